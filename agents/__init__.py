@@ -1,0 +1,1 @@
+"""Learners: encoder, world model, imagination, controller."""

@@ -1,0 +1,1 @@
+"""Trained encoders, MJCF and textures, reached as package resources."""

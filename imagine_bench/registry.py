@@ -1,0 +1,111 @@
+"""Names to objects. A task or an agent costs one line here; nothing heavy is imported until it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from imagine_bench.errors import UnknownNameError
+from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskEntry:
+    """A registered task.
+
+    Attributes:
+        spec: ``"module:attr"`` of its TaskSpec.
+        env_id: Gymnasium id, registered by ``import imagine_bench``.
+        env: ``"module:attr"`` of the environment's constructor.
+        horizon: Macro-actions before truncation.
+    """
+
+    spec: str
+    env_id: str
+    env: str
+    horizon: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentEntry:
+    """A registered agent.
+
+    Attributes:
+        make: ``"module:attr"`` of a function from AgentContext to Agent.
+        learns: Whether training changes it; others are only evaluated.
+        needs_encoder: Whether it sees latents.
+        privileged: Whether it is shown the macrostate and the rules (references only).
+    """
+
+    make: str
+    learns: bool = True
+    needs_encoder: bool = True
+    privileged: bool = False
+
+
+TASKS: dict[str, TaskEntry] = {
+    "arrow_puzzle": TaskEntry(
+        spec="imagine_bench.tasks.arrow_puzzle:SPEC",
+        env_id="imagine_bench/ArrowPuzzle-v0",
+        env="imagine_bench.tasks.arrow_puzzle:make_env",
+        horizon=10,
+    ),
+    "arrow_puzzle_hard": TaskEntry(
+        spec="imagine_bench.tasks.arrow_puzzle:HARD_SPEC",
+        env_id="imagine_bench/ArrowPuzzleHard-v0",
+        env="imagine_bench.tasks.arrow_puzzle:make_hard_env",
+        horizon=10,
+    ),
+}
+
+AGENTS: dict[str, AgentEntry] = {
+    "random": AgentEntry(make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False),
+    "oracle": AgentEntry(
+        make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
+    ),
+    "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
+    "imagination": AgentEntry(make="imagine_bench.agents.imagination_agents:make"),
+    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_agents:make_uncertainty"),
+}
+
+
+def load(target: str) -> Any:
+    """The object that ``"module:attr"`` names."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def task_entry(name: str) -> TaskEntry:
+    """The registry line of a task.
+
+    Raises:
+        UnknownNameError: No such task; the message lists all of them.
+    """
+    if name not in TASKS:
+        raise UnknownNameError("task", name, TASKS)
+    return TASKS[name]
+
+
+def agent_entry(name: str) -> AgentEntry:
+    """The registry line of an agent.
+
+    Raises:
+        UnknownNameError: No such agent; the message lists all of them.
+    """
+    if name not in AGENTS:
+        raise UnknownNameError("agent", name, AGENTS)
+    return AGENTS[name]
+
+
+def task(name: str) -> TaskSpec:
+    """The TaskSpec of a registered task."""
+    spec: TaskSpec = load(task_entry(name).spec)
+    return spec
+
+
+def make_agent(name: str, context: AgentContext) -> Agent:
+    """A new agent of a registered kind."""
+    make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
+    return make(context)

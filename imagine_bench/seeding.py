@@ -1,0 +1,76 @@
+"""Randomness as a tree: every consumer gets its own generator, named by its path, and nothing is global.
+
+Training, evaluation and tuning can never share an environment seed: the purpose is part of the number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from imagine_bench.errors import InvalidValueError, require_known
+
+Purpose = Literal["training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording"]
+_PURPOSES: tuple[str, ...] = get_args(Purpose)
+_SEED_BITS, _EPISODE_BITS = 24, 32
+
+
+def _key(name: str | int) -> int:
+    """A stable 32-bit spawn key: Python's own ``hash`` differs between processes."""
+    return int.from_bytes(hashlib.sha256(str(name).encode()).digest()[:4], "little")
+
+
+@dataclass(frozen=True)
+class SeedTree:
+    """A node of the seed tree; children are addressed by name, in any order, with the same result.
+
+    Args:
+        root: The seed of the whole tree, at least 0.
+        path: The names from the root to this node.
+    """
+
+    root: int
+    path: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.root < 0:
+            raise InvalidValueError(f"Seed {self.root} is negative; give an integer of at least 0.")
+
+    def child(self, *names: str | int) -> SeedTree:
+        """The node below this one at ``names``."""
+        return SeedTree(self.root, self.path + tuple(str(name) for name in names))
+
+    def sequence(self) -> np.random.SeedSequence:
+        """This node's SeedSequence."""
+        return np.random.SeedSequence(self.root, spawn_key=tuple(_key(name) for name in self.path))
+
+    def generator(self) -> np.random.Generator:
+        """A fresh numpy generator of this node: every call starts the same stream again."""
+        return np.random.default_rng(self.sequence())
+
+    def integer(self) -> int:
+        """A seed in [0, 2**63) for libraries that take one integer, such as ``torch.Generator.manual_seed``."""
+        return int(self.sequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def episode_seed(purpose: Purpose, seed: int, episode: int) -> int:
+    """The environment seed of one episode; distinct (purpose, seed, episode) give distinct numbers, by construction.
+
+    Args:
+        purpose: What the episode is for. Evaluation never meets a training seed.
+        seed: The run's seed, in [0, 2**24).
+        episode: The episode's index, in [0, 2**32).
+
+    Raises:
+        UnknownNameError: An unknown purpose.
+        InvalidValueError: A number out of range.
+    """
+    require_known("seed purpose", purpose, _PURPOSES)
+    if not (0 <= seed < 1 << _SEED_BITS and 0 <= episode < 1 << _EPISODE_BITS):
+        raise InvalidValueError(
+            f"seed {seed} and episode {episode} must lie in [0, 2**{_SEED_BITS}) and [0, 2**{_EPISODE_BITS})."
+        )
+    return (_PURPOSES.index(purpose) << (_SEED_BITS + _EPISODE_BITS)) | (seed << _EPISODE_BITS) | episode

@@ -1,0 +1,1 @@
+"""Simulated tasks: MuJoCo scenes, macro-actions executed by an arm, exact rules."""

@@ -1,0 +1,1 @@
+"""From a macro-action to joint motion."""

@@ -1,0 +1,1 @@
+"""Scenes composed with dm_control.mjcf."""
