@@ -1,0 +1,28 @@
+"""Numbers that more than one part of the arrow puzzle's scene needs, each with its unit.
+
+World frame: x away from the robot's base, y to the robot's left, z up, origin at the base. The human sits at the far
+side (+x) and appears at the top of the agent's frame; the frame's right is -y.
+"""
+
+from __future__ import annotations
+
+TIMESTEP_S = 0.005
+
+TABLE_HEIGHT_M = -0.10
+"""Height of the table's surface."""
+
+CUBE_EDGE_M = 0.055
+CUBE_MASS_KG = 0.12
+ROW_X_M = 0.62
+SLOT_SPACING_M = 0.09
+SLOTS_XY_M = ((ROW_X_M, SLOT_SPACING_M), (ROW_X_M, 0.0), (ROW_X_M, -SLOT_SPACING_M))
+"""Nominal cube centres, left to right in the agent's frame."""
+
+DIRECTIONS = ("toward_human", "right", "toward_agent", "left")
+"""Arrow directions 0..3; each next one is a quarter turn clockwise as seen in the frame."""
+
+OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
+"""Arm configuration from which the wrist camera sees the whole row; every macro-action starts and ends here."""
+
+HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
+"""Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
