@@ -1,0 +1,173 @@
+"""What a bench measured, as plain data: written by the runner, read by statistics, report and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import ImaginedRollout
+from imagine_bench.protocol import Protocol
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenLoop:
+    """How right the imagination is by depth, against the rules, over rollouts that the rules keep alive.
+
+    All arrays have shape (D,), index d for imagined step d + 1.
+
+    Attributes:
+        count: Imagined transitions compared.
+        correct: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
+        correct_accepted: The same among those the uncertainty filter keeps (NaN where it keeps none).
+        accepted: Share the filter keeps.
+        reward_mae: Mean absolute error of the predicted reward.
+        termination_error: Share with the wrong side of 0.5 for P(terminal).
+        epistemic: Mean epistemic uncertainty.
+        aleatoric: Mean aleatoric uncertainty.
+        modal: Mean modal uncertainty.
+    """
+
+    count: NDArray[np.int64]
+    correct: NDArray[np.float64]
+    correct_accepted: NDArray[np.float64]
+    accepted: NDArray[np.float64]
+    reward_mae: NDArray[np.float64]
+    termination_error: NDArray[np.float64]
+    epistemic: NDArray[np.float64]
+    aleatoric: NDArray[np.float64]
+    modal: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedRollout:
+    """An imagined rollout beside what the real environment shows for the same start and actions.
+
+    Attributes:
+        start_frame: The real frame it starts from. Shape (64, 64, 3), uint8.
+        rollout: What the agent imagined.
+        real_frames: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
+        real_macrostates: What the rules say. Shape (D, M).
+        real_rewards: What the rules say. Shape (D,).
+        real_terminated: Shape (D,).
+    """
+
+    start_frame: NDArray[np.uint8]
+    rollout: ImaginedRollout
+    real_frames: NDArray[np.uint8]
+    real_macrostates: NDArray[np.int64]
+    real_rewards: NDArray[np.float64]
+    real_terminated: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """One evaluated budget of one run.
+
+    Attributes:
+        episodes: Real training episodes so far.
+        env_steps: Real training macro-actions so far.
+        test_episodes: Greedy test episodes.
+        successes: Test episodes that ended in success.
+        mean_return: Mean undiscounted return of the test episodes.
+        mean_length: Mean macro-actions of the test episodes.
+        faults: Macro-actions of the test episodes whose physics disagreed with the rules.
+        train_cpu_s: CPU seconds of training (environment and learning) since the run began.
+        eval_cpu_s: CPU seconds of this evaluation.
+        diagnostics: The agent's own means since the previous checkpoint.
+        open_loop: Imagination against the rules, for agents that imagine.
+    """
+
+    episodes: int
+    env_steps: int
+    test_episodes: int
+    successes: int
+    mean_return: float
+    mean_length: float
+    faults: int
+    train_cpu_s: float
+    eval_cpu_s: float
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    open_loop: OpenLoop | None = None
+
+    @property
+    def success_rate(self) -> float:
+        """Share of test episodes that succeeded, in [0, 1]."""
+        return self.successes / self.test_episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """One finished run.
+
+    Attributes:
+        agent: Registered agent.
+        seed: The run's seed.
+        checkpoints: One a budget, in the protocol's order.
+        settings: The agent's settings as run.
+        training_success: Whether each training episode succeeded. Shape (episodes,).
+        training_length: Macro-actions of each training episode. Shape (episodes,).
+        imagined: Example rollouts at the last budget, for agents that imagine.
+        folder: Where the run's files lie.
+        recording: Its Rerun recording, or None.
+    """
+
+    agent: str
+    seed: int
+    checkpoints: tuple[Checkpoint, ...]
+    settings: Mapping[str, Any]
+    training_success: NDArray[np.bool_]
+    training_length: NDArray[np.int64]
+    imagined: tuple[ComparedRollout, ...]
+    folder: Path
+    recording: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchResult:
+    """All runs of a protocol. Every agent and seed is there, or this cannot be built.
+
+    Attributes:
+        protocol: What was compared.
+        runs: One an agent and seed.
+        environment: Command, commit, versions, machine, GL renderer, threads; JSON-like.
+        folder: Where the bench's files lie.
+        wall_s: Wall seconds of the bench, over all its sittings.
+
+    Raises:
+        ArtefactError: A run of the protocol is missing, doubled or has other budgets.
+    """
+
+    protocol: Protocol
+    runs: tuple[RunResult, ...]
+    environment: Mapping[str, Any]
+    folder: Path
+    wall_s: float
+
+    def __post_init__(self) -> None:
+        wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
+        found = [(run.agent, run.seed) for run in self.runs]
+        missing = sorted(wanted - set(found))
+        if missing or len(found) != len(wanted):
+            raise ArtefactError(
+                f"{self.folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
+                f"missing: {missing or 'none'}. Run the same bench command again to complete it."
+            )
+        for run in self.runs:
+            budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
+            if budgets != self.protocol.budgets:
+                raise ArtefactError(f"{run.folder} has budgets {budgets}, the protocol says {self.protocol.budgets}.")
+
+    def of(self, agent: str) -> tuple[RunResult, ...]:
+        """The runs of one agent, in the order of the protocol's seeds."""
+        by_seed = {run.seed: run for run in self.runs if run.agent == agent}
+        return tuple(by_seed[seed] for seed in self.protocol.seeds)
+
+    def success_rates(self, agent: str) -> NDArray[np.float64]:
+        """Success rates of one agent. Shape (seeds, budgets)."""
+        return np.array([[checkpoint.success_rate for checkpoint in run.checkpoints] for run in self.of(agent)])
