@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from dataclasses import dataclass
 from typing import Any
@@ -94,8 +95,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
 }
-"""What each preset changes: ``smoke`` shows that everything works, ``quick`` is the default, ``thesis`` is tables 5.1-5.4
-as printed, ``full`` has seeds enough to see the filter's gain (5 do not: power analysis of the thesis' own spreads)."""
+"""What each preset changes: ``smoke`` shows that everything works, ``quick`` is the default, ``thesis`` is tables
+5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the thesis' own spreads)."""
 
 
 def protocol(task: str, preset: str = "quick", **changes: Any) -> Protocol:
@@ -110,7 +111,7 @@ def protocol(task: str, preset: str = "quick", **changes: Any) -> Protocol:
 
 
 def _require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
-    ascending = all(a < b for a, b in zip(values, values[1:], strict=False))
+    ascending = all(a < b for a, b in itertools.pairwise(values))
     if not values or not ascending or values[0] < at_least:
         raise InvalidValueError(
             f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
