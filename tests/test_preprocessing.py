@@ -1,0 +1,34 @@
+"""The declared reading of frames: strips hold the right columns, and joining them loses nothing."""
+
+import numpy as np
+import pytest
+
+from imagine_bench.errors import UnknownNameError
+from imagine_bench.preprocessing import gray_strips, join_strips, preprocess, whole_rgb
+
+
+def test_strips_hold_the_columns_of_their_cube():
+    frames = np.zeros((1, 64, 64, 3), dtype=np.uint8)
+    frames[:, :, :, :] = np.arange(64, dtype=np.uint8)[None, None, :, None]  # grey level = column
+    strips = gray_strips(frames)
+    assert strips.shape == (1, 3, 64, 22) and strips.dtype == np.float32
+    for strip, start in zip(strips[0], (0, 21, 42), strict=True):
+        np.testing.assert_allclose(strip[0] * 255, np.arange(start, start + 22), atol=1e-3)
+
+
+def test_joined_strips_are_the_grey_frame():
+    frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
+    gray = frames @ np.array([0.299, 0.587, 0.114]) / 255
+    np.testing.assert_allclose(join_strips(gray_strips(frames)), gray, atol=1e-6)
+
+
+def test_whole_rgb_moves_channels_first():
+    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    pixels = whole_rgb(frames)
+    assert pixels.shape == (2, 3, 64, 64)
+    np.testing.assert_allclose(pixels[1, 2], frames[1, :, :, 2] / 255, atol=1e-6)
+
+
+def test_unknown_preprocessing_lists_the_known_ones():
+    with pytest.raises(UnknownNameError, match=r"No preprocessing 'gray_strip'. Did you mean 'gray_strips'\?"):
+        preprocess("gray_strip")

@@ -1,0 +1,77 @@
+"""Protocols: complete, hashed, and strict about what they are given."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.protocol import PRESETS, Protocol, protocol
+from imagine_bench.registry import TASKS
+from imagine_bench.results import BenchResult, Checkpoint, RunResult
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_survives_json_with_its_hash(task, preset):
+    original = protocol(task, preset)
+    copy = Protocol.from_dict(original.as_dict())
+    assert copy == original and copy.hash == original.hash
+
+
+def test_any_change_changes_the_hash():
+    base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
+    changes = {
+        "task": "arrow_puzzle_hard", "preset": "smoke", "agents": ("dqn",), "seeds": (5,), "budgets": (7,),
+        "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
+        "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "recorded_episodes": 1,
+    }  # fmt: skip
+    assert set(changes) >= {field.name for field in dataclasses.fields(Protocol)} - {"encoder"}
+    hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
+    assert len(hashes | {base.hash}) == len(changes) + 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"task": "arrow_puzle"}, UnknownNameError, r"No task 'arrow_puzle'. Did you mean 'arrow_puzzle'\?"),
+        ({"preset": "fast"}, UnknownNameError, "No preset 'fast'.* Known: smoke, quick, thesis, full"),
+        ({"agents": ("dnq",)}, UnknownNameError, r"No agent 'dnq'. Did you mean 'dqn'\?"),
+        ({"agents": ("dqn", "dqn")}, InvalidValueError, "none of them twice"),
+        ({"appearance": "milld"}, UnknownNameError, r"No appearance 'milld'. Did you mean 'mild'\?"),
+        ({"execution": "real"}, UnknownNameError, "Known: physics, kinematic"),
+        ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
+        ({"seeds": (1, 1)}, InvalidValueError, "seeds"),
+        ({"evaluation_episodes": 0}, InvalidValueError, "evaluation_episodes is 0"),
+    ],
+)
+def test_bad_fields_say_what_is_allowed(changes, error, message):
+    fields = {"task": "arrow_puzzle", **changes}
+    with pytest.raises(error, match=message):
+        protocol(fields.pop("task"), fields.pop("preset", "quick"), **fields)
+
+
+def _run(agent, seed, budgets, successes=1):
+    checkpoints = tuple(
+        Checkpoint(
+            episodes=budget, env_steps=budget, test_episodes=4, successes=successes, mean_return=0.0, mean_length=1.0,
+            faults=0, train_cpu_s=0.0, eval_cpu_s=0.0,
+        )
+        for budget in budgets
+    )  # fmt: skip
+    return RunResult(
+        agent=agent, seed=seed, checkpoints=checkpoints, settings={}, training_success=np.zeros(0, bool),
+        training_length=np.zeros(0, int), imagined=(), folder=Path("runs"), recording=None,
+    )  # fmt: skip
+
+
+def test_a_bench_result_refuses_missing_and_mismatched_runs():
+    p = protocol("arrow_puzzle", agents=("dqn", "random"), seeds=(0, 1), budgets=(10, 20))
+    runs = tuple(_run(agent, seed, p.budgets, successes=seed) for agent in p.agents for seed in p.seeds)
+    whole = BenchResult(protocol=p, runs=runs, environment={}, folder=Path("runs"), wall_s=0.0)
+    np.testing.assert_array_equal(whole.success_rates("dqn"), [[0.0, 0.0], [0.25, 0.25]])
+    with pytest.raises(ArtefactError, match=r"missing: \[\('random', 1\)\]. Run the same bench command again"):
+        dataclasses.replace(whole, runs=runs[:-1])
+    with pytest.raises(ArtefactError, match=r"has budgets \(10,\), the protocol says \(10, 20\)"):
+        dataclasses.replace(whole, runs=(*runs[:-1], _run("random", 1, (10,))))

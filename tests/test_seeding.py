@@ -1,0 +1,51 @@
+"""The seed tree: stable, addressable in any order, and with evaluation apart from training by construction."""
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.seeding import SeedTree, episode_seed
+
+
+def test_children_do_not_depend_on_order_and_differ_from_one_another():
+    tree = SeedTree(7)
+    first, second = tree.child("agent").integer(), tree.child("agent", "masks").integer()
+    again = SeedTree(7)
+    assert (again.child("agent").child("masks").integer(), again.child("agent").integer()) == (second, first)
+    values = {tree.child(name, i).integer() for name in ("a", "b") for i in range(50)}
+    assert len(values) == 100
+
+
+def test_generator_starts_the_same_stream_at_every_call():
+    node = SeedTree(3).child("x")
+    assert np.array_equal(node.generator().random(5), node.generator().random(5))
+    assert not np.array_equal(node.generator().random(5), SeedTree(4).child("x").generator().random(5))
+
+
+def test_seeds_are_equal_in_another_process():
+    code = "from imagine_bench.seeding import SeedTree; print(SeedTree(11).child('agent', 2).integer())"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert int(printed) == SeedTree(11).child("agent", 2).integer()
+
+
+def test_episode_seeds_never_meet():
+    purposes = ("training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording")
+    edges = (0, 1, 2**24 - 1), (0, 1, 9_999, 2**32 - 1)
+    seeds = [episode_seed(p, s, e) for p, s, e in itertools.product(purposes, *edges)]
+    assert len(set(seeds)) == len(purposes) * 12
+    assert max(seeds) < 2**63
+
+
+def test_bad_values_say_what_is_allowed():
+    with pytest.raises(
+        UnknownNameError, match=r"No seed purpose 'evaluate'. Did you mean 'evaluation'\? Known: training"
+    ):
+        episode_seed("evaluate", 0, 0)
+    with pytest.raises(InvalidValueError, match=r"seed 16777216 and episode 0 must lie in \[0, 2\*\*24\)"):
+        episode_seed("training", 2**24, 0)
+    with pytest.raises(InvalidValueError, match="Seed -1 is negative"):
+        SeedTree(-1)
