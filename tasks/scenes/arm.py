@@ -1,0 +1,29 @@
+"""The Sawyer arm and its gripper as an MJCF part, and the facts about it that MJCF cannot hold."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+from dm_control import mjcf
+
+ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
+"""From the base to the wrist."""
+
+FINGER_JOINTS = ("finger_left_slide", "finger_right_slide")
+"""Slides in metres: each pad's distance from the grip's middle, 0 (closed) to 0.045."""
+
+TCP_SITE = "tcp"
+"""Between the pads: +z along the tool, the fingers open along y."""
+
+WRIST_CAMERA = "wrist"
+
+ARM_GEOM_GROUP = 2
+"""Every geom of the arm is in it, so that a view can leave the arm out."""
+
+JOINT_SPEED_LIMITS_RAD_S = (1.74, 1.328, 1.957, 1.957, 3.485, 3.485, 4.545)
+"""Per arm joint, from the same URDF as ``assets/sawyer.xml``."""
+
+
+def arm_root() -> mjcf.RootElement:
+    """A new MJCF model of the arm, its base at the origin; attach it to a scene or compile it alone."""
+    return mjcf.from_xml_string(resources.files("imagine_bench.assets").joinpath("sawyer.xml").read_text())
