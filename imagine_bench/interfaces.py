@@ -74,6 +74,10 @@ class Rules(Protocol):
     """The macrostate machine of a task: no physics, no pixels, exact."""
 
     @property
+    def n_actions(self) -> int:
+        """Number of macro-actions A."""
+
+    @property
     def states(self) -> tuple[tuple[int, ...], ...]:
         """Every macrostate the machine knows, terminal ones included."""
 
@@ -83,6 +87,12 @@ class Rules(Protocol):
 
     def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
         """Every possible result of ``action`` in ``macrostate``."""
+
+    def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
+        """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
+
+    def is_legal(self, macrostate: tuple[int, ...]) -> bool:
+        """Whether ``macrostate`` breaks no rule."""
 
     def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether no episode goes on from ``macrostate``."""

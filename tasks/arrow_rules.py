@@ -1,0 +1,100 @@
+"""The rules of the arrow puzzle (thesis, chapter 5) and of its hard variant: no physics, no pixels, exact.
+
+A macrostate is ``(d0, d1, d2, pointed)``: the arrow directions of the cubes, left to right in the agent's frame, and
+the cube the human points at. Directions: 0 toward the human (up in the frame), 1 right, 2 toward the agent, 3 left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Outcome
+
+from .rules import optimal_policy, tabulate
+
+N_CUBES = 3
+N_DIRECTIONS = 4
+TOWARD_HUMAN, RIGHT, TOWARD_AGENT, LEFT = range(N_DIRECTIONS)
+
+GOAL_REWARD = 50.0
+ILLEGAL_REWARD = -5.0
+STEP_REWARD = -1.0
+
+
+@dataclass(frozen=True)
+class ArrowPuzzleRules:
+    """The macrostate machine of the arrow puzzle.
+
+    Action ``2i`` turns cube i a quarter turn clockwise as seen in the frame, ``2i + 1`` counter-clockwise.
+
+    Args:
+        hard: Whether the goal also wants no arrow to point toward the agent.
+    """
+
+    hard: bool = False
+
+    @property
+    def n_actions(self) -> int:
+        """Two turns a cube."""
+        return 2 * N_CUBES
+
+    @cached_property
+    def states(self) -> tuple[tuple[int, ...], ...]:
+        """All 192 macrostates."""
+        return tuple(product(*[range(N_DIRECTIONS)] * N_CUBES, range(N_CUBES)))
+
+    @cached_property
+    def start_states(self) -> tuple[tuple[int, ...], ...]:
+        """The macrostates that are not terminal: 54, hard 66."""
+        return tuple(state for state in self.states if not self.is_terminal(state))
+
+    def is_legal(self, macrostate: tuple[int, ...]) -> bool:
+        """Whether all arrows point in different directions."""
+        return len(set(macrostate[:N_CUBES])) == N_CUBES
+
+    def is_goal(self, macrostate: tuple[int, ...]) -> bool:
+        """Whether the macrostate is legal and the arrow pointed at (in the hard variant: and no arrow at the agent)."""
+        toward_human = macrostate[macrostate[N_CUBES]] == TOWARD_HUMAN
+        spoiled = self.hard and TOWARD_AGENT in macrostate[:N_CUBES]
+        return self.is_legal(macrostate) and toward_human and not spoiled
+
+    def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
+        """Whether the macrostate is a goal or illegal."""
+        return self.is_goal(macrostate) or not self.is_legal(macrostate)
+
+    def turned(self, macrostate: tuple[int, ...], action: int) -> tuple[int, ...]:
+        """The macrostate after a quarter turn, also out of a terminal one.
+
+        Raises:
+            InvalidValueError: No such action.
+        """
+        if not 0 <= action < self.n_actions:
+            raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
+        cube, counter_clockwise = divmod(action, 2)
+        turned = list(macrostate)
+        turned[cube] = (turned[cube] + (-1 if counter_clockwise else 1)) % N_DIRECTIONS
+        return tuple(turned)
+
+    def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
+        """Reward and end of an episode depend on the macrostate reached alone."""
+        del macrostate, action
+        if not self.is_legal(reached):
+            return Outcome(1.0, reached, ILLEGAL_REWARD, terminated=True, success=False)
+        if self.is_goal(reached):
+            return Outcome(1.0, reached, GOAL_REWARD, terminated=True, success=True)
+        return Outcome(1.0, reached, STEP_REWARD, terminated=False, success=False)
+
+    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+        """The one result of a turn, which is certain."""
+        return (self.judge(macrostate, action, self.turned(macrostate, action)),)
+
+    @cached_property
+    def _policy(self) -> dict[tuple[int, ...], int]:
+        return dict(zip(self.states, optimal_policy(tabulate(self)).tolist(), strict=True))
+
+    def optimal_action(self, macrostate: tuple[int, ...]) -> int:
+        """The first action of a shortest plan (the lowest index among equals)."""
+        return self._policy[tuple(int(value) for value in macrostate)]

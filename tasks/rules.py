@@ -1,0 +1,143 @@
+"""Exact facts about any macrostate machine, by dynamic programming over its (possibly stochastic) outcomes.
+
+Shapes: ``S`` macrostates, ``A`` macro-actions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import RuleFacts, Rules
+
+_SWEEPS = 10_000
+_VALUE_TOLERANCE = 1e-12
+_TIE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuleTables:
+    """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1.
+
+    Attributes:
+        index: Macrostate to row.
+        starts: Rows an episode may start in, equally likely.
+        alive: Probability of going on in each next macrostate. Shape (A, S, S).
+        reward: Expected reward. Shape (A, S).
+        success: Probability of ending here as a success. Shape (A, S).
+    """
+
+    index: dict[tuple[int, ...], int]
+    starts: NDArray[np.int64]
+    alive: NDArray[np.float64]
+    reward: NDArray[np.float64]
+    success: NDArray[np.float64]
+
+
+def tabulate(rules: Rules) -> RuleTables:
+    """Write the machine out as arrays.
+
+    Raises:
+        InvalidValueError: The outcome probabilities of some (macrostate, action) do not sum to 1.
+    """
+    index = {state: row for row, state in enumerate(rules.states)}
+    shape = (rules.n_actions, len(index))
+    alive, reward, success = np.zeros((*shape, len(index))), np.zeros(shape), np.zeros(shape)
+    for state, row in index.items():
+        for action in range(rules.n_actions):
+            outcomes = rules.outcomes(state, action)
+            total = sum(outcome.probability for outcome in outcomes)
+            if abs(total - 1.0) > _TIE_TOLERANCE:
+                raise InvalidValueError(f"Outcomes of action {action} in macrostate {state} sum to {total}, not 1.")
+            for outcome in outcomes:
+                reward[action, row] += outcome.probability * outcome.reward
+                success[action, row] += outcome.probability * outcome.success
+                if not outcome.terminated:
+                    alive[action, row, index[outcome.macrostate]] += outcome.probability
+    starts = np.array([index[state] for state in rules.start_states], dtype=np.int64)
+    return RuleTables(index=index, starts=starts, alive=alive, reward=reward, success=success)
+
+
+def optimal_values(tables: RuleTables) -> NDArray[np.float64]:
+    """Action values of the largest undiscounted return without a horizon, by value iteration. Shape (A, S).
+
+    Raises:
+        InvalidValueError: The return of some macrostate is unbounded.
+    """
+    values = np.full(tables.reward.shape[1], tables.reward.min(initial=0.0))
+    for _ in range(_SWEEPS):
+        action_values = tables.reward + tables.alive @ values  # [A, S]
+        best = action_values.max(axis=0)
+        if np.abs(best - values).max() < _VALUE_TOLERANCE:
+            return action_values
+        values = best
+    raise InvalidValueError(f"Value iteration did not settle in {_SWEEPS} sweeps: the rules allow an endless return.")
+
+
+def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
+    """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
+    action_values = optimal_values(tables)
+    near_best = action_values >= action_values.max(axis=0) - _TIE_TOLERANCE
+    return near_best.argmax(axis=0).astype(np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyFacts:
+    """What a policy reaches within a horizon, from each macrostate. Shapes (S,).
+
+    Attributes:
+        success: Success probability.
+        returns: Expected undiscounted return.
+        length: Expected number of actions.
+    """
+
+    success: NDArray[np.float64]
+    returns: NDArray[np.float64]
+    length: NDArray[np.float64]
+
+
+def evaluate(tables: RuleTables, policy: NDArray[np.float64], horizon: int) -> PolicyFacts:
+    """Evaluate a stationary policy exactly.
+
+    Args:
+        tables: The machine.
+        policy: Action probabilities in each macrostate. Shape (A, S).
+        horizon: Actions before truncation, at least 1.
+    """
+    if horizon < 1:
+        raise InvalidValueError(f"Horizon {horizon} is too short; give at least 1 action.")
+    alive = np.einsum("as,ast->st", policy, tables.alive)
+    reward, success = (policy * tables.reward).sum(axis=0), (policy * tables.success).sum(axis=0)
+    zeros = np.zeros(alive.shape[0])
+    successes, returns, length = zeros, zeros, zeros
+    for _ in range(horizon):
+        successes = success + alive @ successes
+        returns = reward + alive @ returns
+        length = 1.0 + alive @ length
+    return PolicyFacts(success=successes, returns=returns, length=length)
+
+
+def greedy(policy: NDArray[np.int64], n_actions: int) -> NDArray[np.float64]:
+    """A deterministic policy (S,) as action probabilities (A, S)."""
+    return np.eye(n_actions)[:, policy]
+
+
+def facts(rules: Rules, horizon: int) -> RuleFacts:
+    """Chance level, optimum and plan length of a task, exactly.
+
+    The optimal agent is the stationary one with the largest undiscounted return; all figures are means over the
+    start macrostates, truncated at ``horizon`` actions.
+    """
+    tables = tabulate(rules)
+    optimal = evaluate(tables, greedy(optimal_policy(tables), rules.n_actions), horizon)
+    uniform = np.full(tables.reward.shape, 1.0 / rules.n_actions)
+    chance = evaluate(tables, uniform, horizon)
+    return RuleFacts(
+        chance_level=float(chance.success[tables.starts].mean()),
+        optimum=float(optimal.success[tables.starts].mean()),
+        optimal_return=float(optimal.returns[tables.starts].mean()),
+        mean_plan_length=float(optimal.length[tables.starts].mean()),
+    )
