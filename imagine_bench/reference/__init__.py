@@ -1,1 +1,61 @@
-"""The results of the thesis, as data."""
+"""The results of the thesis, as data: one JSON file a task, every figure with its table or section.
+
+The files keep the thesis' own units (percent, metres); :func:`success` and :func:`gain` give shares, as the bench does.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from typing import Any
+
+from imagine_bench.errors import require_known
+
+NAMES = ("arrow_puzzle", "arrow_puzzle_hard", "pick_place", "robot_ik")
+"""What the thesis reports on; a TaskSpec names one of these as its ``reference``."""
+
+
+def load(name: str) -> dict[str, Any]:
+    """Everything the thesis reports on one task, as in its JSON file.
+
+    Raises:
+        UnknownNameError: The thesis has no such task.
+    """
+    require_known("thesis reference", name, NAMES)
+    text = resources.files(__name__).joinpath(f"{name}.json").read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+def success(task_reference: str, agent: str) -> dict[int, tuple[float, float]]:
+    """Success shares of one agent in tables 5.1 and 5.3: real episodes to (mean, standard deviation), in [0, 1].
+
+    Args:
+        task_reference: One of :data:`NAMES`.
+        agent: Registered agent. One that the thesis did not test gives an empty dict.
+
+    Raises:
+        UnknownNameError: The thesis has no such task.
+    """
+    rows = load(task_reference).get("success", {}).get("agents", {}).get(agent, {})
+    return {int(episodes): (mean / 100.0, std / 100.0) for episodes, (mean, std) in rows.items()}
+
+
+def gain(task_reference: str, agent: str) -> dict[int, float]:
+    """Gains over DQN in tables 5.2 and 5.4: real episodes to (P_aug - P_base) / P_base.
+
+    Raises:
+        UnknownNameError: The thesis has no such task.
+    """
+    rows = load(task_reference).get("gain", {}).get("agents", {}).get(agent, {})
+    return {int(episodes): percent / 100.0 for episodes, percent in rows.items()}
+
+
+def random_success(task_reference: str) -> float | None:
+    """The success share the thesis measured for its random agent, in [0, 1], or None where it did not.
+
+    Raises:
+        UnknownNameError: The thesis has no such task.
+    """
+    row = load(task_reference).get("random_agent")
+    return None if row is None else float(row["success"]) / 100.0

@@ -1,0 +1,62 @@
+"""What the real environment shows for the macro-actions that an agent imagined."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, ImaginedRollout, Outcome, TaskSpec
+from imagine_bench.results import ComparedRollout
+
+
+def compare_rollout(
+    spec: TaskSpec,
+    *,
+    frame: Frame,
+    macrostate: NDArray[np.int64],
+    rollout: ImaginedRollout,
+    appearance: str,
+    rng: np.random.Generator,
+) -> ComparedRollout:
+    """Put the truth beside an imagined rollout: the rules give states and rewards, the kinematic mode gives frames.
+
+    Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
+
+    Args:
+        spec: The task.
+        frame: The real frame the rollout starts from. Shape (64, 64, 3).
+        macrostate: What that frame shows. Shape (M,).
+        rollout: What the agent imagined from it, of depth D.
+        appearance: Appearance level of the real frames.
+        rng: Draws among stochastic outcomes, and the appearance.
+    """
+    state = tuple(int(value) for value in macrostate)
+    over = spec.rules.is_terminal(state)
+    states, rewards, ends = [], [], []
+    for action in rollout.actions:
+        reward = 0.0
+        if not over:
+            outcome = _draw(spec.rules.outcomes(state, int(action)), rng)
+            state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
+        states.append(state)
+        rewards.append(reward)
+        ends.append(over)
+    real_macrostates = np.array(states, dtype=np.int64).reshape(-1, len(macrostate))  # [D, M]
+    real_frames = (
+        spec.render_macrostates(real_macrostates, appearance, rng)
+        if states
+        else np.zeros((0, *frame.shape), dtype=np.uint8)
+    )
+    return ComparedRollout(
+        start_frame=frame.copy(),
+        rollout=rollout,
+        real_frames=real_frames,
+        real_macrostates=real_macrostates,
+        real_rewards=np.array(rewards, dtype=np.float64),
+        real_terminated=np.array(ends, dtype=np.bool_),
+    )
+
+
+def _draw(outcomes: tuple[Outcome, ...], rng: np.random.Generator) -> Outcome:
+    """One of the possible outcomes, with its probability."""
+    return outcomes[int(rng.choice(len(outcomes), p=[outcome.probability for outcome in outcomes]))]

@@ -1,0 +1,52 @@
+"""The thesis' tables, a few of them typed again by hand, and tested against each other."""
+
+from __future__ import annotations
+
+import pytest
+
+from imagine_bench import reference
+from imagine_bench.errors import UnknownNameError
+
+
+def test_table_5_1() -> None:
+    assert reference.success("arrow_puzzle", "dqn")[2000] == pytest.approx((0.4218, 0.0601))
+    assert reference.success("arrow_puzzle", "imagination")[3000] == pytest.approx((0.814, 0.0295))
+    assert reference.success("arrow_puzzle", "imagination_uncertainty")[6000] == pytest.approx((0.9697, 0.0208))
+
+
+def test_table_5_3() -> None:
+    assert reference.success("arrow_puzzle_hard", "dqn")[3000] == pytest.approx((0.4956, 0.0848))
+    assert reference.success("arrow_puzzle_hard", "imagination_uncertainty")[2000] == pytest.approx((0.5845, 0.0157))
+
+
+def test_tables_5_2_and_5_4_are_what_5_1_and_5_3_imply() -> None:
+    for name in ("arrow_puzzle", "arrow_puzzle_hard"):
+        base = reference.success(name, "dqn")
+        for agent in ("imagination", "imagination_uncertainty"):
+            printed, treated = reference.gain(name, agent), reference.success(name, agent)
+            assert list(printed) == list(base) == [2000, 3000, 4000, 5000, 6000]
+            for episodes, value in printed.items():
+                implied = (treated[episodes][0] - base[episodes][0]) / base[episodes][0]
+                assert value == pytest.approx(implied, abs=1.1e-4)
+
+
+def test_other_chapters() -> None:
+    assert reference.load("pick_place")["transfer"]["trained_on_imagined"] == 78
+    assert reference.load("robot_ik")["cumulative_error"]["criteria"]["max"]["1000"] == [29.24, 4.24]
+    assert reference.load("arrow_puzzle")["plans"]["solved"] == 17
+    assert reference.random_success("arrow_puzzle") == pytest.approx(0.0372)
+    assert reference.random_success("robot_ik") is None
+
+
+def test_every_table_names_its_source() -> None:
+    for name in reference.NAMES:
+        data = reference.load(name)
+        assert "thesis" in data.pop("source")
+        assert data
+        assert all(part["source"] for part in data.values())
+
+
+def test_untested_agents_and_unknown_tasks() -> None:
+    assert reference.success("arrow_puzzle", "oracle") == {}
+    with pytest.raises(UnknownNameError, match=r"No thesis reference 'arow_puzzle'. Did you mean 'arrow_puzzle'\?"):
+        reference.success("arow_puzzle", "dqn")
