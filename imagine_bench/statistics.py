@@ -1,0 +1,172 @@
+"""What a handful of seeds allows one to say: pure functions on scores, every random draw from a passed generator.
+
+Scores have shape (runs,) or (runs, strata), a stratum being a task; they are resampled within each stratum
+(Agarwal et al., "Deep RL at the edge of the statistical precipice", 2021).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from imagine_bench.errors import InvalidValueError
+
+LEVEL = 0.95
+RESAMPLES = 4000
+
+Statistic = Literal["iqm", "mean"]
+
+
+class Estimate(NamedTuple):
+    """A point estimate and its interval; the ends are NaN where the data allow none (fewer than two runs)."""
+
+    value: float
+    low: float
+    high: float
+
+
+def iqm(scores: ArrayLike) -> float:
+    """Interquartile mean: the mean of the middle half of all scores (of fewer than four: the plain mean)."""
+    return float(_summary(_finite("scores", scores).ravel()[None], "iqm")[0])
+
+
+def bootstrap_interval(
+    scores: ArrayLike,
+    rng: np.random.Generator,
+    *,
+    statistic: Statistic = "iqm",
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+) -> tuple[float, float]:
+    """Percentile interval of ``statistic`` by the stratified bootstrap over runs.
+
+    Args:
+        scores: Shape (runs,) or (runs, strata).
+        rng: Draws the resamples.
+        statistic: ``"iqm"`` or ``"mean"``, of all scores of a resample.
+        level: Coverage, in (0, 1).
+        resamples: Bootstrap samples.
+
+    Returns:
+        The two ends; both NaN with fewer than two runs, which say nothing of their spread.
+
+    Raises:
+        InvalidValueError: Scores that are empty, not finite, or of another shape.
+    """
+    table = _table(scores)
+    if len(table) < 2:
+        return float("nan"), float("nan")
+    draws = _resample(table, rng, resamples).reshape(resamples, -1)  # [resamples, runs * strata]
+    return _percentiles(_summary(draws, statistic), level)
+
+
+def wilson(successes: int, trials: int, *, level: float = LEVEL) -> tuple[float, float]:
+    """Wilson's score interval of a success probability after ``trials`` independent trials (Wilson, 1927).
+
+    Raises:
+        InvalidValueError: Not 0 <= successes <= trials, or no trial.
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise InvalidValueError(
+            f"{successes} successes in {trials} trials is impossible; give 0 <= successes <= trials."
+        )
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence_level=level, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def probability_of_improvement(
+    ours: ArrayLike, theirs: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
+) -> Estimate:
+    """Probability that a random run of ``ours`` beats a random run of ``theirs``; a tie counts half.
+
+    Args:
+        ours: Shape (runs,) or (runs, strata); averaged over strata.
+        theirs: Shape (other runs,) or (other runs, strata).
+        rng: Draws the resamples, of each side independently.
+        level: Coverage of the interval.
+        resamples: Bootstrap samples.
+    """
+    a, b = _table(ours), _table(theirs)
+    if a.shape[1] != b.shape[1]:
+        raise InvalidValueError(f"The two sides have {a.shape[1]} and {b.shape[1]} strata; compare the same tasks.")
+    value = float(_share_won(a[None], b[None])[0])
+    if min(len(a), len(b)) < 2:
+        return Estimate(value, float("nan"), float("nan"))
+    draws = _share_won(_resample(a, rng, resamples), _resample(b, rng, resamples))
+    return Estimate(value, *_percentiles(draws, level))
+
+
+def gain(
+    augmented: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
+) -> Estimate:
+    """Relative gain (P_aug - P_base) / P_base of mean success rates (thesis tables 5.2 and 5.4), paired by seed.
+
+    Args:
+        augmented: Success rates of the augmented agent, one a seed. Shape (seeds,).
+        base: Success rates of the base agent for the same seeds. Shape (seeds,).
+        rng: Draws the resamples; a seed is drawn for both agents together.
+        level: Coverage of the interval.
+        resamples: Bootstrap samples.
+
+    Returns:
+        The gain, 0.5 for half as much again; NaN where the base never succeeds.
+    """
+    pairs = np.stack([_finite("augmented", augmented), _finite("base", base)], axis=-1)  # [seeds, 2]
+    if pairs.ndim != 2:
+        raise InvalidValueError(f"Gains are paired by seed; give two vectors, not shape {pairs.shape[:-1]}.")
+    value = float(_relative(pairs[None])[0])
+    if len(pairs) < 2 or np.isnan(value):
+        return Estimate(value, float("nan"), float("nan"))
+    picks = rng.integers(len(pairs), size=(resamples, len(pairs)))
+    draws = _relative(pairs[picks])
+    return Estimate(value, *_percentiles(draws[~np.isnan(draws)], level))
+
+
+def _summary(draws: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:
+    """The statistic of each row: (resamples, scores) to (resamples,)."""
+    if statistic == "mean":
+        return draws.mean(axis=1)
+    trimmed: NDArray[np.float64] = stats.trim_mean(draws, 0.25, axis=1)
+    return trimmed
+
+
+def _relative(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Relative gains of mean pairs (augmented, base): (resamples, seeds, 2) to (resamples,)."""
+    augmented, base = np.moveaxis(pairs.mean(axis=1), -1, 0)
+    return np.where(base > 0, (augmented - base) / np.where(base > 0, base, 1.0), np.nan)
+
+
+def _share_won(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of pairs that ``a`` wins: two tables with a leading resamples axis to (resamples,)."""
+    difference = a[:, :, None, :] - b[:, None, :, :]  # [resamples, runs, other runs, strata]
+    won: NDArray[np.float64] = ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(1, 2, 3))
+    return won
+
+
+def _resample(table: NDArray[np.float64], rng: np.random.Generator, resamples: int) -> NDArray[np.float64]:
+    """Runs drawn with replacement, for each stratum independently. Shape (resamples, runs, strata)."""
+    picks = rng.integers(len(table), size=(resamples, *table.shape))
+    return np.take_along_axis(table[None], picks, axis=1)
+
+
+def _percentiles(draws: NDArray[np.float64], level: float) -> tuple[float, float]:
+    tail = 50.0 * (1.0 - level)
+    low, high = np.percentile(draws, [tail, 100.0 - tail])
+    return float(low), float(high)
+
+
+def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.size == 0 or not np.isfinite(array).all():
+        raise InvalidValueError(f"{name} must hold at least one number and only finite ones, not {array.tolist()}.")
+    return array
+
+
+def _table(values: ArrayLike) -> NDArray[np.float64]:
+    array = _finite("scores", values)
+    if array.ndim > 2:
+        raise InvalidValueError(f"scores must have shape (runs,) or (runs, strata), not {array.shape}.")
+    return array.reshape(len(array), -1)

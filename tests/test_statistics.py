@@ -1,0 +1,102 @@
+"""Statistics against answers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from imagine_bench import statistics
+from imagine_bench.errors import InvalidValueError
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def test_iqm_drops_a_quarter_at_each_end() -> None:
+    assert statistics.iqm([1.0, 2.0, 4.0, 100.0]) == 3.0
+    assert statistics.iqm([[0.0, 8.0], [1.0, 2.0], [3.0, 100.0], [4.0, -50.0]]) == 2.5  # of -50 0 | 1 2 3 4 | 8 100
+    assert statistics.iqm([1.0, 2.0, 9.0]) == 4.0  # three: nothing to trim
+
+
+def test_wilson_by_hand() -> None:
+    z = 1.959963984540054
+    n, p = 10, 0.8
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    assert statistics.wilson(8, 10) == pytest.approx((centre - half, centre + half), abs=1e-12)
+    assert statistics.wilson(0, 5)[0] == 0.0
+    assert statistics.wilson(5, 5)[1] == 1.0
+
+
+def test_wilson_refuses_impossible_counts() -> None:
+    with pytest.raises(InvalidValueError, match="6 successes in 5 trials is impossible"):
+        statistics.wilson(6, 5)
+
+
+def test_bootstrap_of_two_runs_has_the_three_possible_means() -> None:
+    # Resamples of (0, 1): mean 0 with 1/4, 1/2 with 1/2, 1 with 1/4; so 95 % spans everything and 40 % only the middle.
+    assert statistics.bootstrap_interval([0.0, 1.0], rng(), statistic="mean") == (0.0, 1.0)
+    assert statistics.bootstrap_interval([0.0, 1.0], rng(), statistic="mean", level=0.4) == (0.5, 0.5)
+
+
+def test_bootstrap_resamples_within_strata() -> None:
+    # Each task is constant over its runs: resampling within a task can change nothing, mixing tasks would.
+    scores = np.tile([0.0, 10.0], (5, 1))
+    assert statistics.bootstrap_interval(scores, rng(), statistic="mean") == (5.0, 5.0)
+    spread = statistics.bootstrap_interval(scores.ravel(), rng(), statistic="mean")
+    assert spread[1] - spread[0] > 3.0
+
+
+def test_bootstrap_repeats_and_brackets_the_point() -> None:
+    scores = [0.2, 0.5, 0.55, 0.6, 0.9]
+    first = statistics.bootstrap_interval(scores, rng())
+    assert first == statistics.bootstrap_interval(scores, rng())
+    assert first[0] < statistics.iqm(scores) < first[1]
+
+
+def test_bootstrap_covers_as_often_as_it_says() -> None:
+    draw = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        low, high = statistics.bootstrap_interval(draw.normal(size=20), draw, statistic="mean", resamples=300)
+        hits += low <= 0.0 <= high
+    assert 0.87 <= hits / 200 <= 0.98  # percentile bootstrap of 20 undercovers slightly
+
+
+def test_one_run_gives_no_interval() -> None:
+    assert all(math.isnan(end) for end in statistics.bootstrap_interval([0.3], rng()))
+    assert math.isnan(statistics.gain([0.3], [0.2], rng()).low)
+
+
+def test_probability_of_improvement_by_hand() -> None:
+    # Pairs: 3>1, 3>2, 3=3, 1=1, 1<2, 1<3 -> (2 + 2 * 0.5) / 6
+    value, low, high = statistics.probability_of_improvement([3.0, 1.0], [1.0, 2.0, 3.0], rng())
+    assert value == pytest.approx(0.5)
+    assert low < 0.5 < high
+    assert statistics.probability_of_improvement([5.0, 6.0], [1.0, 2.0], rng()) == (1.0, 1.0, 1.0)
+
+
+def test_gain_is_the_thesis_table() -> None:
+    value, _, _ = statistics.gain([62.17], [42.18], rng())
+    assert value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes
+
+
+def test_gain_is_paired_by_seed() -> None:
+    base = np.array([0.2, 0.4, 0.8])
+    value, low, high = statistics.gain(1.5 * base, base, rng())
+    assert (value, low, high) == pytest.approx((0.5, 0.5, 0.5))  # every resample keeps the pairs
+    _, low, high = statistics.gain([1.2, 0.3, 0.6], base, rng())
+    assert high - low > 0.5  # non-vacuous: broken pairs spread
+
+
+def test_gain_over_nothing_is_not_a_number() -> None:
+    assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0], rng()).value)
+
+
+@pytest.mark.parametrize("scores", [[], [float("nan"), 1.0]])
+def test_scores_must_be_numbers(scores: list[float]) -> None:
+    with pytest.raises(InvalidValueError, match="only finite ones"):
+        statistics.iqm(scores)
