@@ -1,0 +1,140 @@
+"""Runs planned motions in the contact simulation, from a canonical start, so that the same start gives the same bits."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from imagine_bench.errors import DivergedError
+
+from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
+from ..scenes.constants import OBSERVATION_QPOS_RAD
+from .arm_model import Floats
+from .trajectory import Trajectory
+
+REST_OPENING_M = 0.0395
+"""Each finger's distance from the grip's middle between macro-actions: a cube's half and 12 mm."""
+
+_RUNAWAY_RAD_S = 200.0
+"""Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
+_BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MacroResult:
+    """What became of one macro-action.
+
+    Attributes:
+        sim_time_s: Simulated seconds.
+        ik_error_m: Largest distance between a solved waypoint and its target.
+        fault: Why the action failed physically, in words, or None.
+        time_s: When the samples of the motion were taken, from 0. Shape (K,), K = 0 without capture.
+        qpos: The samples, whole scene. Shape (K, nq).
+    """
+
+    sim_time_s: float
+    ik_error_m: float
+    fault: str | None
+    time_s: Floats
+    qpos: Floats
+
+
+class MacroExecutor:
+    """Executes trajectories on a compiled scene that holds the arm.
+
+    Args:
+        model: The scene.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+        self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in ARM_JOINTS])
+        self._finger_qpos = np.array([int(model.joint(name).qposadr[0]) for name in FINGER_JOINTS])
+        self._arm_ctrl = np.array([model.actuator(f"{name}_servo").id for name in ARM_JOINTS])
+        fingers = [name.replace("_slide", "_servo") for name in FINGER_JOINTS]
+        self._finger_ctrl = np.array([model.actuator(name).id for name in fingers])
+        self._state = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+        self._qpos_column = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME.value)
+        self._start = np.empty(mujoco.mj_stateSize(model, self._state))
+
+    def rest(self, data: mujoco.MjData) -> None:
+        """Bring ``data`` to the canonical start: the arm at its observation pose, everything still.
+
+        Only the positions of loose objects and of mocap bodies survive; velocities, warm start, sleep states, time
+        and controls are as if new. Hence what follows depends on those positions alone.
+        """
+        qpos, mocap_pos, mocap_quat = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
+        data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
+        data.qpos[self._finger_qpos] = REST_OPENING_M
+        data.ctrl[self._arm_ctrl] = OBSERVATION_QPOS_RAD
+        data.ctrl[self._finger_ctrl] = REST_OPENING_M
+
+    def run(self, data: mujoco.MjData, trajectory: Trajectory) -> Floats:
+        """Execute ``trajectory`` from the canonical start.
+
+        Args:
+            data: Changed in place; its derived quantities (such as ``xpos``) fit the final positions.
+            trajectory: Planned at the model's timestep.
+
+        Returns:
+            Positions of the whole scene, row 0 at the start, row k after step k. Shape (N + 1, nq).
+
+        Raises:
+            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
+        """
+        self.rest(data)
+        mujoco.mj_getState(self.model, data, self._start, self._state)
+        control = np.empty((len(trajectory.opening_m), self.model.nu))  # [N, nu]
+        control[:] = data.ctrl
+        control[:, self._arm_ctrl] = trajectory.arm_command_rad
+        control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
+        states, _ = mujoco.rollout.rollout(self.model, data, self._start, control)  # [1, N, nstate]
+        states = np.concatenate([self._start[None], states[0]])  # [N + 1, nstate]
+        self._check(data, states, control)
+        mujoco.mj_forward(self.model, data)
+        return states[:, self._qpos_column : self._qpos_column + self.model.nq]
+
+    def arm_qpos_rad(self, qpos: Floats) -> Floats:
+        """The arm's joints in positions of the scene: (..., nq) to (..., 7)."""
+        return qpos[..., self._arm_qpos]
+
+    def opening_m(self, qpos: Floats) -> Floats:
+        """Each finger's distance from the grip's middle in positions of the scene: (..., nq) to (..., 2)."""
+        return qpos[..., self._finger_qpos]
+
+    def capture(self, qpos: Floats, motion_hz: float) -> tuple[Floats, Floats]:
+        """Pick samples of a run for a recording.
+
+        Args:
+            qpos: What :meth:`run` returned. Shape (N + 1, nq).
+            motion_hz: Samples a second, at most one a timestep; 0 picks none.
+
+        Returns:
+            Times in s (K,) and positions (K, nq), with the first and the last row whenever ``motion_hz > 0``.
+        """
+        timestep_s = self.model.opt.timestep
+        if motion_hz <= 0:
+            return np.empty(0), np.empty((0, self.model.nq))
+        last = len(qpos) - 1
+        stride = max(1.0, 1.0 / (motion_hz * timestep_s))
+        rows = np.unique(np.append(np.round(np.arange(0, last, stride)).astype(np.int64), last))
+        return rows * timestep_s, qpos[rows].copy()
+
+    def _check(self, data: mujoco.MjData, states: Floats, control: Floats) -> None:
+        """Raise if the simulation blew up."""
+        broken = any(data.warning[int(kind)].number for kind in _BAD_STATE) or not np.isfinite(states[-1]).all()
+        if not broken and np.abs(data.qvel).max() < _RUNAWAY_RAD_S:
+            return
+        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, start_state=self._start, control=control)
+        raise DivergedError(
+            f"The simulation of a macro-action diverged (NaN, infinity or runaway speed); its start and controls are in {path}."
+        )

@@ -1,0 +1,109 @@
+"""Inverse kinematics with mink: the arm configuration whose gripper points straight down at a place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mink
+import numpy as np
+
+from imagine_bench.errors import ImagineBenchError
+
+from ..scenes.constants import HOME_QPOS_RAD
+from .arm_model import ArmModel, Floats
+
+POSITION_TOLERANCE_M = 2e-4
+ANGLE_TOLERANCE_RAD = 2e-3
+MAX_ITERATIONS = 40
+
+_ORIENTATION_COST = 0.3
+_POSTURE_COST = 1e-3  # ten times more leaves 0.3 mm and never converges
+_STEP_S = 1.0  # mink's velocities are plain joint differences then
+
+
+class UnreachableTargetError(ImagineBenchError):
+    """No configuration within the joint limits brings the gripper to the target."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IKSolution:
+    """A configuration that reaches its target.
+
+    Attributes:
+        qpos_rad: Arm joints. Shape (7,).
+        position_error_m: Distance of the tool centre point from the target.
+        angle_error_rad: Angle between the tool's orientation and the target's, tilt and yaw together.
+        iterations: Newton steps taken.
+    """
+
+    qpos_rad: Floats
+    position_error_m: float
+    angle_error_rad: float
+    iterations: int
+
+
+def pointing_down(yaw_rad: float) -> mink.SO3:
+    """The tool's rotation when it points down and its x axis has heading ``yaw_rad`` (0 along world +x)."""
+    return mink.SO3.from_z_radians(yaw_rad) @ mink.SO3.from_x_radians(math.pi)
+
+
+class ArmIK:
+    """Solves for the seven joints, one call a waypoint. A solution depends on the arguments alone.
+
+    Args:
+        arm: The arm to solve on.
+    """
+
+    def __init__(self, arm: ArmModel) -> None:
+        self._configuration = mink.Configuration(arm.model)
+        self._reach = mink.FrameTask("tcp", "site", position_cost=1.0, orientation_cost=_ORIENTATION_COST)
+        self._posture = mink.PostureTask(arm.model, cost=_POSTURE_COST)
+        self._posture.set_target(np.array(HOME_QPOS_RAD))
+        self._limits = [mink.ConfigurationLimit(arm.model)]
+
+    def solve(
+        self,
+        *,
+        position_in_base_m: Floats,
+        yaw_rad: float,
+        start_qpos_rad: Floats | None = None,
+        max_iterations: int = MAX_ITERATIONS,
+    ) -> IKSolution:
+        """Find the configuration nearest the home posture that points straight down at a place.
+
+        Args:
+            position_in_base_m: Where the tool centre point shall be. Shape (3,).
+            yaw_rad: Heading of the tool's x axis about the vertical.
+            start_qpos_rad: Where the search starts, such as a known solution nearby; home if None. Shape (7,).
+            max_iterations: Newton steps before giving up.
+
+        Raises:
+            UnreachableTargetError: No convergence; the message gives target, residual and tolerance.
+        """
+        self._reach.set_target(mink.SE3.from_rotation_and_translation(pointing_down(yaw_rad), position_in_base_m))
+        self._configuration.update(np.array(HOME_QPOS_RAD if start_qpos_rad is None else start_qpos_rad))
+        tasks = [self._reach, self._posture]
+        for iteration in range(max_iterations + 1):
+            position_error_m, angle_error_rad = self._errors()
+            if position_error_m < POSITION_TOLERANCE_M and angle_error_rad < ANGLE_TOLERANCE_RAD:
+                return IKSolution(
+                    qpos_rad=self._configuration.q.copy(),
+                    position_error_m=position_error_m,
+                    angle_error_rad=angle_error_rad,
+                    iterations=iteration,
+                )
+            if iteration < max_iterations:
+                velocity = mink.solve_ik(self._configuration, tasks, _STEP_S, "daqp", limits=self._limits)
+                self._configuration.integrate_inplace(velocity, _STEP_S)
+        raise UnreachableTargetError(
+            f"The gripper cannot reach {np.round(position_in_base_m, 4).tolist()} m at yaw {math.degrees(yaw_rad):.0f} deg: "
+            f"after {max_iterations} steps it is {1000 * position_error_m:.1f} mm and {math.degrees(angle_error_rad):.1f} deg "
+            f"away, allowed are {1000 * POSITION_TOLERANCE_M:g} mm and {math.degrees(ANGLE_TOLERANCE_RAD):.2f} deg; "
+            "move the target nearer to the middle of the table."
+        )
+
+    def _errors(self) -> tuple[float, float]:
+        """Distance (m) and angle (rad) still missing."""
+        error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
+        return math.hypot(*error[:3]), math.hypot(*error[3:])

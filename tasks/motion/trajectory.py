@@ -1,0 +1,124 @@
+"""Minimum-jerk motions in joint space, as fast as the joints' own speed and effort limits allow.
+
+Between two waypoints every joint follows q0 + (q1 - q0) s(t / T) with s = 10 x³ - 15 x⁴ + 6 x⁵ (Flash and Hogan, 1985):
+speed peaks at 1.875 Δq / T and acceleration at 10 / √3 Δq / T². The servo commands carry feed-forward terms, so that a
+plain position servo follows without lag.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .arm_model import ArmModel, Floats
+
+PEAK_SPEED = 15 / 8
+"""Of the minimum-jerk profile, in Δq / T."""
+PEAK_ACCELERATION = 10 / math.sqrt(3)
+"""Of the minimum-jerk profile, in Δq / T²."""
+
+SPEED_SHARE = 0.97
+"""Share of the speed limits that a plan uses; the rest is left to the servos."""
+EFFORT_SHARE = 0.7
+"""Share of the effort limits that accelerating may take; the rest is left to damping, load and the servos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """Where arm and fingers shall be next, at rest.
+
+    Attributes:
+        name: What this motion is for, such as ``"close"``; unique in its trajectory.
+        qpos_rad: Arm joints. Shape (7,).
+        opening_m: Commanded distance of each pad from the grip's middle. Less than the object's half width squeezes it.
+        min_duration_s: The motion takes at least so long, such as the time fingers need.
+    """
+
+    name: str
+    qpos_rad: Floats
+    opening_m: float
+    min_duration_s: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """A motion sampled once a timestep; row k is what holds at the end of step k.
+
+    Attributes:
+        qpos_rad: Planned arm joints. Shape (N, 7).
+        arm_command_rad: Commands to the arm's position servos. Shape (N, 7).
+        opening_m: Command to each finger. Shape (N,).
+        last_step: Index of the last step of each waypoint's motion, by name.
+    """
+
+    qpos_rad: Floats
+    arm_command_rad: Floats
+    opening_m: Floats
+    last_step: dict[str, int]
+
+
+def minimum_jerk(steps: int) -> Floats:
+    """The profile s and its first two derivatives at x = 1/steps, 2/steps, .., 1. Shape (3, steps)."""
+    x = np.arange(1, steps + 1) / steps
+    return np.stack(
+        [x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2, 60 * x * (1 - x) * (1 - 2 * x)]
+    )  # [3, steps]
+
+
+def shortest_duration_s(arm: ArmModel, delta_rad: Floats, inertia: Floats) -> float:
+    """The least time for a minimum-jerk motion within the shares of the speed and effort limits.
+
+    Args:
+        arm: Its limits count.
+        delta_rad: Joint differences. Shape (7,).
+        inertia: Joint-space inertia along the way, kg·m². Shape (7, 7).
+    """
+    by_speed = PEAK_SPEED * np.max(np.abs(delta_rad) / (SPEED_SHARE * arm.speed_limit_rad_s))
+    by_effort = PEAK_ACCELERATION * np.max(np.abs(inertia @ delta_rad) / (EFFORT_SHARE * arm.effort_limit_nm))
+    return float(max(by_speed, math.sqrt(by_effort)))
+
+
+def plan(
+    arm: ArmModel, *, start_qpos_rad: Floats, start_opening_m: float, waypoints: Sequence[Waypoint], timestep_s: float
+) -> Trajectory:
+    """Join the waypoints by minimum-jerk motions, each as short as the limits allow.
+
+    The command is q + (K_d q' + M q'') / K_p, which cancels what damping and inertia would make the servo lag
+    (gravity is compensated in the model). M is taken halfway along each motion.
+
+    Args:
+        arm: The arm that moves.
+        start_qpos_rad: Where it rests before. Shape (7,).
+        start_opening_m: Where each finger rests before.
+        waypoints: At least one.
+        timestep_s: Of the simulation.
+    """
+    from_qpos_rad, from_opening_m = start_qpos_rad, start_opening_m
+    qpos, commands, openings = [], [], []
+    last_step: dict[str, int] = {}
+    steps_so_far = 0
+    for waypoint in waypoints:
+        delta_rad = waypoint.qpos_rad - from_qpos_rad
+        inertia = arm.inertia(from_qpos_rad + delta_rad / 2)
+        duration_s = max(shortest_duration_s(arm, delta_rad, inertia), waypoint.min_duration_s, timestep_s)
+        steps = math.ceil(duration_s / timestep_s - 1e-9)
+        s, ds, dds = minimum_jerk(steps)
+        duration_s = steps * timestep_s
+        position_rad = from_qpos_rad + s[:, None] * delta_rad  # [steps, 7]
+        damping_rad = arm.damping_nms_rad * delta_rad / (duration_s * arm.stiffness_nm_rad)  # [7]
+        inertia_rad = inertia @ delta_rad / (duration_s**2 * arm.stiffness_nm_rad)  # [7]
+        qpos.append(position_rad)
+        commands.append(position_rad + ds[:, None] * damping_rad + dds[:, None] * inertia_rad)
+        openings.append(from_opening_m + s * (waypoint.opening_m - from_opening_m))
+        steps_so_far += steps
+        last_step[waypoint.name] = steps_so_far - 1
+        from_qpos_rad, from_opening_m = waypoint.qpos_rad, waypoint.opening_m
+    return Trajectory(
+        qpos_rad=np.concatenate(qpos),
+        arm_command_rad=np.concatenate(commands),
+        opening_m=np.concatenate(openings),
+        last_step=last_step,
+    )
