@@ -24,6 +24,7 @@ Macrostate = NDArray[np.int64]
 
 APPEARANCES = ("clean", "mild", "strong")
 EXECUTIONS = ("physics", "kinematic")
+DEVICES = ("cpu", "cuda")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.registry import agent_entry, task_entry
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
@@ -33,7 +33,9 @@ class Protocol:
         appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
         overrides: Agent settings that replace the preset's, as sorted (dotted name, value) pairs.
         open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
-        recorded_episodes: Real episodes in each recording.
+        recorded_episodes: Real episodes in each recording; 0 records none.
+        encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
+        device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
     """
 
     task: str
@@ -47,6 +49,8 @@ class Protocol:
     overrides: tuple[tuple[str, Any], ...] = ()
     open_loop_starts: int = 100
     recorded_episodes: int = 5
+    encoder: str | None = None
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         task_entry(self.task)
@@ -54,6 +58,7 @@ class Protocol:
             agent_entry(agent)
         require_known("appearance", self.appearance, APPEARANCES)
         require_known("execution", self.execution, EXECUTIONS)
+        require_known("device", self.device, DEVICES)
         _require_ascending("budgets", self.budgets, at_least=1)
         _require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
         if not self.agents or len(set(self.agents)) != len(self.agents):

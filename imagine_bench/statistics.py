@@ -99,6 +99,26 @@ def probability_of_improvement(
     return Estimate(value, *_percentiles(draws, level))
 
 
+def difference(
+    treated: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
+) -> Estimate:
+    """Difference of the interquartile means of two agents, whose runs are resampled independently.
+
+    Args:
+        treated: Shape (runs,) or (runs, strata).
+        base: Shape (other runs,) or (other runs, strata).
+        rng: Draws the resamples.
+        level: Coverage of the interval.
+        resamples: Bootstrap samples.
+    """
+    a, b = _table(treated), _table(base)
+    value = iqm(a) - iqm(b)
+    if min(len(a), len(b)) < 2:
+        return Estimate(value, float("nan"), float("nan"))
+    sides = [_summary(_resample(side, rng, resamples).reshape(resamples, -1), "iqm") for side in (a, b)]
+    return Estimate(value, *_percentiles(sides[0] - sides[1], level))
+
+
 def gain(
     augmented: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
 ) -> Estimate:

@@ -79,6 +79,12 @@ def test_probability_of_improvement_by_hand() -> None:
     assert statistics.probability_of_improvement([5.0, 6.0], [1.0, 2.0], rng()) == (1.0, 1.0, 1.0)
 
 
+def test_difference_by_hand() -> None:
+    assert statistics.difference([3.0, 3.0], [1.0, 1.0, 1.0], rng()) == (2.0, 2.0, 2.0)
+    value, low, high = statistics.difference([0.0, 1.0], [0.0, 1.0], rng())
+    assert (value, low, high) == (0.0, -1.0, 1.0)  # either side is 0 or 1 with 1/4 each: both ends have 1/16
+
+
 def test_gain_is_the_thesis_table() -> None:
     value, _, _ = statistics.gain([62.17], [42.18], rng())
     assert value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes

@@ -1,0 +1,126 @@
+"""The facts of a machine and an installation that stand beside every result."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import imagine_bench
+from imagine_bench import registry
+from imagine_bench.errors import SetupError
+
+PACKAGES = (
+    "dm-control", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
+)  # fmt: skip
+GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def describe_environment() -> dict[str, Any]:
+    """Command, commit, versions, machine, GL renderer, threads; JSON-like.
+
+    Where there is no GL, ``gl_renderer`` says why not.
+    """
+    return {
+        "command": command(),
+        "commit": commit(),
+        "versions": versions(),
+        "machine": machine(),
+        "gl_renderer": _gl_renderer_or_reason(),
+        "threads_a_run": 1,
+    }
+
+
+def command() -> str:
+    """The command line of this process, with the program's bare name."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def commit() -> str | None:
+    """The checkout's commit, with ``+changes`` if tracked files differ from it; None outside a checkout."""
+    top = Path(imagine_bench.__file__).parent.parent
+    if not (top / ".git").exists() or shutil.which("git") is None:
+        return None
+    head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")
+    changed = _output("git", "-C", str(top), "status", "--porcelain", "--untracked-files=no")
+    return f"{head}+changes" if head and changed else head
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and the packages that decide its numbers, read without importing them."""
+    found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "missing"
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """Operating system, processor, cores this process may use, memory, NVIDIA GPU."""
+    return {
+        "system": platform.platform(),
+        "cpu": cpu_model(),
+        "cores": usable_cores(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": gpu_model(),
+        "thread_variables": {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ},
+    }
+
+
+def cpu_model() -> str:
+    """The processor's name as the system gives it."""
+    if sys.platform == "darwin":
+        return _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.machine())
+
+
+def gpu_model() -> str | None:
+    """The first NVIDIA GPU's name, or None."""
+    if shutil.which("nvidia-smi") is None:
+        return None
+    names = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
+    return names.splitlines()[0] if names else None
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def gl_renderer() -> str:
+    """Vendor and renderer of the OpenGL that draws the frames.
+
+    Raises:
+        SetupError: There is none; the message says what to install.
+    """
+    name: str = registry.load(GL_RENDERER)()
+    return name
+
+
+def _gl_renderer_or_reason() -> str:
+    try:
+        return gl_renderer()
+    except SetupError as error:
+        return f"none: {error}"
+
+
+def _output(*words: str) -> str | None:
+    """What a command prints, stripped; None if it fails."""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

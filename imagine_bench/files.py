@@ -1,0 +1,159 @@
+"""Writing so that a file is either whole or absent, and saying in one sentence why it could not be written."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import ArtefactError, BusyError, SetupError
+
+_REASONS = {
+    errno.EACCES: "you may not write there; choose another folder with --out or change its permissions",
+    errno.EPERM: "you may not write there; choose another folder with --out or change its permissions",
+    errno.EROFS: "that file system is read-only; choose another folder with --out",
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.EDQUOT: "your disk quota is used up; free some space and run the same command again",
+    errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder with --out",
+    errno.EEXIST: "a part of that path is a file, not a folder; choose another folder with --out",
+    errno.ENOLCK: "that file system cannot lock files; choose a local folder with --out",
+    errno.ENOTSUP: "that file system cannot lock files; choose a local folder with --out",
+}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the operating system's refusal to write at ``path`` into one sentence.
+
+    Raises:
+        SetupError: The folder is not writable, the disk is full, or the like.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = _REASONS.get(error.errno or 0, error.strerror or str(error))
+        raise SetupError(f"Cannot write {path}: {reason}.") from error
+
+
+def make_folder(folder: Path) -> Path:
+    """Create ``folder`` with its parents if need be.
+
+    Raises:
+        SetupError: It cannot be made.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in ``folder`` survive a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a whole file at once: to a temporary neighbour, to the disk, then into place.
+
+    Raises:
+        SetupError: It cannot be written; an earlier file at ``path`` is untouched.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with writing(path):
+        try:
+            with temporary.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            temporary.replace(path)
+            sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as JSON, atomically.
+
+    Raises:
+        SetupError: It cannot be written.
+    """
+    write_bytes(path, (json.dumps(value, indent=1) + "\n").encode())
+
+
+def read_json(path: Path, what: str) -> Any:
+    """What a JSON file holds.
+
+    Args:
+        path: The file.
+        what: What it should be, for the error.
+
+    Raises:
+        ArtefactError: It is missing or damaged; it is left untouched.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise ArtefactError(f"{path} is not {what}: {error}. It was left untouched.") from error
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file.
+
+    Raises:
+        ArtefactError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise ArtefactError(f"Cannot read {path}: {error.strerror}.") from error
+
+
+@contextmanager
+def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold the lock file ``path``; the system lets go of it when this process ends, however it ends.
+
+    Args:
+        path: The lock file, which stays behind, empty of meaning once nobody holds it.
+        busy: Where another process works, for the error.
+        patience_s: How long to wait for the holder, in seconds.
+
+    Raises:
+        BusyError: Another live process holds it; the message says which.
+        SetupError: The folder cannot be written or locked.
+    """
+    with writing(path):
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        _acquire(handle, path, busy, time.monotonic() + patience_s)
+        os.ftruncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        yield
+    finally:
+        os.close(handle)
+
+
+def _acquire(handle: int, path: Path, busy: str, deadline_s: float) -> None:
+    while True:
+        try:
+            with writing(path):
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except SetupError as error:
+            if not isinstance(error.__cause__, BlockingIOError):
+                raise
+        if time.monotonic() >= deadline_s:
+            holder = os.pread(handle, 200, 0).decode(errors="replace") or "another process"
+            raise BusyError(f"{busy} is in use by {holder}; wait for it, stop it, or choose another folder with --out.")
+        time.sleep(0.05)
