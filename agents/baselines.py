@@ -1,0 +1,107 @@
+"""The floor and the ceiling: an agent that knows nothing, and one that is shown everything. Neither learns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+
+
+class RandomAgent:
+    """Uniformly random macro-actions, when it is tested too.
+
+    Args:
+        n_actions: A.
+        rng: Draws them.
+    """
+
+    def __init__(self, n_actions: int, rng: np.random.Generator) -> None:
+        self._n_actions, self._rng = n_actions, rng
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Any action, each equally likely."""
+        return int(self._rng.integers(self._n_actions))
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Learn nothing."""
+
+    def diagnostics(self) -> dict[str, float]:
+        """Nothing is measured."""
+        return {}
+
+    def state(self) -> AgentState:
+        """The generator's state."""
+        return AgentState(arrays={}, values={"generator": self._rng.bit_generator.state})
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a generator's state.
+
+        Raises:
+            ArtefactError: The snapshot is of another agent.
+        """
+        _require_only(state, {"generator"})
+        self._rng.bit_generator.state = state.values["generator"]
+
+
+class OracleAgent:
+    """An optimal action of the rules in the true macrostate.
+
+    Args:
+        optimal_action: The rules' optimal policy.
+    """
+
+    def __init__(self, optimal_action: Callable[[tuple[int, ...]], int]) -> None:
+        self._optimal_action = optimal_action
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """The optimal action.
+
+        Raises:
+            InvalidValueError: The observation does not show the macrostate.
+        """
+        if observation.macrostate is None:
+            raise InvalidValueError("The oracle was shown no macrostate; give it privileged observations.")
+        return self._optimal_action(tuple(int(value) for value in observation.macrostate))
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Learn nothing."""
+
+    def diagnostics(self) -> dict[str, float]:
+        """Nothing is measured."""
+        return {}
+
+    def state(self) -> AgentState:
+        """Nothing to remember."""
+        return AgentState(arrays={}, values={})
+
+    def restore(self, state: AgentState) -> None:
+        """Take up nothing.
+
+        Raises:
+            ArtefactError: The snapshot is of another agent.
+        """
+        _require_only(state, set())
+
+
+def _require_only(state: AgentState, values: set[str]) -> None:
+    for name in sorted((set(state.values) ^ values) | set(state.arrays)):
+        raise ArtefactError(f"The snapshot differs from this agent's in {name!r}; it is of another agent or damaged.")
+
+
+def make_random(context: AgentContext) -> RandomAgent:
+    """The ``random`` agent."""
+    return RandomAgent(context.n_actions, context.seeds.child("exploration").generator())
+
+
+def make_oracle(context: AgentContext) -> OracleAgent:
+    """The ``oracle`` agent.
+
+    Raises:
+        InvalidValueError: The context has no rules to ask.
+    """
+    if context.optimal_action is None:
+        raise InvalidValueError("The oracle needs the rules' optimal action in its context.")
+    return OracleAgent(context.optimal_action)

@@ -1,0 +1,83 @@
+"""The controller: Q-learning by a small network on latents (thesis 5.2.3; Mnih et al. 2015, no target network)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from imagine_bench.errors import DivergedError
+
+from .layers import MemberMLP
+from .memory import Batch
+from .settings import ControllerSettings
+
+
+def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: float) -> Tensor:
+    """One-step target ``r + gamma max_a Q(z', a)``.
+
+    Termination stops bootstrapping; truncation does not, since ``terminated`` is 0 there.
+
+    Args:
+        reward: Shape (B,).
+        terminated: 0 or 1. Shape (B,).
+        q_next: Values of the next states. Shape (B, A).
+        discount: Gamma a macro-action, in [0, 1].
+
+    Returns:
+        Targets. Shape (B,).
+    """
+    return reward + discount * (1.0 - terminated) * q_next.amax(dim=-1)
+
+
+def epsilon(step: int, settings: ControllerSettings) -> float:
+    """Exploration probability at real step ``step``: equation 3.3, from the maximum down to the minimum."""
+    span = settings.epsilon_max - settings.epsilon_min
+    return settings.epsilon_min + span * math.exp(-settings.epsilon_decay * step)
+
+
+class Controller(nn.Module):
+    """Action values of latents.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes and rates.
+        generator: Draws the initial weights; its device is the controller's.
+    """
+
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: ControllerSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.n_actions, self.settings = n_actions, settings
+        sizes = (latent_size, *settings.hidden, n_actions)
+        self.network = MemberMLP(sizes, members=1, dropout=0.0, generator=generator)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+
+    @torch.no_grad()
+    def values(self, z: Tensor) -> Tensor:
+        """Action values of latents (N, Z). Shape (N, A)."""
+        return self.network(z.unsqueeze(0)).squeeze(0)
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Mean squared Bellman error; no gradient flows through the target."""
+        target = td_target(batch.reward, batch.terminated, self.values(batch.next_z), self.settings.discount)
+        q = self.network(batch.z.unsqueeze(0)).squeeze(0).gather(1, batch.action.unsqueeze(1)).squeeze(1)  # [B]
+        return (target - q).square().mean()
+
+    def update(self, batch: Batch) -> float:
+        """One step of Adam on a batch; returns the loss before it.
+
+        Raises:
+            DivergedError: The loss is NaN or infinite; the weights are left as they were.
+        """
+        loss = self.loss(batch)
+        value = loss.item()
+        if not math.isfinite(value):
+            raise DivergedError(f"The controller's loss is {value}. Lower controller.learning_rate.")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        return value

@@ -1,0 +1,16 @@
+"""The baseline: a DQN on latents that learns from real transitions alone."""
+
+from __future__ import annotations
+
+from imagine_bench.interfaces import AgentContext
+
+from .learner import Learner
+from .perception import load_perception, prepare_torch
+from .presets import resolve
+
+
+def make(context: AgentContext) -> Learner:
+    """The ``dqn`` agent."""
+    settings = resolve(context.preset, context.overrides)
+    device = prepare_torch(context.device)
+    return Learner(load_perception(context), context.n_actions, settings, context.seeds, device)

@@ -1,0 +1,168 @@
+"""Imagination: the world model in closed loop, and the epistemic filter on what it says (thesis 5.2.2).
+
+From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
+dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from imagine_bench.seeding import SeedTree
+
+from . import mixture as mdn
+from . import snapshot
+from .controller import Controller
+from .layers import Masks
+from .memory import Batch, ImaginedMemory, RealMemory
+from .settings import Settings
+from .uncertainty import Uncertainty, decompose, reduction
+from .world_model import ModelLosses, WorldModel
+
+TERMINAL = 0.5
+"""Predicted probability above which a rollout ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Imagined:
+    """One imagined step of N rollouts.
+
+    Attributes:
+        next_z: Shape (N, Z).
+        reward: Predicted reward. Shape (N,).
+        p_terminated: Predicted probability that the episode ends there. Shape (N,).
+        uncertainty: Predictive variance by cause, (N, Z) each.
+    """
+
+    next_z: Tensor
+    reward: Tensor
+    p_terminated: Tensor
+    uncertainty: Uncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How much one call imagined: rollouts begun, transitions predicted, transitions kept."""
+
+    rollouts: int
+    predicted: int
+    accepted: int
+
+
+def imagine_step(
+    model: WorldModel,
+    z: Tensor,
+    action: Tensor,
+    weights: Masks | None,
+    *,
+    temperature: float,
+    generator: torch.Generator,
+) -> Imagined:
+    """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
+    samples = model.predict(z, action, weights)  # [T, N, ...]
+    next_z = mdn.sample(mdn.average(samples), temperature, generator)
+    reward, p_terminated = model.assess(next_z)
+    return Imagined(next_z, reward, p_terminated, decompose(samples))
+
+
+class Imagination:
+    """A world model, what it imagines, and the filter between the two.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: All hyperparameters of the learner.
+        filtered: Whether epistemic variance above the threshold discards a transition and the rest of its rollout.
+        seeds: This imagination's node of the seed tree.
+        device: Where networks and memory lie.
+    """
+
+    def __init__(
+        self,
+        latent_size: int,
+        n_actions: int,
+        settings: Settings,
+        *,
+        filtered: bool,
+        seeds: SeedTree,
+        device: torch.device,
+    ) -> None:
+        self.settings, self.filtered = settings.imagination, filtered
+        self._generators = {
+            name: torch.Generator(device).manual_seed(seeds.child(name).integer())
+            for name in ("weights", "replay", "dropout", "rollouts")
+        }
+        self.model = WorldModel(latent_size, n_actions, settings.model, self._generators["weights"])
+        self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
+        self._reduce = reduction(self.settings.reduction)
+
+    def learn(self, real: RealMemory) -> list[ModelLosses]:
+        """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
+        updates, size = self.model.settings.updates_per_step, self.model.settings.batch_size
+        drawn = real.sample(updates * size, self._generators["replay"])
+        parts = zip(*(getattr(drawn, field.name).split(size) for field in fields(Batch)), strict=True)
+        return [self.model.update(Batch(*part), self._generators["dropout"]) for part in parts]
+
+    def score(self, variances: Tensor) -> Tensor:
+        """Reduce variances (..., Z) as the filter does. Shape (...)."""
+        return self._reduce(variances)
+
+    def keeps(self, uncertainty: Uncertainty) -> Tensor:
+        """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
+        score = self.score(uncertainty.epistemic)
+        return score <= self.settings.threshold if self.filtered else torch.ones_like(score, dtype=torch.bool)
+
+    def rollouts(self, controller: Controller, z: Tensor, epsilon: float) -> Counts:
+        """Imagine ``I_B`` rollouts from one state and store what the filter keeps.
+
+        A rollout ends where the model says that the episode does, or with its first discarded transition.
+
+        Args:
+            controller: Chooses the actions, epsilon-greedily.
+            z: The state to start from. Shape (Z,).
+            epsilon: Probability of a random action; that of the settings counts where it is larger.
+        """
+        settings, generator = self.settings, self._generators["rollouts"]
+        weights = self.model.draw_weights(settings.weight_samples, self._generators["dropout"])
+        z, predicted, accepted = z.expand(settings.breadth, -1), 0, 0
+        for _ in range(settings.depth):
+            action = self._act(controller, z, max(epsilon, settings.exploration))
+            step = imagine_step(self.model, z, action, weights, temperature=settings.temperature, generator=generator)
+            terminated = step.p_terminated > TERMINAL
+            keep = self.keeps(step.uncertainty)
+            kept = int(keep.sum())
+            predicted, accepted = predicted + len(z), accepted + kept
+            if kept:
+                batch = Batch(z, action, step.reward, step.next_z, terminated.float())
+                self.memory.add(Batch(*(getattr(batch, field.name)[keep] for field in fields(Batch))))
+            z = step.next_z[keep & ~terminated]
+            if len(z) == 0:
+                break
+        return Counts(settings.breadth, predicted, accepted)
+
+    def _act(self, controller: Controller, z: Tensor, epsilon: float) -> Tensor:
+        """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
+        greedy = controller.values(z).argmax(dim=-1)
+        size, generator = greedy.shape, self._generators["rollouts"]
+        random = torch.randint(controller.n_actions, size, generator=generator, device=generator.device)
+        explores = torch.rand(size, generator=generator, device=generator.device) < epsilon
+        return torch.where(explores, random, greedy)
+
+    def arrays(self) -> snapshot.Arrays:
+        """Copies of weights, moments, memory and generators."""
+        generators = {name: snapshot.generator_array(generator) for name, generator in self._generators.items()}
+        return {
+            **snapshot.prefixed("model", snapshot.trained_arrays(self.model, self.model.optimiser)),
+            **snapshot.prefixed("memory", self.memory.arrays()),
+            **snapshot.prefixed("generator", generators),
+        }
+
+    def load(self, arrays: snapshot.Arrays, added: int) -> None:
+        """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
+        snapshot.load_trained(self.model, self.model.optimiser, snapshot.below("model", arrays))
+        self.memory.load(snapshot.below("memory", arrays), added)
+        for name, generator in self._generators.items():
+            snapshot.load_generator(generator, arrays[f"generator/{name}"])

@@ -1,0 +1,105 @@
+"""The thesis' agents: a DQN fed by imagination, without and with the epistemic filter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, Frame, ImaginedRollout
+
+from .imagination import TERMINAL, Imagination, Imagined, imagine_step
+from .learner import Learner
+from .perception import load_perception, prepare_torch
+from .presets import resolve
+
+
+class ImaginingLearner(Learner):
+    """A learner whose imagination can be looked at."""
+
+    imagination: Imagination
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.interfaces.Imaginer`.
+
+        Raises:
+            InvalidValueError: No depth to imagine, or actions that are none.
+        """
+        planned = None if actions is None else [int(action) for action in actions[:depth]]
+        if depth < 1 or planned == []:
+            raise InvalidValueError(f"Asked to imagine depth {depth} along actions {actions}; give at least one.")
+        if planned is not None and not all(0 <= action < self.n_actions for action in planned):
+            raise InvalidValueError(f"Actions {planned} must lie in [0, {self.n_actions}).")
+        start, _ = self.perception.posterior(frame)
+        steps = list(self._unroll(start.unsqueeze(0), planned, depth, rng))
+        return self._picture(start.unsqueeze(0), steps)
+
+    def _unroll(
+        self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator
+    ) -> Iterator[tuple[Tensor, Tensor, Imagined]]:
+        """Values before, action and result of each imagined step, one rollout."""
+        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
+        model, settings = self.imagination.model, self.imagination.settings
+        weights = model.draw_weights(settings.weight_samples, generator)
+        for index in range(depth if planned is None else len(planned)):
+            values = self.controller.values(z)  # [1, A]
+            action = values.argmax(dim=-1) if planned is None else torch.tensor([planned[index]], device=z.device)
+            step = imagine_step(model, z, action, weights, temperature=settings.temperature, generator=generator)
+            yield values, action, step
+            if planned is None and float(step.p_terminated) > TERMINAL:
+                return
+            z = step.next_z
+
+    def _picture(self, start: Tensor, steps: list[tuple[Tensor, Tensor, Imagined]]) -> ImaginedRollout:
+        values, actions, imagined = zip(*steps, strict=True)
+        encoder, imagination = self.perception.encoder, self.imagination
+        latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
+        kept = torch.cat([imagination.keeps(step.uncertainty) for step in imagined]).cpu().numpy()  # [D]
+
+        def reduced(cause: str) -> NDArray[np.float32]:
+            parts = [imagination.score(getattr(step.uncertainty, cause)) for step in imagined]
+            return torch.cat(parts).cpu().numpy()
+
+        return ImaginedRollout(
+            actions=torch.cat(actions).cpu().numpy(),
+            frames=encoder.decode(latents),
+            start_frame=encoder.decode(start)[0],
+            rewards=torch.cat([step.reward for step in imagined]).cpu().numpy(),
+            p_terminated=torch.cat([step.p_terminated for step in imagined]).cpu().numpy(),
+            q_values=torch.cat(values).cpu().numpy(),
+            epistemic=reduced("epistemic"),
+            aleatoric=reduced("aleatoric"),
+            modal=reduced("modal"),
+            accepted=np.logical_and.accumulate(kept),
+            macrostates=encoder.read_macrostate(latents),
+        )
+
+
+def _make(context: AgentContext, *, filtered: bool) -> ImaginingLearner:
+    settings = resolve(context.preset, context.overrides)
+    device, perception = prepare_torch(context.device), load_perception(context)
+    imagination = Imagination(
+        perception.latent_size,
+        context.n_actions,
+        settings,
+        filtered=filtered,
+        seeds=context.seeds.child("imagination"),
+        device=device,
+    )
+    return ImaginingLearner(perception, context.n_actions, settings, context.seeds, device, imagination)
+
+
+def make(context: AgentContext) -> ImaginingLearner:
+    """The ``imagination`` agent: algorithm 1 without the filter."""
+    return _make(context, filtered=False)
+
+
+def make_uncertainty(context: AgentContext) -> ImaginingLearner:
+    """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
+    return _make(context, filtered=True)

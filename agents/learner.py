@@ -1,0 +1,155 @@
+"""Algorithm 1 of the thesis: learn from what happened, then from what was imagined."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import AgentState, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from . import snapshot
+from .controller import Controller, epsilon
+from .imagination import Imagination
+from .memory import ImaginedMemory, RealMemory
+from .meters import Meters
+from .perception import Perception
+from .presets import flatten
+from .settings import Settings
+
+_LOSSES = {"dynamics": "loss/dynamics", "reward": "loss/reward", "termination": "loss/termination"}
+
+
+class Learner:
+    """A DQN on latents and, where it has one, an imagination that feeds it.
+
+    Two learners of one seed act alike until one of them first learns from imagination: every consumer of randomness
+    has a generator of its own.
+
+    Args:
+        perception: Frames to posteriors of latents.
+        n_actions: A.
+        settings: All hyperparameters.
+        seeds: This agent's node of the seed tree.
+        device: Where networks and memories lie.
+        imagination: The world model, its filter and its memory; None for the plain DQN.
+    """
+
+    def __init__(
+        self,
+        perception: Perception,
+        n_actions: int,
+        settings: Settings,
+        seeds: SeedTree,
+        device: torch.device,
+        imagination: Imagination | None = None,
+    ) -> None:
+        self.perception, self.n_actions, self.settings = perception, n_actions, settings
+        self.imagination = imagination
+        self.rng = seeds.child("exploration").generator()
+        self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
+        weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
+        self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
+        self.real = RealMemory(settings.memory.real, perception.latent_size, device)
+        self.meters = Meters()
+        self.steps = 0
+
+    @property
+    def epsilon(self) -> float:
+        """Probability that the next exploring action is random."""
+        return epsilon(self.steps, self.settings.controller)
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        """Values of every macro-action at the mean latents. Shape (A,)."""
+        mu, _ = self.perception.posterior(observation.frame)
+        values: NDArray[np.float32] = self.controller.values(mu.unsqueeze(0))[0].cpu().numpy()
+        return values
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act epsilon-greedily on the mean latents; greedily, and changing nothing, without ``explore``."""
+        if explore and self.rng.random() < self.epsilon:
+            return int(self.rng.integers(self.n_actions))
+        return int(self.q_values(observation).argmax())
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Algorithm 1 after the action: store, N_E model updates, N_R updates on real batches; imagine, N_I updates.
+
+        Raises:
+            DivergedError: A loss is no longer finite.
+        """
+        now = self.perception.posterior(transition.observation.frame)
+        then = self.perception.posterior(transition.next_observation.frame)
+        self.real.add(now, transition.action, transition.reward, then, transition.terminated)
+        if self.imagination is not None:
+            self._learn_model(self.imagination)
+        self._learn_values(self.real, self.settings.controller.updates_per_step)
+        if self.imagination is not None and episode >= self.settings.imagination.start_episode:
+            self._imagine(self.imagination, now[0])
+            self._learn_values(self.imagination.memory, self.settings.imagination.updates_per_step)
+        self.steps += 1
+
+    def _learn_model(self, imagination: Imagination) -> None:
+        with self.meters.cpu_time("time/model_s"):
+            for losses in imagination.learn(self.real):
+                for name, value in asdict(losses).items():
+                    self.meters.add(_LOSSES[name], value)
+
+    def _learn_values(self, memory: RealMemory | ImaginedMemory, updates: int) -> None:
+        if len(memory) == 0:
+            return
+        with self.meters.cpu_time("time/controller_s"):
+            for _ in range(updates):
+                batch = memory.sample(self.settings.controller.batch_size, self._replay)
+                self.meters.add("loss/bellman", self.controller.update(batch))
+
+    def _imagine(self, imagination: Imagination, z: torch.Tensor) -> None:
+        with self.meters.cpu_time("time/imagination_s"):
+            counts = imagination.rollouts(self.controller, z, self.epsilon)
+        self.meters.add("imagination/acceptance_rate", counts.accepted, counts.predicted)
+        self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call of what was measured (``time/*`` in CPU seconds a call), and the counters now."""
+        imagined = {} if self.imagination is None else {"imagined_transitions": float(self.imagination.memory.added)}
+        return {**self.meters.read(), "epsilon": self.epsilon, "real_transitions": float(self.real.added), **imagined}
+
+    def state(self) -> AgentState:
+        """A snapshot: weights, moments, memories, generators, counters, measurements."""
+        arrays = {
+            **snapshot.prefixed("controller", snapshot.trained_arrays(self.controller, self.controller.optimiser)),
+            **snapshot.prefixed("real", self.real.arrays()),
+            "generator/replay": snapshot.generator_array(self._replay),
+        }
+        values = {
+            "steps": self.steps,
+            "real_added": self.real.added,
+            "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(),
+            "settings": snapshot.jsonable(flatten(self.settings)),
+            "filtered": None if self.imagination is None else self.imagination.filtered,
+        }
+        if self.imagination is not None:
+            arrays.update(snapshot.prefixed("imagination", self.imagination.arrays()))
+            values["imagined_added"] = self.imagination.memory.added
+        return AgentState(arrays=arrays, values=values)
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot.
+
+        Raises:
+            ArtefactError: It does not fit this agent; nothing was changed.
+        """
+        snapshot.require_fit(state, self.state())
+        arrays, values = state.arrays, state.values
+        controller = snapshot.below("controller", arrays)
+        snapshot.load_trained(self.controller, self.controller.optimiser, controller)
+        snapshot.load_generator(self._replay, arrays["generator/replay"])
+        self.real.load(snapshot.below("real", arrays), values["real_added"])
+        self.rng.bit_generator.state = values["exploration"]
+        self.meters.restore(values["meters"])
+        self.steps = values["steps"]
+        if self.imagination is not None:
+            self.imagination.load(snapshot.below("imagination", arrays), values["imagined_added"])

@@ -1,0 +1,142 @@
+"""The two memories of algorithm 1, of different kinds and never one buffer (thesis 5.2.2).
+
+The real memory keeps what the encoder saw, mean and standard deviation, and draws ``z ~ N(mu, sigma)`` anew
+for every batch; the imagined memory keeps imagined latents and is short, since recent imagination is the better one.
+A row is one transition with both its ends, so no batch ever pairs states of two episodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imagine_bench.errors import InvalidValueError
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """B transitions between latents.
+
+    Attributes:
+        z: Shape (B, Z).
+        action: Shape (B,), int64.
+        reward: Shape (B,).
+        next_z: Shape (B, Z).
+        terminated: 1 where the episode ended in a terminal state, else 0; truncation is 0. Shape (B,).
+    """
+
+    z: Tensor
+    action: Tensor
+    reward: Tensor
+    next_z: Tensor
+    terminated: Tensor
+
+
+class _Ring:
+    """Named columns of a fixed number of rows; a full ring overwrites its oldest ones."""
+
+    def __init__(self, capacity: int, columns: dict[str, Tensor]) -> None:
+        self.capacity = capacity
+        self.added = 0
+        self._columns = columns
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def _write(self, rows: dict[str, Tensor]) -> None:
+        count = len(next(iter(rows.values())))
+        device = next(iter(self._columns.values())).device
+        index = torch.arange(self.added, self.added + count, device=device) % self.capacity
+        for name, values in rows.items():
+            self._columns[name][index] = values
+        self.added += count
+
+    def _draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        if self.added == 0:
+            raise InvalidValueError("The memory is empty; store a transition before sampling from it.")
+        index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+        return {name: column.index_select(0, index) for name, column in self._columns.items()}
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Copies of the filled rows, by column."""
+        return {name: column[: len(self)].cpu().numpy().copy() for name, column in self._columns.items()}
+
+    def load(self, arrays: dict[str, NDArray[np.generic]], added: int) -> None:
+        """Take up the rows of :meth:`arrays` and the number of rows ever added."""
+        for name, column in self._columns.items():
+            column[: len(arrays[name])] = torch.as_tensor(arrays[name]).to(column.device)
+        self.added = added
+
+
+class RealMemory(_Ring):
+    """Transitions that happened, as posteriors of their latents.
+
+    Args:
+        capacity: Largest number of transitions.
+        latent_size: Z.
+        device: Where the rows lie.
+    """
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
+        latents = ("mu", "sigma", "next_mu", "next_sigma")
+        columns = {name: torch.zeros(capacity, latent_size, device=device) for name in latents}
+        columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
+        columns["reward"] = torch.zeros(capacity, device=device)
+        columns["terminated"] = torch.zeros(capacity, device=device)
+        super().__init__(capacity, columns)
+
+    def add(
+        self,
+        posterior: tuple[Tensor, Tensor],
+        action: int,
+        reward: float,
+        next_posterior: tuple[Tensor, Tensor],
+        terminated: bool,
+    ) -> None:
+        """Store one transition between posteriors (mu, sigma), each of shape (Z,)."""
+        row, columns = self.added % self.capacity, self._columns
+        columns["mu"][row], columns["sigma"][row] = posterior
+        columns["next_mu"][row], columns["next_sigma"][row] = next_posterior
+        columns["action"][row], columns["reward"][row], columns["terminated"][row] = action, reward, float(terminated)
+        self.added += 1
+
+    def sample(self, count: int, generator: torch.Generator) -> Batch:
+        """Draw transitions with replacement, and latents from their posteriors."""
+        rows = self._draw(count, generator)
+        noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator)
+        return Batch(
+            z=torch.addcmul(rows["mu"], rows["sigma"], noise[0]),
+            action=rows["action"],
+            reward=rows["reward"],
+            next_z=torch.addcmul(rows["next_mu"], rows["next_sigma"], noise[1]),
+            terminated=rows["terminated"],
+        )
+
+
+class ImaginedMemory(_Ring):
+    """Transitions that were imagined.
+
+    Args:
+        capacity: Largest number of transitions.
+        latent_size: Z.
+        device: Where the rows lie.
+    """
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
+        columns = {name: torch.zeros(capacity, latent_size, device=device) for name in ("z", "next_z")}
+        columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
+        columns["reward"] = torch.zeros(capacity, device=device)
+        columns["terminated"] = torch.zeros(capacity, device=device)
+        super().__init__(capacity, columns)
+
+    def add(self, batch: Batch) -> None:
+        """Store every transition of a batch."""
+        self._write({name: getattr(batch, name) for name in self._columns})
+
+    def sample(self, count: int, generator: torch.Generator) -> Batch:
+        """Draw transitions with replacement."""
+        return Batch(**self._draw(count, generator))

@@ -1,0 +1,98 @@
+"""The mathematics of Gaussian mixtures with diagonal components, in log space (thesis 2.1.5; Bishop 1994).
+
+Shapes: ``...`` any leading axes, ``K`` components, ``Z`` dimensions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture:
+    """Gaussian mixtures, one a leading index.
+
+    Attributes:
+        log_weights: Logarithms of the mixture coefficients, normalised. Shape (..., K).
+        means: Shape (..., K, Z).
+        log_sigmas: Logarithms of the standard deviations. Shape (..., K, Z).
+    """
+
+    log_weights: Tensor
+    means: Tensor
+    log_sigmas: Tensor
+
+
+def output_size(components: int, dimensions: int) -> int:
+    """Network outputs that one mixture needs: K coefficients, K Z means, K Z log variances."""
+    return components * (1 + 2 * dimensions)
+
+
+def from_outputs(outputs: Tensor, components: int, dimensions: int, log_sigma_floor: float) -> Mixture:
+    """Read network outputs as mixtures: softmax coefficients, linear means, linear log variances.
+
+    Args:
+        outputs: Shape (..., output_size(K, Z)).
+        components: K.
+        dimensions: Z.
+        log_sigma_floor: Smallest log sigma, approached smoothly: a hard clamp would leave no gradient below it.
+    """
+    logits, means, log_variances = outputs.split((components, *2 * (components * dimensions,)), dim=-1)
+    shape = (*outputs.shape[:-1], components, dimensions)
+    log_sigmas = log_sigma_floor + functional.softplus(0.5 * log_variances - log_sigma_floor)
+    return Mixture(logits.log_softmax(dim=-1), means.reshape(shape), log_sigmas.reshape(shape))
+
+
+def log_likelihood(mixture: Mixture, targets: Tensor) -> Tensor:
+    """``log p(targets)`` by log-sum-exp over components. Targets (..., Z), result (...)."""
+    scaled = (targets.unsqueeze(-2) - mixture.means) * torch.exp(-mixture.log_sigmas)  # [..., K, Z]
+    log_normal = -0.5 * (scaled.square() + _LOG_2PI) - mixture.log_sigmas  # [..., K, Z]
+    return torch.logsumexp(mixture.log_weights + log_normal.sum(dim=-1), dim=-1)
+
+
+def mean(mixture: Mixture) -> Tensor:
+    """Mean of each mixture. Shape (..., Z)."""
+    return (mixture.log_weights.exp().unsqueeze(-1) * mixture.means).sum(dim=-2)
+
+
+def variance(mixture: Mixture) -> Tensor:
+    """Variance of each mixture, a dimension at a time: within components plus between them. Shape (..., Z)."""
+    weights = mixture.log_weights.exp().unsqueeze(-1)  # [..., K, 1]
+    between = (mixture.means - mean(mixture).unsqueeze(-2)).square()
+    return (weights * (torch.exp(2.0 * mixture.log_sigmas) + between)).sum(dim=-2)
+
+
+def sample(mixture: Mixture, temperature: float, generator: torch.Generator) -> Tensor:
+    """Draw a component by its coefficient, then a value of it.
+
+    Args:
+        mixture: Mixtures with one leading axis N.
+        temperature: Scale of the component's standard deviation: 0 gives its mean, 1 the thesis' sample.
+        generator: Draws components and noise.
+
+    Returns:
+        One value a mixture. Shape (N, Z).
+    """
+    chosen = torch.multinomial(mixture.log_weights.exp(), 1, generator=generator)  # [N, 1]
+    index = chosen.unsqueeze(-1).expand(-1, 1, mixture.means.shape[-1])  # [N, 1, Z]
+    means = mixture.means.gather(1, index).squeeze(1)
+    if temperature == 0.0:
+        return means
+    noise = torch.empty_like(means).normal_(generator=generator)
+    return means + temperature * mixture.log_sigmas.gather(1, index).squeeze(1).exp() * noise
+
+
+def average(mixtures: Mixture) -> Mixture:
+    """Average coefficients, means and variances over the leading axis of weight samples (thesis 4.4)."""
+    return Mixture(
+        mixtures.log_weights.exp().mean(dim=0).log(),
+        mixtures.means.mean(dim=0),
+        0.5 * torch.exp(2.0 * mixtures.log_sigmas).mean(dim=0).log(),
+    )

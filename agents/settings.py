@@ -1,0 +1,118 @@
+"""Every hyperparameter of the learners, with its unit and its source. The defaults are the thesis' values.
+
+A preset is a list of deviations from them, each beside its reason; ``thesis`` and ``full`` deviate in nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelSettings:
+    """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.3).
+
+    Attributes:
+        dynamics_hidden: Units a hidden layer of the dynamics network.
+        components: Gaussians in its mixture, K.
+        reward_hidden: Units a hidden layer of the reward network.
+        termination_hidden: Units a hidden layer of the termination network.
+        dropout: Probability of dropping a hidden unit, the same in the three networks; [0, 1).
+        learning_rate: Of Adam (thesis 3.2.2: 1e-3).
+        max_norm: Largest norm of the incoming weights of a unit.
+        updates_per_step: Model updates a real step, N_E.
+        batch_size: Transitions an update.
+        predict_change: Whether the mixture describes z' - z instead of z'.
+        reward_unit: Reward that the reward network outputs as 1.
+        sigma_floor: Smallest standard deviation of a component, in units of z.
+        gradient_clip: Largest gradient norm of each of the three networks; None clips nothing.
+    """
+
+    dynamics_hidden: tuple[int, ...] = (256, 256, 256)
+    components: int = 5
+    reward_hidden: tuple[int, ...] = (512, 512, 512)
+    termination_hidden: tuple[int, ...] = (256, 256)
+    dropout: float = 0.5
+    learning_rate: float = 1e-3
+    max_norm: float = 3.0
+    updates_per_step: int = 16
+    batch_size: int = 512
+    predict_change: bool = False
+    reward_unit: float = 1.0
+    sigma_floor: float = 0.01
+    gradient_clip: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerSettings:
+    """The DQN on latents (thesis 5.2.3).
+
+    Attributes:
+        hidden: Units a hidden layer.
+        learning_rate: Of Adam.
+        batch_size: Transitions an update, real or imagined.
+        updates_per_step: Updates on real transitions a real step, N_R.
+        discount: Discount a macro-action, gamma in [0, 1].
+        epsilon_min: Exploration probability in the limit.
+        epsilon_max: Exploration probability at step 0.
+        epsilon_decay: Decay rate lambda, a real step.
+    """
+
+    hidden: tuple[int, ...] = (512, 256, 128)
+    learning_rate: float = 1e-3
+    batch_size: int = 64
+    updates_per_step: int = 1
+    discount: float = 0.95
+    epsilon_min: float = 0.001
+    epsilon_max: float = 0.8
+    epsilon_decay: float = 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginationSettings:
+    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1).
+
+    Attributes:
+        start_episode: First training episode that imagines, I_start.
+        breadth: Rollouts from the current state a real step, I_B.
+        depth: Longest rollout in macro-actions, I_D.
+        updates_per_step: Controller updates on imagined transitions a real step, N_I.
+        temperature: Scale of the component's standard deviation when z' is drawn: 1 the thesis, 0 its mean.
+        exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
+        weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
+        reduction: How the epistemic variances of the latent dimensions become one: sum, mean or max.
+        threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
+    """
+
+    start_episode: int = 1000
+    breadth: int = 3
+    depth: int = 10
+    updates_per_step: int = 1
+    temperature: float = 1.0
+    exploration: float = 0.0
+    weight_samples: int = 50
+    reduction: str = "sum"
+    threshold: float = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemorySettings:
+    """How many transitions each memory keeps; the oldest go first (thesis 5.2.3).
+
+    Attributes:
+        real: Transitions of the real memory.
+        imagined: Transitions of the imagined memory.
+    """
+
+    real: int = 50_000
+    imagined: int = 3_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All settings of a learner."""
+
+    model: WorldModelSettings = field(default_factory=WorldModelSettings)
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
+    imagination: ImaginationSettings = field(default_factory=ImaginationSettings)
+    memory: MemorySettings = field(default_factory=MemorySettings)

@@ -1,0 +1,113 @@
+"""Parts of a learner as named numpy arrays, and the check that a snapshot fits before anything is overwritten."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import AgentState
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays under ``prefix/``."""
+    return {f"{prefix}/{name}": array for name, array in arrays.items()}
+
+
+def below(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays that lie under ``prefix/``, without it."""
+    start = f"{prefix}/"
+    return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+
+
+def trained_arrays(module: nn.Module, optimiser: torch.optim.Adam) -> Arrays:
+    """Copies of a module's parameters and of Adam's moments; before the first update the moments are 0."""
+    arrays: Arrays = {}
+    for name, parameter in module.named_parameters():
+        moments = optimiser.state.get(parameter, {})
+        blank = torch.zeros_like(parameter)
+        parts = {
+            "value": parameter.detach(),
+            "exp_avg": moments.get("exp_avg", blank),
+            "exp_avg_sq": moments.get("exp_avg_sq", blank),
+            "step": moments.get("step", torch.zeros(())),
+        }
+        arrays.update({f"{name}/{part}": tensor.cpu().numpy().copy() for part, tensor in parts.items()})
+    return arrays
+
+
+@torch.no_grad()
+def load_trained(module: nn.Module, optimiser: torch.optim.Adam, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Take up the result of :func:`trained_arrays`."""
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for index, (name, parameter) in enumerate(module.named_parameters()):
+        parts = {part: torch.tensor(arrays[f"{name}/{part}"]) for part in ("value", "exp_avg", "exp_avg_sq", "step")}
+        parameter.copy_(parts.pop("value"))
+        state[index] = parts
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def generator_array(generator: torch.Generator) -> NDArray[np.uint8]:
+    """A torch generator's state."""
+    return generator.get_state().numpy().copy()
+
+
+def load_generator(generator: torch.Generator, array: NDArray[np.uint8]) -> None:
+    """Take up the result of :func:`generator_array`."""
+    generator.set_state(torch.tensor(array))
+
+
+def jsonable(values: dict[str, Any]) -> dict[str, Any]:
+    """The values as JSON would give them back."""
+    result: dict[str, Any] = json.loads(json.dumps(values))
+    return result
+
+
+_ROWS_VARY = ("real/", "imagination/memory/")
+
+
+def require_fit(given: AgentState, own: AgentState) -> None:
+    """Check a snapshot against the agent's own: settings, names of values, and names, types and shapes of arrays.
+
+    Args:
+        given: The snapshot.
+        own: The agent's present state.
+
+    Raises:
+        ArtefactError: It does not fit; the message names the first difference.
+    """
+    _require_same_names(given.values, own.values)
+    for part in ("filtered", "settings"):
+        _require_equal(part, given.values[part], own.values[part])
+    _require_same_names(given.arrays, own.arrays)
+    for name, ours in own.arrays.items():
+        theirs, start = given.arrays[name], 1 if name.startswith(_ROWS_VARY) else 0
+        if (theirs.dtype, theirs.shape[start:]) != (ours.dtype, ours.shape[start:]):
+            raise ArtefactError(
+                f"{name!r} in the snapshot is {theirs.dtype} {theirs.shape}, in this agent {ours.dtype} {ours.shape}; "
+                "restore it with the settings and the encoder it was made with."
+            )
+
+
+def _require_same_names(given: Collection[str], own: Collection[str]) -> None:
+    for name in sorted(set(given) ^ set(own)):
+        verb = "lacks" if name in own else "has"
+        raise ArtefactError(f"The snapshot {verb} {name!r}, unlike this agent; it is of another agent or damaged.")
+
+
+def _require_equal(name: str, given: Any, own: Any) -> None:
+    if isinstance(own, dict) and isinstance(given, dict) and set(given) == set(own):
+        for key in own:
+            _require_equal(f"{name}.{key}", given[key], own[key])
+    elif given != own:
+        raise ArtefactError(
+            f"{name!r} is {given!r} in the snapshot and {own!r} in this agent; restore it into its like."
+        )

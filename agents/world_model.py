@@ -1,0 +1,141 @@
+"""The environment model: a mixture density network for the dynamics, and what the next state means (thesis 5.2.3).
+
+``p(z' | z, a)`` says where a macro-action leads, ``r(z')`` what it earns and ``d(z')`` whether the episode ends there.
+The three networks share no weights; one backward pass through the sum of their losses trains them as three would.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imagine_bench.errors import DivergedError
+
+from . import mixture as mdn
+from .layers import Masks, MemberMLP, clip_unit_norms
+from .memory import Batch
+from .mixture import Mixture
+from .settings import WorldModelSettings
+
+_MEMBERS = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ModelLosses:
+    """Means over a batch: negative log-likelihood (nats), log-cosh (reward units), cross-entropy (nats)."""
+
+    dynamics: float
+    reward: float
+    termination: float
+
+
+def log_cosh(x: Tensor) -> Tensor:
+    """``log(cosh(x))`` without overflow: quadratic near 0, linear far away."""
+    size = x.abs()
+    return size + functional.softplus(-2.0 * size) - math.log(2.0)
+
+
+class WorldModel(nn.Module):
+    """Dynamics, reward and termination, trained together from batches of transitions.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes and rates.
+        generator: Draws the initial weights; its device is the model's.
+    """
+
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
+
+        def network(n_in: int, hidden: tuple[int, ...], n_out: int) -> MemberMLP:
+            return MemberMLP((n_in, *hidden, n_out), members=_MEMBERS, dropout=settings.dropout, generator=generator)
+
+        outputs = mdn.output_size(settings.components, latent_size)
+        self.dynamics = network(latent_size + n_actions, settings.dynamics_hidden, outputs)
+        self.reward = network(latent_size, settings.reward_hidden, 1)
+        self.termination = network(latent_size, settings.termination_hidden, 1)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+        self._one_hot = torch.eye(n_actions, device=generator.device)
+
+    def _mixture(self, z: Tensor, action: Tensor, masks: Masks | None) -> Mixture:
+        """``p(z' | z, a)`` of every row, (E N) of them."""
+        settings = self.settings
+        inputs = torch.cat([z, self._one_hot[action]], dim=-1).unsqueeze(0)  # [E, N, Z + A]
+        outputs = self.dynamics(inputs, masks).squeeze(0)  # [N, K (1 + 2 Z)]
+        mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
+        return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
+
+    def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean losses of the three networks on one batch, under fresh dropout masks."""
+        rows = len(batch.action)
+        next_z = batch.next_z.unsqueeze(0)  # [E, N, Z]
+        mixture = self._mixture(batch.z, batch.action, self.dynamics.draw_masks(rows, dropout))
+        reward = self.reward(next_z, self.reward.draw_masks(rows, dropout)).view(-1)
+        logit = self.termination(next_z, self.termination.draw_masks(rows, dropout)).view(-1)
+        return (
+            -mdn.log_likelihood(mixture, batch.next_z).mean(),
+            log_cosh(reward - batch.reward / self.settings.reward_unit).mean(),
+            functional.binary_cross_entropy_with_logits(logit, batch.terminated),
+        )
+
+    def update(self, batch: Batch, dropout: torch.Generator) -> ModelLosses:
+        """One step of Adam on the three networks, then the max-norm constraint.
+
+        Raises:
+            DivergedError: A loss is NaN or infinite; the weights are left as they were.
+        """
+        terms = self.losses(batch, dropout)
+        losses = ModelLosses(*(term.item() for term in terms))
+        if not all(map(math.isfinite, (losses.dynamics, losses.reward, losses.termination))):
+            raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
+        self.optimiser.zero_grad(set_to_none=True)
+        sum(terms).backward()  # type: ignore[union-attr]
+        for network in (self.dynamics, self.reward, self.termination):
+            if self.settings.gradient_clip is not None:
+                nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
+        self.optimiser.step()
+        for network in (self.dynamics, self.reward, self.termination):
+            clip_unit_norms(network, self.settings.max_norm)
+        return losses
+
+    def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
+        """Draw T weight samples of the dynamics: masks (E, T, H) that every state of a prediction shares."""
+        return self.dynamics.draw_masks(count, dropout)
+
+    @torch.no_grad()
+    def predict(self, z: Tensor, action: Tensor, weights: Masks | None) -> Mixture:
+        """``p(z' | z, a)`` under every weight sample, in one batched pass.
+
+        Args:
+            z: Shape (N, Z).
+            action: Shape (N,).
+            weights: From :meth:`draw_weights`; None drops nothing, as one sample.
+
+        Returns:
+            Mixtures with leading axes (T, N).
+        """
+        rows = len(z)
+        samples = 1 if weights is None else weights[0].shape[1]
+        masks = None if weights is None else tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
+        mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [T N, ...]
+        return Mixture(
+            *(
+                values.view(samples, rows, *values.shape[1:])
+                for values in (mixture.log_weights, mixture.means, mixture.log_sigmas)
+            )
+        )
+
+    @torch.no_grad()
+    def assess(self, next_z: Tensor) -> tuple[Tensor, Tensor]:
+        """Predicted rewards and termination probabilities of next states (N, Z), without dropout: two of shape (N,)."""
+        states = next_z.unsqueeze(0)
+        reward = self.reward(states).view(-1) * self.settings.reward_unit
+        return reward, self.termination(states).view(-1).sigmoid()
