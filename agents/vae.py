@@ -142,7 +142,7 @@ class StripVae(Vae):
     def generate(self, latents: Tensor) -> Tensor:
         """Means of the standardised pixels. Shape (N, C, H, W)."""
         channels = self._strip[0]
-        strips = self.decoder(latents.reshape(len(latents) * channels, -1))  # [N * C, H * W]
+        strips = self.decoder(latents.reshape(len(latents) * channels, self.latent_size // channels))  # [N * C, H * W]
         return strips.reshape(len(latents), *self._strip)
 
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
