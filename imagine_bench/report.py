@@ -1,0 +1,228 @@
+"""The report of a bench: one self-contained page, the same as Markdown, CSV and PNG, and a table for the terminal."""
+
+from __future__ import annotations
+
+import base64
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from imagine_bench import report_plots, report_words
+from imagine_bench.files import make_folder, write_bytes
+from imagine_bench.pictures import first_cut, png, rollout_strip
+from imagine_bench.report_data import ReportData, collect, results_csv, summary_csv
+from imagine_bench.report_encoder import encoder_view
+from imagine_bench.report_words import agent_words, percent, score_text
+from imagine_bench.results import BenchResult, ComparedRollout
+
+SHOWN_ROLLOUTS = 3
+"""Rollouts shown of each imagining agent: the first ones of its first seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strip:
+    """A picture strip with its words.
+
+    Attributes:
+        name: File name without ending.
+        png: The picture.
+        alt: What a reader who does not see it should know.
+        caption: What stands below it.
+    """
+
+    name: str
+    png: bytes
+    alt: str
+    caption: str
+
+    @property
+    def base64(self) -> str:
+        """The picture for a data URL."""
+        return base64.b64encode(self.png).decode()
+
+
+def write_report(result: BenchResult) -> Path:
+    """Write ``result.folder / "report"``: index.html, report.md, results.csv, summary.csv and the pictures.
+
+    Everything comes from ``result`` (and the bundled encoder's card), so writing it again gives the same report.
+
+    Returns:
+        The path of index.html.
+
+    Raises:
+        SetupError: The folder cannot be written.
+    """
+    folder = make_folder(result.folder / "report")
+    data = collect(result)
+    plots = report_plots.all_plots(data)
+    strips = _strips(data)
+    encoder = encoder_view(result)
+    picture = encoder.picture.read_bytes() if encoder and encoder.picture else b""
+    context = {
+        **_words(data),
+        "plots": {plot.name: plot for plot in plots},
+        "strips": strips,
+        "encoder": encoder,
+        "encoder_picture": base64.b64encode(picture).decode(),
+    }
+    files = {f"{image.name}.png": image.png for image in (*plots, *strips)}
+    if picture:
+        files["encoder.png"] = picture
+    files["results.csv"] = results_csv(result).encode()
+    files["summary.csv"] = summary_csv(data).encode()
+    files["report.md"] = _render("report.md.j2", context).encode()
+    files["index.html"] = _render("report.html.j2", context).encode()
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+    return folder / "index.html"
+
+
+def summary_table(result: BenchResult) -> str:
+    """Success (%) of every agent at every budget as plain text, chance level, optimum and thesis beside them."""
+    data = collect(result)
+    protocol = result.protocol
+    header = ["real episodes", "chance", *(agent_words(agent).title for agent in protocol.agents), "optimum"]
+    rows = [header]
+    for budget in data.budgets:
+        cells = [score_text(data.scores[agent][budget]) for agent in protocol.agents]
+        rows.append([f"{budget:,}", percent(data.facts.chance_level), *cells, percent(data.facts.optimum)])
+        if any(budget in printed for printed in data.thesis.values()):
+            rows.append(_thesis_row(data, budget, "  thesis"))
+    beyond = [budget for budget in _thesis_only(data) if budget > data.budgets[-1]]
+    if beyond:
+        rows.append(_thesis_row(data, beyond[0], f"thesis at {beyond[0]:,}"))
+    title = (
+        f"{data.spec.title}: test episodes solved, % [{_interval_words(data)}]; preset {protocol.preset}, "
+        f"{protocol.execution}, {protocol.appearance}, {len(protocol.seeds)} seed(s) x "
+        f"{protocol.evaluation_episodes} test episodes"
+    )
+    return "\n".join([title, "", *_aligned(rows), "", *report_words.answers(data)])
+
+
+def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
+    cells = [
+        _thesis_text(data.thesis[agent][budget]) if budget in data.thesis.get(agent, {}) else ""
+        for agent in data.result.protocol.agents
+    ]
+    return [name, "", *cells, ""]
+
+
+def _aligned(rows: list[list[str]]) -> list[str]:
+    """Columns padded to the width of their widest cell, the first to the left and the others to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
+    return [lines[0], "-" * max(len(line) for line in lines), *lines[1:]]
+
+
+def _words(data: ReportData) -> dict[str, Any]:
+    """What both templates share."""
+    protocol = data.result.protocol
+    return {
+        "data": data,
+        "protocol": protocol,
+        "question": report_words.question(data),
+        "answers": report_words.answers(data),
+        "interval_words": _interval_words(data),
+        "thesis_only": _thesis_only(data),
+        "seed_index": {seed: index for index, seed in enumerate(protocol.seeds)},
+        "facts": _facts(data.result),
+        "recordings": [_relative(run.recording, data.result.folder) for run in data.result.runs if run.recording],
+    }
+
+
+def _interval_words(data: ReportData) -> str:
+    if len(data.result.protocol.seeds) == 1:
+        return "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
+    return "95 % interval over seeds (bootstrap)"
+
+
+def _thesis_only(data: ReportData) -> list[int]:
+    """Budgets of the thesis that this run does not have, ascending."""
+    return sorted({budget for printed in data.thesis.values() for budget in printed} - set(data.budgets))
+
+
+def _thesis_text(printed: tuple[float, float]) -> str:
+    return f"{percent(printed[0])} ({percent(printed[1])})"
+
+
+def _seconds(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:,.1f}"
+
+
+def _facts(result: BenchResult) -> list[tuple[str, str]]:
+    """How the result was made, name and value, nested values joined by a dot."""
+    protocol = result.protocol
+    rows = [
+        ("protocol", f"{protocol.hash}, preset {protocol.preset}"),
+        ("seeds", ", ".join(str(seed) for seed in protocol.seeds)),
+        *_flat("", result.environment),
+    ]
+    commit = result.environment.get("commit")
+    command = result.environment.get("command", "")
+    where = f"git checkout {str(commit).split('+')[0]} && " if commit else ""
+    rows.append(("reproduce", f"{where}{command}"))
+    return rows
+
+
+def _flat(prefix: str, value: Any) -> list[tuple[str, str]]:
+    if hasattr(value, "items"):
+        return [row for key, inner in value.items() for row in _flat(f"{prefix}.{key}" if prefix else str(key), inner)]
+    if isinstance(value, list | tuple):
+        return [(prefix, "; ".join(str(item) for item in value))]
+    return [(prefix, str(value))]
+
+
+def _strips(data: ReportData) -> list[Strip]:
+    strips = []
+    for agent in data.result.protocol.agents:
+        run = data.result.of(agent)[0]
+        for index, compared in enumerate(run.imagined[:SHOWN_ROLLOUTS]):
+            strips.append(_strip(data, agent, run.seed, index, compared))
+    return strips
+
+
+def _strip(data: ReportData, agent: str, seed: int, index: int, compared: ComparedRollout) -> Strip:
+    title = agent_words(agent).title
+    matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1)
+    depth, cut = len(matches), first_cut(compared)
+    kept = "the filter would keep it all" if cut is None else f"the filter cuts before macro-action {cut + 1}"
+    caption = (
+        f"{title[:1].upper()}{title[1:]}, seed {seed}, start {index + 1}: {int(matches.sum())} of {depth} imagined "
+        f"macrostates are what the rules say; {kept}."
+    )
+    return Strip(
+        name=f"rollout_{agent}_{index + 1}",
+        png=png(rollout_strip(compared, data.spec.action_names)),
+        alt=f"Real frames above, imagined frames below. {caption}",
+        caption=caption,
+    )
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
+def _render(template: str, context: dict[str, Any]) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("imagine_bench"),
+        autoescape=template.endswith(".html.j2"),
+        trim_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.globals.update(
+        percent=percent,
+        signed=report_words.signed_percent,
+        estimate=report_words.estimate_text,
+        score_text=score_text,
+        thesis_text=_thesis_text,
+        seconds=_seconds,
+        words=agent_words,
+        color=report_plots.color,
+    )
+    return environment.get_template(template).render(context)

@@ -1,0 +1,267 @@
+"""Every number of a report, computed once from a BenchResult: page, Markdown, tables and plots all read these."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from imagine_bench import reference, registry, statistics
+from imagine_bench.interfaces import RuleFacts, TaskSpec
+from imagine_bench.results import BenchResult, OpenLoop, RunResult
+from imagine_bench.seeding import SeedTree
+
+BASE_AGENT = "dqn"
+"""What gains are measured against, as in the thesis."""
+
+_SUMMARY_COLUMNS = (
+    *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
+    *("difference_to_dqn", "difference_low_95", "difference_high_95", "gain", "gain_low_95", "gain_high_95"),
+    "thesis_gain",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Success of one agent at one budget, as shares in [0, 1].
+
+    Attributes:
+        value: Interquartile mean over the seeds.
+        low: Lower end of the 95 % interval.
+        high: Upper end.
+        over: What the interval covers: ``"seeds"``, or ``"episodes"`` where there is one seed only.
+        by_seed: Success of each seed, in the protocol's order.
+        thesis: (mean, standard deviation) of the thesis at this budget, or None.
+    """
+
+    value: float
+    low: float
+    high: float
+    over: str
+    by_seed: tuple[float, ...]
+    thesis: tuple[float, float] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """An agent against DQN at one budget; NaN ends where one seed allows no interval.
+
+    Attributes:
+        difference: Difference of the interquartile means of the success shares, with its 95 % interval.
+        gain: (P_aug - P_base) / P_base of the means, paired by seed, with its interval.
+        thesis_gain: The thesis' gain at this budget, or None.
+    """
+
+    difference: statistics.Estimate
+    gain: statistics.Estimate
+    thesis_gain: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Means over an agent's runs.
+
+    Attributes:
+        train_cpu_s: CPU seconds of training in one run.
+        learner_cpu_s: Those the agent itself reports for learning and imagining; NaN where it reports none.
+        eval_cpu_s: CPU seconds of all evaluations of one run.
+        env_steps: Real training macro-actions of one run.
+        test_steps: Test macro-actions of all runs.
+        faults: Those whose physics disagreed with the rules.
+    """
+
+    train_cpu_s: float
+    learner_cpu_s: float
+    eval_cpu_s: float
+    env_steps: float
+    test_steps: int
+    faults: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportData:
+    """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes)."""
+
+    result: BenchResult
+    spec: TaskSpec
+    facts: RuleFacts
+    scores: dict[str, dict[int, Score]]
+    comparisons: dict[str, dict[int, Comparison]]
+    acceptance: dict[str, dict[int, float]]
+    open_loop: dict[str, OpenLoop]
+    timing: dict[str, Timing]
+    thesis: dict[str, dict[int, tuple[float, float]]]
+    thesis_random: float | None
+
+    @property
+    def budgets(self) -> tuple[int, ...]:
+        """Real episodes at which agents were tested."""
+        return self.result.protocol.budgets
+
+    @property
+    def imagining(self) -> tuple[str, ...]:
+        """Agents with open-loop results, in the protocol's order."""
+        return tuple(self.open_loop)
+
+
+def collect(result: BenchResult) -> ReportData:
+    """Compute a report's numbers. The same result gives the same bits: the bootstrap's seed is the protocol's hash."""
+    spec = registry.task(result.protocol.task)
+    agents = result.protocol.agents
+    thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in agents}
+    open_loops = {agent: _open_loop(result.of(agent)) for agent in agents}
+    return ReportData(
+        result=result,
+        spec=spec,
+        facts=spec.facts(),
+        scores={agent: _scores(result, agent, thesis[agent]) for agent in agents},
+        comparisons=_comparisons(result, spec.reference),
+        acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
+        open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
+        timing={agent: _timing(result.of(agent)) for agent in agents},
+        thesis={agent: rows for agent, rows in thesis.items() if rows},
+        thesis_random=reference.random_success(spec.reference) if spec.reference else None,
+    )
+
+
+def results_csv(result: BenchResult) -> str:
+    """One row an agent, seed and budget; every diagnostic the agents report has its column."""
+    names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
+    fields = ("episodes", "env_steps", "test_episodes", "successes", "success_rate", "mean_return", "mean_length")
+    costs = ("faults", "train_cpu_s", "eval_cpu_s")
+    rows: list[list[object]] = [["agent", "seed", *fields, "wilson_low", "wilson_high", *costs, *names]]
+    for agent in result.protocol.agents:
+        for run in result.of(agent):
+            for checkpoint in run.checkpoints:
+                low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
+                row = [agent, run.seed, *(getattr(checkpoint, field) for field in fields), low, high]
+                row += [getattr(checkpoint, cost) for cost in costs]
+                rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
+    return _csv(rows)
+
+
+def summary_csv(data: ReportData) -> str:
+    """One row an agent and budget: score, interval, thesis, difference to DQN, gain."""
+    rows: list[list[object]] = [list(_SUMMARY_COLUMNS)]
+    for agent, scores in data.scores.items():
+        for budget, score in scores.items():
+            row: list[object] = [agent, budget, len(score.by_seed), score.value, score.low, score.high, score.over]
+            row += list(score.thesis or ("", ""))
+            comparison = data.comparisons.get(agent, {}).get(budget)
+            if comparison:
+                row += [*comparison.difference, *comparison.gain]
+                row.append("" if comparison.thesis_gain is None else comparison.thesis_gain)
+            else:
+                row += [""] * 7
+            rows.append(row)
+    return _csv(rows)
+
+
+def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, float]]) -> dict[int, Score]:
+    scores = {}
+    for index, budget in enumerate(result.protocol.budgets):
+        shares = result.success_rates(agent)[:, index]  # [seeds]
+        low, high = statistics.bootstrap_interval(shares, _rng(result, agent, budget))
+        over = "seeds"
+        if len(shares) == 1:
+            checkpoint = result.of(agent)[0].checkpoints[index]
+            low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
+            over = "episodes"
+        scores[budget] = Score(
+            value=statistics.iqm(shares),
+            low=low,
+            high=high,
+            over=over,
+            by_seed=tuple(float(share) for share in shares),
+            thesis=thesis.get(budget),
+        )
+    return scores
+
+
+def _comparisons(result: BenchResult, thesis: str | None) -> dict[str, dict[int, Comparison]]:
+    """Every learning agent against DQN, where DQN was run."""
+    agents = result.protocol.agents
+    if BASE_AGENT not in agents:
+        return {}
+    learners = [agent for agent in agents if agent != BASE_AGENT and registry.agent_entry(agent).learns]
+    base = result.success_rates(BASE_AGENT)
+    comparisons: dict[str, dict[int, Comparison]] = {}
+    for agent in learners:
+        printed = reference.gain(thesis, agent) if thesis else {}
+        treated = result.success_rates(agent)
+        comparisons[agent] = {}
+        for index, budget in enumerate(result.protocol.budgets):
+            rng = _rng(result, agent, budget, "comparison")
+            comparisons[agent][budget] = Comparison(
+                difference=statistics.difference(treated[:, index], base[:, index], rng),
+                gain=statistics.gain(treated[:, index], base[:, index], rng),
+                thesis_gain=printed.get(budget),
+            )
+    return comparisons
+
+
+def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:
+    """Mean share of imagined transitions kept while training up to each budget."""
+    rates: dict[int, list[float]] = {}
+    for run in runs:
+        for checkpoint in run.checkpoints:
+            rate = checkpoint.diagnostics.get("imagination/acceptance_rate", float("nan"))
+            if np.isfinite(rate):
+                rates.setdefault(checkpoint.episodes, []).append(rate)
+    return {budget: float(np.mean(values)) for budget, values in rates.items()}
+
+
+def _open_loop(runs: tuple[RunResult, ...]) -> OpenLoop | None:
+    """Mean over runs at the last budget; where the filter keeps nothing in any run, NaN."""
+    loops = [run.checkpoints[-1].open_loop for run in runs]
+    found = [loop for loop in loops if loop is not None]
+    if not found:
+        return None
+    names = [name for name in OpenLoop.__dataclass_fields__ if name != "count"]
+    means = {name: _nan_mean(np.stack([getattr(loop, name) for loop in found])) for name in names}
+    return OpenLoop(count=np.sum([loop.count for loop in found], axis=0), **means)
+
+
+def _nan_mean(table: np.ndarray) -> np.ndarray:
+    """Mean over the first axis of what is finite; NaN where nothing is."""
+    finite = np.isfinite(table)
+    count = finite.sum(axis=0)
+    total = np.where(finite, table, 0.0).sum(axis=0)
+    mean: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _timing(runs: tuple[RunResult, ...]) -> Timing:
+    tests = [checkpoint for run in runs for checkpoint in run.checkpoints]
+    last = [run.checkpoints[-1] for run in runs]
+    return Timing(
+        train_cpu_s=float(np.mean([checkpoint.train_cpu_s for checkpoint in last])),
+        learner_cpu_s=float(np.mean([_learner_cpu_s(run) for run in runs])),
+        eval_cpu_s=float(np.mean([sum(checkpoint.eval_cpu_s for checkpoint in run.checkpoints) for run in runs])),
+        env_steps=float(np.mean([checkpoint.env_steps for checkpoint in last])),
+        test_steps=round(sum(checkpoint.mean_length * checkpoint.test_episodes for checkpoint in tests)),
+        faults=sum(checkpoint.faults for checkpoint in tests),
+    )
+
+
+def _learner_cpu_s(run: RunResult) -> float:
+    """CPU seconds in the agent's ``time/*_s`` diagnostics, which are means a real step since the last budget."""
+    total, before = float("nan"), 0
+    for checkpoint in run.checkpoints:
+        parts = [value for name, value in checkpoint.diagnostics.items() if name.startswith("time/")]
+        if parts:
+            total = np.nansum([total, sum(parts) * (checkpoint.env_steps - before)])
+        before = checkpoint.env_steps
+    return float(total)
+
+
+def _rng(result: BenchResult, *names: str | int) -> np.random.Generator:
+    return SeedTree(int(result.protocol.hash, 16)).child("report", *names).generator()
+
+
+def _csv(rows: list[list[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()

@@ -1,0 +1,215 @@
+"""The plots of a report, in one style: colour-blind-safe, labelled directly, readable on light and dark pages."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from imagine_bench.report_data import ReportData
+from imagine_bench.report_words import agent_words
+
+_INK = "#2b2b2f"  # in the SVG this becomes the page's own text colour
+_COLORS = {  # Okabe and Ito's palette
+    "random": "#8c8c8c",
+    "oracle": "#b8860b",
+    "dqn": "#0072b2",
+    "imagination": "#d55e00",
+    "imagination_uncertainty": "#009e73",
+}
+_SPARE_COLORS = ("#cc79a7", "#56b4e9", "#e69f00")
+_STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "imagine_bench",
+    "font.family": "DejaVu Sans",
+    "font.size": 10.5,
+    "text.color": _INK,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "axes.titlecolor": _INK,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "axes.grid": True,
+    "grid.color": "#8c8c8c",
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 2.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "legend.frameon": False,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """A finished plot.
+
+    Attributes:
+        name: File name without ending.
+        svg: Inline SVG whose text and axes take the page's colour.
+        png: The same on white, 2x.
+        alt: What a reader who does not see it should know.
+    """
+
+    name: str
+    svg: str
+    png: bytes
+    alt: str
+
+
+def all_plots(data: ReportData) -> list[Plot]:
+    """Success against real episodes, and where agents imagined, acceptance and open-loop error by depth."""
+    plots = [_render("success", success_figure, data, "Success of each agent against real training episodes.")]
+    if data.acceptance:
+        alt = "Share of imagined transitions kept, by real training episodes."
+        plots.append(_render("acceptance", acceptance_figure, data, alt))
+    if data.open_loop:
+        alt = "Open-loop quality of imagination by depth: correct share, errors, uncertainties."
+        plots.append(_render("open_loop", open_loop_figure, data, alt))
+    return plots
+
+
+def color(agent: str) -> str:
+    """The agent's colour, the same in every plot."""
+    return _COLORS.get(agent, _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)])
+
+
+def success_figure(data: ReportData) -> Figure:
+    """Success (%) against real training episodes, with 95 % intervals, chance level, optimum and the thesis' points."""
+    figure = Figure(figsize=(9.2, 4.9), layout="constrained")
+    axes = figure.add_subplot()
+    budgets = np.array(data.budgets)
+    for share, word in ((data.facts.optimum, "optimum"), (data.facts.chance_level, "chance level")):
+        axes.axhline(100.0 * share, color=_INK, linewidth=1.0, linestyle=(0, (4, 3)), alpha=0.7)
+        label = f"{word} {100.0 * share:.1f} %"
+        axes.text(0.005, 100.0 * share + 1.2, label, transform=axes.get_yaxis_transform(), fontsize=9)
+    for agent, scores in data.scores.items():
+        values = np.array([[scores[b].value, scores[b].low, scores[b].high] for b in data.budgets]) * 100.0
+        axes.plot(budgets, values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
+        axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
+    _thesis_points(axes, data)
+    ticks = sorted({*data.budgets, *(b for rows in data.thesis.values() for b in rows)})
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
+    axes.minorticks_off()
+    axes.set(xlabel="real training episodes (logarithmic)", ylabel="test episodes solved (%)", ylim=(-2, 108))
+    _end_labels(axes, {a: 100.0 * s[data.budgets[-1]].value for a, s in data.scores.items()}, budgets[-1], ticks[-1])
+    return figure
+
+
+def acceptance_figure(data: ReportData) -> Figure:
+    """Share of imagined transitions kept (%) while training up to each budget."""
+    figure = Figure(figsize=(9.2, 2.9), layout="constrained")
+    axes = figure.add_subplot()
+    for agent, rates in data.acceptance.items():
+        axes.plot(
+            list(rates), [100.0 * rate for rate in rates.values()], color=color(agent), marker="o", markersize=4.5
+        )
+    axes.set(xlabel="real training episodes", ylabel="transitions kept (%)", ylim=(-3, 106))
+    last = {agent: 100.0 * list(rates.values())[-1] for agent, rates in data.acceptance.items()}
+    end = max(max(rates) for rates in data.acceptance.values())
+    _end_labels(axes, last, end, end)
+    return figure
+
+
+def open_loop_figure(data: ReportData) -> Figure:
+    """Four panels by imagined depth: correct share, reward error, termination error, uncertainties."""
+    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
+    grid = figure.subplots(2, 2)
+    panels: list[Axes] = list(grid.ravel())
+    for agent, loop in data.open_loop.items():
+        depth = np.arange(1, len(loop.correct) + 1)
+        style = {"color": color(agent), "marker": "o", "markersize": 3.5}
+        title = agent_words(agent).title
+        panels[0].plot(depth, 100.0 * loop.correct, label=title, **style)
+        if np.isfinite(loop.correct_accepted).any() and (loop.accepted < 1.0).any():
+            label = f"{title}, kept by the filter"
+            panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", label=label, **style)
+        panels[1].plot(depth, loop.reward_mae, label=title, **style)
+        panels[2].plot(depth, 100.0 * loop.termination_error, label=title, **style)
+        for name, line in (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":")):
+            panels[3].plot(depth, getattr(loop, name), linestyle=line, label=f"{name}, {title}", color=color(agent))
+    panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
+    panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
+    panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
+    panels[3].set(title="Uncertainty", ylabel="variance in latent space", yscale=_log_if_positive(data))
+    for axes in panels:
+        axes.set_xlabel("imagined depth (macro-actions)")
+        axes.legend(fontsize=8, loc="best")
+    return figure
+
+
+def _log_if_positive(data: ReportData) -> str:
+    values = [getattr(loop, name) for loop in data.open_loop.values() for name in ("epistemic", "aleatoric", "modal")]
+    joined = np.concatenate(values)
+    return "log" if (joined[np.isfinite(joined)] > 0).all() else "linear"
+
+
+def _thesis_points(axes: Axes, data: ReportData) -> None:
+    for agent, rows in data.thesis.items():
+        episodes = np.array(list(rows))
+        means, stds = 100.0 * np.array(list(rows.values())).T
+        axes.errorbar(
+            *(episodes, means, stds), color=color(agent), marker="D", markersize=5, markerfacecolor="none",
+            linestyle=":", linewidth=1.0, elinewidth=0.8, capsize=2, zorder=2,
+        )  # fmt: skip
+    if data.thesis:
+        axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
+        axes.plot(
+            *([], []), color=_INK, marker="D", markersize=5, markerfacecolor="none", linestyle=":", linewidth=1.0,
+            label="thesis, bar: standard deviation",
+        )  # fmt: skip
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=9)
+
+
+def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) -> None:
+    """Name each line in the right margin, spread so that no two names overlap, with a thin leader to its last point."""
+    low, high = axes.get_ylim()
+    step = 0.065 * (high - low) * 4.9 / axes.figure.get_figheight()
+    placed: dict[str, float] = {}
+    floor = -np.inf
+    for agent, value in sorted(last.items(), key=lambda item: item[1]):
+        floor = max(value, floor + step)
+        placed[agent] = floor
+    excess = max(0.0, floor - high)
+    for agent, y in placed.items():
+        axes.annotate(
+            agent_words(agent).title, xy=(from_x, last[agent]), xycoords="data", xytext=(1.02, y - excess),
+            textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
+            arrowprops={"arrowstyle": "-", "color": color(agent), "linewidth": 0.7, "alpha": 0.6},
+        )  # fmt: skip
+    axes.set_xlim(right=to_x * 1.04)
+
+
+def _render(name: str, draw: object, data: ReportData, alt: str) -> Plot:
+    assert callable(draw)
+    with mpl.rc_context(_STYLE):
+        figure: Figure = draw(data)
+        FigureCanvasAgg(figure)
+        svg, png = io.StringIO(), io.BytesIO()
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+        figure.savefig(png, format="png", dpi=180, facecolor="white", metadata={"Software": None})
+    return Plot(name=name, svg=_inline(svg.getvalue(), name, alt), png=png.getvalue(), alt=alt)
+
+
+def _inline(svg: str, name: str, alt: str) -> str:
+    """Strip what a page does not want (prologue, metadata, fixed size) and let text take the page's colour."""
+    body = svg[svg.index("<svg") :]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    body = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", body, count=1)
+    body = re.sub(r'(<svg[^>]*?) width="[^"]*"', rf'\1 role="img" aria-label="{alt}"', body, count=1)
+    body = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", body)  # ids of several plots share one page
+    return body.replace(_INK, "currentColor")

@@ -1,0 +1,152 @@
+"""The sentences of a report: what the agents are, and the short answer, computed from the numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from imagine_bench.report_data import BASE_AGENT, Comparison, ReportData, Score
+from imagine_bench.statistics import Estimate
+
+FEW_SEEDS = 5
+"""Below this the bootstrap interval is hardly more than the range of the seeds, and the report says so."""
+
+
+@dataclass(frozen=True)
+class AgentWords:
+    """How an agent is introduced.
+
+    Attributes:
+        title: For headings, legends and tables.
+        description: One sentence for a reader who knows none of this.
+    """
+
+    title: str
+    description: str
+
+
+_AGENTS = {
+    "random": AgentWords("random", "Picks every macro-action by chance: the floor."),
+    "oracle": AgentWords(
+        "oracle", "Is shown the true state and the rules and acts optimally: the ceiling, no learner."
+    ),
+    "dqn": AgentWords(
+        "DQN", "Learns the value of each macro-action from real experience only (deep Q-learning): the baseline."
+    ),
+    "imagination": AgentWords(
+        "imagination",
+        "DQN that also learns a model of its world and practises on transitions it imagines with it, all of them.",
+    ),
+    "imagination_uncertainty": AgentWords(
+        "imagination + uncertainty",
+        "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
+    ),
+}
+
+
+def agent_words(agent: str) -> AgentWords:
+    """Title and description of an agent; one that is not known here goes by its registered name."""
+    return _AGENTS.get(agent, AgentWords(agent.replace("_", " "), "A registered agent."))
+
+
+def percent(share: float) -> str:
+    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as an en dash."""
+    return "–" if math.isnan(share) else f"{100.0 * share:.1f}"
+
+
+def signed_percent(share: float) -> str:
+    """Like :func:`percent` with a sign, the minus a true one."""
+    return "–" if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+
+
+def score_text(score: Score) -> str:
+    """``61.3 [55.0, 67.2]``."""
+    return f"{percent(score.value)} [{percent(score.low)}, {percent(score.high)}]"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """``+6.3 [−2.0, +14.1]``, or without the brackets where one seed allows no interval."""
+    if math.isnan(estimate.low):
+        return signed_percent(estimate.value)
+    return f"{signed_percent(estimate.value)} [{signed_percent(estimate.low)}, {signed_percent(estimate.high)}]"
+
+
+def question(data: ReportData) -> str:
+    """What was asked."""
+    protocol = data.result.protocol
+    return (
+        f"Does imagination, practising on the predictions of a learned model of the world, let a robot master "
+        f"“{data.spec.title}” with less real experience? {_count(len(protocol.agents), 'agent')} "
+        f"{'was' if len(protocol.agents) == 1 else 'were'} trained from {_count(len(protocol.seeds), 'seed')} for up "
+        f"to {protocol.budgets[-1]:,} real episodes and tested, without exploring, on {protocol.evaluation_episodes:,} "
+        f"new episodes at each of {_count(len(protocol.budgets), 'budget')}."
+    )
+
+
+def answers(data: ReportData) -> list[str]:
+    """The short answer, one sentence a finding, whatever the numbers say."""
+    budget = data.budgets[-1]
+    sentences = []
+    if BASE_AGENT in data.scores:
+        sentences.append(
+            f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
+            f"{percent(data.scores[BASE_AGENT][budget].value)} % of the test episodes "
+            f"(chance {percent(data.facts.chance_level)} %, optimum {percent(data.facts.optimum)} %)."
+        )
+    sentences += [_verdict(data, agent) for agent in data.comparisons]
+    if not data.comparisons:
+        sentences.append(
+            "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
+        )
+    elif 1 < len(data.result.protocol.seeds) < FEW_SEEDS:
+        sentences.append(
+            f"With only {len(data.result.protocol.seeds)} seeds an interval is hardly more than the range of its "
+            "seeds: read it as a hint. The presets thesis (5 seeds) and full (20) settle more."
+        )
+    return sentences
+
+
+def _verdict(data: ReportData, agent: str) -> str:
+    budgets, comparisons = data.budgets, data.comparisons[agent]
+    last = comparisons[budgets[-1]]
+    title = agent_words(agent).title
+    score = percent(data.scores[agent][budgets[-1]].value)
+    difference = last.difference
+    head = f"“{title}” solves {score} %, {_points(difference)} than DQN"
+    if math.isnan(difference.low):
+        return f"{head}; one seed says nothing about how much of that is luck."
+    interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
+    if difference.low > 0:
+        verdict = "so at this budget imagination helped"
+    elif difference.high < 0:
+        verdict = "so at this budget imagination did not help: it did worse"
+    else:
+        verdict = "which includes zero, so at this budget no help is shown"
+    return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons)}"
+
+
+def _over_budgets(comparisons: dict[int, Comparison]) -> str:
+    if len(comparisons) < 2:
+        return ""
+    ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
+    behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
+    parts = []
+    for budgets, word in ((ahead, "ahead"), (behind, "behind")):
+        if budgets:
+            parts.append(f"clearly {word} at {_listing([f'{budget:,}' for budget in budgets])}")
+    if not parts:
+        return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
+    return f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets)."
+
+
+def _points(difference: Estimate) -> str:
+    points = f"{abs(100.0 * difference.value):.1f}"
+    return f"{points} percentage points {'less' if difference.value < 0 else 'more'}"
+
+
+def _listing(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
