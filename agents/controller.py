@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from imagine_bench.errors import DivergedError
 
+from .flat_adam import FlatAdam
 from .layers import MemberMLP
 from .memory import Batch
 from .settings import ControllerSettings
@@ -54,7 +55,7 @@ class Controller(nn.Module):
         self.n_actions, self.settings = n_actions, settings
         sizes = (latent_size, *settings.hidden, n_actions)
         self.network = MemberMLP(sizes, members=1, dropout=0.0, generator=generator)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+        self.optimiser = FlatAdam([self.network], learning_rate=settings.learning_rate, gradient_clip=None)
 
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:
@@ -77,7 +78,5 @@ class Controller(nn.Module):
         value = loss.item()
         if not math.isfinite(value):
             raise DivergedError(f"The controller's loss is {value}. Lower controller.learning_rate.")
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimiser.step()
+        self.optimiser.step(loss)
         return value

@@ -18,8 +18,9 @@ from . import snapshot
 from .controller import Controller
 from .layers import Masks
 from .memory import Batch, ImaginedMemory, RealMemory
+from .mixture import Mixture
 from .settings import Settings
-from .uncertainty import Uncertainty, decompose, reduction
+from .uncertainty import decompose, reduction
 from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
@@ -34,13 +35,13 @@ class Imagined:
         next_z: Shape (N, Z).
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
-        uncertainty: Predictive variance by cause, (N, Z) each.
+        samples: What each weight sample predicted, with leading axes (T, N).
     """
 
     next_z: Tensor
     reward: Tensor
     p_terminated: Tensor
-    uncertainty: Uncertainty
+    samples: Mixture
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ def imagine_step(
     samples = model.predict(z, action, weights)  # [T, N, ...]
     next_z = mdn.sample(mdn.average(samples), temperature, generator)
     reward, p_terminated = model.assess(next_z)
-    return Imagined(next_z, reward, p_terminated, decompose(samples))
+    return Imagined(next_z, reward, p_terminated, samples)
 
 
 class Imagination:
@@ -110,10 +111,11 @@ class Imagination:
         """Reduce variances (..., Z) as the filter does. Shape (...)."""
         return self._reduce(variances)
 
-    def keeps(self, uncertainty: Uncertainty) -> Tensor:
+    def keeps(self, step: Imagined) -> Tensor:
         """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
-        score = self.score(uncertainty.epistemic)
-        return score <= self.settings.threshold if self.filtered else torch.ones_like(score, dtype=torch.bool)
+        if not self.filtered:
+            return torch.ones_like(step.reward, dtype=torch.bool)
+        return self.score(decompose(step.samples).epistemic) <= self.settings.threshold
 
     def rollouts(self, controller: Controller, z: Tensor, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts from one state and store what the filter keeps.
@@ -132,7 +134,7 @@ class Imagination:
             action = self._act(controller, z, max(epsilon, settings.exploration))
             step = imagine_step(self.model, z, action, weights, temperature=settings.temperature, generator=generator)
             terminated = step.p_terminated > TERMINAL
-            keep = self.keeps(step.uncertainty)
+            keep = self.keeps(step)
             kept = int(keep.sum())
             predicted, accepted = predicted + len(z), accepted + kept
             if kept:
@@ -155,14 +157,14 @@ class Imagination:
         """Copies of weights, moments, memory and generators."""
         generators = {name: snapshot.generator_array(generator) for name, generator in self._generators.items()}
         return {
-            **snapshot.prefixed("model", snapshot.trained_arrays(self.model, self.model.optimiser)),
+            **snapshot.prefixed("model", self.model.optimiser.arrays()),
             **snapshot.prefixed("memory", self.memory.arrays()),
             **snapshot.prefixed("generator", generators),
         }
 
     def load(self, arrays: snapshot.Arrays, added: int) -> None:
         """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
-        snapshot.load_trained(self.model, self.model.optimiser, snapshot.below("model", arrays))
+        self.model.optimiser.load(snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)
         for name, generator in self._generators.items():
             snapshot.load_generator(generator, arrays[f"generator/{name}"])

@@ -16,6 +16,7 @@ from .imagination import TERMINAL, Imagination, Imagined, imagine_step
 from .learner import Learner
 from .perception import load_perception, prepare_torch
 from .presets import resolve
+from .uncertainty import decompose
 
 
 class ImaginingLearner(Learner):
@@ -60,10 +61,10 @@ class ImaginingLearner(Learner):
         values, actions, imagined = zip(*steps, strict=True)
         encoder, imagination = self.perception.encoder, self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
-        kept = torch.cat([imagination.keeps(step.uncertainty) for step in imagined]).cpu().numpy()  # [D]
+        kept = torch.cat([imagination.keeps(step) for step in imagined]).cpu().numpy()  # [D]
 
         def reduced(cause: str) -> NDArray[np.float32]:
-            parts = [imagination.score(getattr(step.uncertainty, cause)) for step in imagined]
+            parts = [imagination.score(getattr(decompose(step.samples), cause)) for step in imagined]
             return torch.cat(parts).cpu().numpy()
 
         return ImaginedRollout(

@@ -23,7 +23,21 @@ class Deviation:
     reason: str
 
 
-_QUICK: dict[str, Deviation] = {}
+_QUICK: dict[str, Deviation] = {
+    "model.dynamics_hidden": Deviation((256, 256), ""),
+    "model.reward_hidden": Deviation((128, 128), ""),
+    "model.termination_hidden": Deviation((128, 128), ""),
+    "model.dropout": Deviation(0.25, ""),
+    "model.updates_per_step": Deviation(4, ""),
+    "model.batch_size": Deviation(128, ""),
+    "model.predict_change": Deviation(True, ""),
+    "model.reward_unit": Deviation(10.0, ""),
+    "model.gradient_clip": Deviation(10.0, ""),
+    "imagination.start_episode": Deviation(200, ""),
+    "imagination.temperature": Deviation(0.0, ""),
+    "imagination.exploration": Deviation(0.2, ""),
+    "imagination.weight_samples": Deviation(10, ""),
+}
 
 PRESETS: dict[str, dict[str, Deviation]] = {
     "smoke": {},

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
@@ -26,33 +25,6 @@ def below(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """The arrays that lie under ``prefix/``, without it."""
     start = f"{prefix}/"
     return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
-
-
-def trained_arrays(module: nn.Module, optimiser: torch.optim.Adam) -> Arrays:
-    """Copies of a module's parameters and of Adam's moments; before the first update the moments are 0."""
-    arrays: Arrays = {}
-    for name, parameter in module.named_parameters():
-        moments = optimiser.state.get(parameter, {})
-        blank = torch.zeros_like(parameter)
-        parts = {
-            "value": parameter.detach(),
-            "exp_avg": moments.get("exp_avg", blank),
-            "exp_avg_sq": moments.get("exp_avg_sq", blank),
-            "step": moments.get("step", torch.zeros(())),
-        }
-        arrays.update({f"{name}/{part}": tensor.cpu().numpy().copy() for part, tensor in parts.items()})
-    return arrays
-
-
-@torch.no_grad()
-def load_trained(module: nn.Module, optimiser: torch.optim.Adam, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Take up the result of :func:`trained_arrays`."""
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for index, (name, parameter) in enumerate(module.named_parameters()):
-        parts = {part: torch.tensor(arrays[f"{name}/{part}"]) for part in ("value", "exp_avg", "exp_avg_sq", "step")}
-        parameter.copy_(parts.pop("value"))
-        state[index] = parts
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
 def generator_array(generator: torch.Generator) -> NDArray[np.uint8]:

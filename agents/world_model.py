@@ -16,6 +16,7 @@ from torch.nn import functional
 from imagine_bench.errors import DivergedError
 
 from . import mixture as mdn
+from .flat_adam import FlatAdam
 from .layers import Masks, MemberMLP, clip_unit_norms
 from .memory import Batch
 from .mixture import Mixture
@@ -62,7 +63,10 @@ class WorldModel(nn.Module):
         self.dynamics = network(latent_size + n_actions, settings.dynamics_hidden, outputs)
         self.reward = network(latent_size, settings.reward_hidden, 1)
         self.termination = network(latent_size, settings.termination_hidden, 1)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+        self.networks = (self.dynamics, self.reward, self.termination)
+        self.optimiser = FlatAdam(
+            self.networks, learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
+        )
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
     def _mixture(self, z: Tensor, action: Tensor, masks: Masks | None) -> Mixture:
@@ -93,16 +97,11 @@ class WorldModel(nn.Module):
             DivergedError: A loss is NaN or infinite; the weights are left as they were.
         """
         terms = self.losses(batch, dropout)
-        losses = ModelLosses(*(term.item() for term in terms))
+        losses = ModelLosses(*torch.stack(terms).tolist())
         if not all(map(math.isfinite, (losses.dynamics, losses.reward, losses.termination))):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
-        self.optimiser.zero_grad(set_to_none=True)
-        sum(terms).backward()  # type: ignore[union-attr]
-        for network in (self.dynamics, self.reward, self.termination):
-            if self.settings.gradient_clip is not None:
-                nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
-        self.optimiser.step()
-        for network in (self.dynamics, self.reward, self.termination):
+        self.optimiser.step(torch.stack(terms).sum())
+        for network in self.networks:
             clip_unit_norms(network, self.settings.max_norm)
         return losses
 
