@@ -1,4 +1,4 @@
-"""Runs planned motions in the contact simulation, from a canonical start, so that the same start gives the same bits."""
+"""Runs planned motions in the contact simulation, always from a canonical start: equal starts give equal bits."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class MacroExecutor:
         self._finger_ctrl = np.array([model.actuator(name).id for name in fingers])
         self._state = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         self._qpos_column = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME.value)
-        self._start = np.empty(mujoco.mj_stateSize(model, self._state))
+        self._state_size = mujoco.mj_stateSize(model, self._state)
 
     def rest(self, data: mujoco.MjData) -> None:
         """Bring ``data`` to the canonical start: the arm at its observation pose, everything still.
@@ -90,13 +90,14 @@ class MacroExecutor:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data)
-        mujoco.mj_getState(self.model, data, self._start, self._state)
-        control = np.empty((len(trajectory.opening_m), self.model.nu))  # [N, nu]
+        steps = len(trajectory.opening_m)
+        states = np.empty((steps + 1, self._state_size))
+        mujoco.mj_getState(self.model, data, states[0], self._state)
+        control = np.empty((steps, self.model.nu))
         control[:] = data.ctrl
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        states, _ = mujoco.rollout.rollout(self.model, data, self._start, control)  # [1, N, nstate]
-        states = np.concatenate([self._start[None], states[0]])  # [N + 1, nstate]
+        mujoco.rollout.rollout(self.model, data, states[0], control, state=states[None, 1:])
         self._check(data, states, control)
         mujoco.mj_forward(self.model, data)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
@@ -134,7 +135,8 @@ class MacroExecutor:
             return
         handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=self._start, control=control)
+            np.savez(file, start_state=states[0], control=control)
         raise DivergedError(
-            f"The simulation of a macro-action diverged (NaN, infinity or runaway speed); its start and controls are in {path}."
+            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
+            f"its start state and controls were saved in {path}."
         )

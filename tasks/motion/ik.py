@@ -10,6 +10,7 @@ import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
 
+from ..scenes.arm import TCP_SITE
 from ..scenes.constants import HOME_QPOS_RAD
 from .arm_model import ArmModel, Floats
 
@@ -19,6 +20,7 @@ MAX_ITERATIONS = 40
 
 _ORIENTATION_COST = 0.3
 _POSTURE_COST = 1e-3  # ten times more leaves 0.3 mm and never converges
+_FAR_DAMPING = 0.1  # Levenberg-Marquardt, fades as the error does: targets out of reach do not make the arm whirl
 _STEP_S = 1.0  # mink's velocities are plain joint differences then
 
 
@@ -57,7 +59,9 @@ class ArmIK:
 
     def __init__(self, arm: ArmModel) -> None:
         self._configuration = mink.Configuration(arm.model)
-        self._reach = mink.FrameTask("tcp", "site", position_cost=1.0, orientation_cost=_ORIENTATION_COST)
+        self._reach = mink.FrameTask(
+            TCP_SITE, "site", position_cost=1.0, orientation_cost=_ORIENTATION_COST, lm_damping=_FAR_DAMPING
+        )
         self._posture = mink.PostureTask(arm.model, cost=_POSTURE_COST)
         self._posture.set_target(np.array(HOME_QPOS_RAD))
         self._limits = [mink.ConfigurationLimit(arm.model)]
@@ -97,10 +101,10 @@ class ArmIK:
                 velocity = mink.solve_ik(self._configuration, tasks, _STEP_S, "daqp", limits=self._limits)
                 self._configuration.integrate_inplace(velocity, _STEP_S)
         raise UnreachableTargetError(
-            f"The gripper cannot reach {np.round(position_in_base_m, 4).tolist()} m at yaw {math.degrees(yaw_rad):.0f} deg: "
-            f"after {max_iterations} steps it is {1000 * position_error_m:.1f} mm and {math.degrees(angle_error_rad):.1f} deg "
-            f"away, allowed are {1000 * POSITION_TOLERANCE_M:g} mm and {math.degrees(ANGLE_TOLERANCE_RAD):.2f} deg; "
-            "move the target nearer to the middle of the table."
+            f"The gripper cannot reach {np.round(position_in_base_m, 4).tolist()} m at yaw "
+            f"{math.degrees(yaw_rad):.0f} deg: after {max_iterations} steps {1000 * position_error_m:.1f} mm and "
+            f"{math.degrees(angle_error_rad):.1f} deg are missing, allowed are {1000 * POSITION_TOLERANCE_M:g} mm and "
+            f"{math.degrees(ANGLE_TOLERANCE_RAD):.2f} deg; choose a target nearer to the middle of the table."
         )
 
     def _errors(self) -> tuple[float, float]:

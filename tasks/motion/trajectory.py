@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -60,12 +61,14 @@ class Trajectory:
     last_step: dict[str, int]
 
 
+@lru_cache(maxsize=512)
 def minimum_jerk(steps: int) -> Floats:
-    """The profile s and its first two derivatives at x = 1/steps, 2/steps, .., 1. Shape (3, steps)."""
+    """The profile s and its first two derivatives at x = 1/steps, 2/steps, .., 1. Shape (steps, 3), read-only."""
     x = np.arange(1, steps + 1) / steps
-    return np.stack(
-        [x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2, 60 * x * (1 - x) * (1 - 2 * x)]
-    )  # [3, steps]
+    position = x**3 * (10 - 15 * x + 6 * x**2)
+    profile = np.stack([position, 30 * x**2 * (1 - x) ** 2, 60 * x * (1 - x) * (1 - 2 * x)], axis=1)
+    profile.setflags(write=False)
+    return profile
 
 
 def shortest_duration_s(arm: ArmModel, delta_rad: Floats, inertia: Floats) -> float:
@@ -96,29 +99,26 @@ def plan(
         waypoints: At least one.
         timestep_s: Of the simulation.
     """
-    from_qpos_rad, from_opening_m = start_qpos_rad, start_opening_m
-    qpos, commands, openings = [], [], []
+    at_qpos_rad, at_opening_m = start_qpos_rad, start_opening_m
+    motions: list[Floats] = []
     last_step: dict[str, int] = {}
-    steps_so_far = 0
+    step = -1
     for waypoint in waypoints:
-        delta_rad = waypoint.qpos_rad - from_qpos_rad
-        inertia = arm.inertia(from_qpos_rad + delta_rad / 2)
+        delta_rad = waypoint.qpos_rad - at_qpos_rad
+        inertia = arm.inertia(at_qpos_rad + delta_rad / 2)
         duration_s = max(shortest_duration_s(arm, delta_rad, inertia), waypoint.min_duration_s, timestep_s)
         steps = math.ceil(duration_s / timestep_s - 1e-9)
-        s, ds, dds = minimum_jerk(steps)
         duration_s = steps * timestep_s
-        position_rad = from_qpos_rad + s[:, None] * delta_rad  # [steps, 7]
-        damping_rad = arm.damping_nms_rad * delta_rad / (duration_s * arm.stiffness_nm_rad)  # [7]
-        inertia_rad = inertia @ delta_rad / (duration_s**2 * arm.stiffness_nm_rad)  # [7]
-        qpos.append(position_rad)
-        commands.append(position_rad + ds[:, None] * damping_rad + dds[:, None] * inertia_rad)
-        openings.append(from_opening_m + s * (waypoint.opening_m - from_opening_m))
-        steps_so_far += steps
-        last_step[waypoint.name] = steps_so_far - 1
-        from_qpos_rad, from_opening_m = waypoint.qpos_rad, waypoint.opening_m
-    return Trajectory(
-        qpos_rad=np.concatenate(qpos),
-        arm_command_rad=np.concatenate(commands),
-        opening_m=np.concatenate(openings),
-        last_step=last_step,
-    )
+        # Rows weigh s, s' and s''; columns are the planned joints, the commands and the opening.
+        weights = np.zeros((3, 15))
+        weights[0, :7] = weights[0, 7:14] = delta_rad
+        weights[0, 14] = waypoint.opening_m - at_opening_m
+        weights[1, 7:14] = arm.damping_nms_rad * delta_rad / (duration_s * arm.stiffness_nm_rad)
+        weights[2, 7:14] = inertia @ delta_rad / (duration_s**2 * arm.stiffness_nm_rad)
+        start = np.concatenate([at_qpos_rad, at_qpos_rad, [at_opening_m]])  # [15]
+        motions.append(start + minimum_jerk(steps) @ weights)  # [steps, 15]
+        step += steps
+        last_step[waypoint.name] = step
+        at_qpos_rad, at_opening_m = waypoint.qpos_rad, waypoint.opening_m
+    rows = np.concatenate(motions)  # [N, 15]
+    return Trajectory(qpos_rad=rows[:, :7], arm_command_rad=rows[:, 7:14], opening_m=rows[:, 14], last_step=last_step)

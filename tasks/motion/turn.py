@@ -20,6 +20,9 @@ _QUARTER_RAD = math.pi / 2
 _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
 
+_WRIST_LIMIT_RAD = 4.70
+"""The last joint's upper limit, nearly."""
+
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
@@ -27,7 +30,7 @@ _SQUEEZE_M = 0.004
 _CLOSE_S, _OPEN_S, _SETTLE_S = 0.15, 0.10, 0.05
 
 _MAX_TILT_RAD = math.radians(10)
-_MIN_GRIP_M = CUBE_EDGE_M / 2 - 0.004
+_MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
 _ARM_AT_REST_RAD = 0.02
 
 
@@ -151,6 +154,9 @@ def _waypoints(grip: _Grip, slot: _Grip, skew_rad: float, clockwise: bool) -> li
     before[-1] = -sense * _QUARTER_RAD / 2 - skew_rad
     after = np.zeros(7)
     after[-1] = sense * _QUARTER_RAD / 2
+    if max(grip.at_qpos_rad[-1], grip.above_qpos_rad[-1]) + before[-1] > _WRIST_LIMIT_RAD:  # a very skew cube
+        before[-1] -= math.pi  # the gripper is the same after half a turn
+        after[-1] -= math.pi
     squeezed_m = CUBE_EDGE_M / 2 - _SQUEEZE_M
     observe = np.array(OBSERVATION_QPOS_RAD)
     return [
