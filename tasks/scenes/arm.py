@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 
-from dm_control import mjcf
+from .composing import mjcf
 
 ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
 """From the base to the wrist."""

@@ -13,6 +13,8 @@ TABLE_HEIGHT_M = -0.10
 
 CUBE_EDGE_M = 0.055
 CUBE_MASS_KG = 0.12
+CUBE_REST_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
+"""Height of a standing cube's centre."""
 ROW_X_M = 0.62
 SLOT_SPACING_M = 0.09
 SLOTS_XY_M = ((ROW_X_M, SLOT_SPACING_M), (ROW_X_M, 0.0), (ROW_X_M, -SLOT_SPACING_M))
@@ -26,3 +28,14 @@ OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 
 HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
+
+FINGER_REST_M = CUBE_EDGE_M / 2 + 0.012
+"""Each finger's distance from the grip's middle between macro-actions: 12 mm of air beside a cube."""
+
+SCENE_GROUP, ARM_GROUP, SETTING_GROUP = 0, 2, 3
+"""Geom groups: table top, cubes and hand; the arm; what only the human's view shows (floor, legs, person)."""
+
+AGENT_CAMERA, HUMAN_CAMERA = "wrist", "human"
+
+FINGERTIP_IN_SLOT_M = (0.048, 0.0, 0.040)
+"""Nominal tip of the pointing index finger relative to the centre of the cube it points at."""

@@ -1,0 +1,112 @@
+"""The arrow puzzle (thesis, chapter 5) and its hard variant: what the bench needs to know, and the environments.
+
+Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Frame, TaskSpec
+
+from .arrow_rules import N_CUBES, N_DIRECTIONS, ArrowPuzzleRules
+from .rules import facts
+
+if TYPE_CHECKING:
+    from .arrow_world import ArrowWorld
+    from .macro_env import MacroEnv
+    from .rendering import Renderer
+
+HORIZON = 10
+_DIRECTIONS = ("toward the human", "right", "toward the agent", "left")
+_CUBES = ("left", "middle", "right")
+_PLAY = (
+    "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a time. "
+    "The arrow of the cube pointed at must come to point toward the human{extra}, and no two arrows may ever point "
+    "the same way."
+)
+
+
+@functools.lru_cache(maxsize=3)
+def _studio(appearance: str) -> tuple[ArrowWorld, Renderer]:
+    """One scene and eye a process and level, for pictures of macrostates."""
+    from .arrow_world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
+    from .macro_env import agent_eye  # noqa: PLC0415
+    from .scenes.appearance import appearance as level  # noqa: PLC0415
+
+    world = ArrowWorld(level(appearance))
+    return world, agent_eye(world.model)
+
+
+def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
+    """Frames of macrostates in the kinematic mode.
+
+    Args:
+        macrostates: Any of the 192. Shape (N, 4).
+        appearance: A level's name.
+        rng: Draws the variation.
+
+    Returns:
+        Shape (N, 64, 64, 3), uint8.
+
+    Raises:
+        UnknownNameError: No such appearance.
+        InvalidValueError: Macrostates of another shape or out of range.
+    """
+    from .macro_env import frames_of  # noqa: PLC0415
+    from .scenes.appearance import appearance as level  # noqa: PLC0415
+
+    macrostates = np.asarray(macrostates)
+    tops = np.array([N_DIRECTIONS] * N_CUBES + [N_CUBES])
+    if macrostates.ndim != 2 or macrostates.shape[1] != len(tops) or not np.issubdtype(macrostates.dtype, np.integer):
+        raise InvalidValueError(f"Macrostates must be integers of shape (N, {len(tops)}), not {macrostates.shape}.")
+    if ((macrostates < 0) | (macrostates >= tops)).any():
+        raise InvalidValueError(f"Macrostates must lie below {tops.tolist()} in each coordinate and not be negative.")
+    world, eye = _studio(level(appearance).name)
+    return frames_of(world, macrostates, eye, rng)
+
+
+def _spec(*, hard: bool) -> TaskSpec:
+    rules = ArrowPuzzleRules(hard=hard)
+    return TaskSpec(
+        id="arrow_puzzle_hard" if hard else "arrow_puzzle",
+        title="Arrow puzzle, hard" if hard else "Arrow puzzle",
+        description=_PLAY.format(extra=", no arrow toward the agent" if hard else ""),
+        env_id="imagine_bench/ArrowPuzzleHard-v0" if hard else "imagine_bench/ArrowPuzzle-v0",
+        horizon=HORIZON,
+        action_names=tuple(f"turn the {cube} cube {way}" for cube in _CUBES for way in ("right", "left")),
+        macrostate_names=(*(f"{cube} arrow" for cube in _CUBES), "pointed cube"),
+        macrostate_values=(_DIRECTIONS,) * N_CUBES + (_CUBES,),
+        preprocessing="gray_strips",
+        encoder="arrow_puzzle",
+        rules=rules,
+        facts=functools.partial(facts, rules, HORIZON),
+        render_macrostates=render_macrostates,
+        reference="arrow_puzzle_hard" if hard else "arrow_puzzle",
+    )
+
+
+SPEC = _spec(hard=False)
+HARD_SPEC = _spec(hard=True)
+
+
+def _make(spec: TaskSpec, options: dict[str, Any]) -> MacroEnv:
+    from .arrow_world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads with the first environment)
+    from .macro_env import MacroEnv  # noqa: PLC0415
+
+    return MacroEnv(spec, ArrowWorld, **options)
+
+
+def make_env(**options: Any) -> MacroEnv:
+    """The arrow puzzle; ``options`` are the keyword arguments of MacroEnv."""
+    return _make(SPEC, options)
+
+
+def make_hard_env(**options: Any) -> MacroEnv:
+    """The hard variant; ``options`` are the keyword arguments of MacroEnv."""
+    return _make(HARD_SPEC, options)

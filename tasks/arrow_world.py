@@ -1,0 +1,181 @@
+"""The arrow puzzle's world at run time: puts a macrostate into the scene, lets the arm act, and reads it back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .macro_env import Reading
+from .scenes import constants as c
+from .scenes.appearance import Appearance, Looks
+from .scenes.arm import ARM_JOINTS, FINGER_JOINTS
+from .scenes.arrow_scene import compile_arrow_scene
+
+if TYPE_CHECKING:
+    from .motion.executor import MacroResult
+    from .motion.turn import TurnExecutor
+
+_N_CUBES = len(c.SLOTS_XY_M)
+_QUARTER_RAD = math.pi / 2
+_MATERIALS = ("table_top", "cube", "arrow", "skin")
+
+MAX_SKEW_RAD = math.radians(20.0)
+"""A cube further from a right angle than this is a fault."""
+MAX_TILT_RAD = math.radians(10.0)
+MAX_OFF_SLOT_M = 0.015
+MAX_BYSTANDER_SHIFT_M = 0.005
+
+
+class ArrowWorld:
+    """One scene of the arrow puzzle.
+
+    Args:
+        level: How much the looks vary.
+
+    Attributes:
+        model: Compiled scene, this world's own.
+        data: Its state; derived positions are up to date after every method.
+    """
+
+    def __init__(self, level: Appearance) -> None:
+        self.model = compile_arrow_scene()
+        self.data = mujoco.MjData(self.model)
+        self._level = level
+        self._looks = Looks(self.model, level, camera=c.AGENT_CAMERA, materials=_MATERIALS)
+        starts = [int(self.model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(_N_CUBES)]
+        self._cube_qpos = (np.array(starts)[:, None] + np.arange(7)).ravel()
+        self._hand = int(self.model.body("hand").mocapid[0])
+        self._slots = np.array(c.SLOTS_XY_M)
+        self._fingertip_m = np.array(c.FINGERTIP_IN_SLOT_M) + [0.0, 0.0, c.CUBE_REST_Z_M]
+        self._pointed = 0
+        self._rest_qpos, self._rest_ctrl = self._arm_at_rest()
+        self._executor: TurnExecutor | None = None
+
+    def _arm_at_rest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and controls of the whole scene with the arm at its observation pose."""
+        qpos, ctrl = self.model.qpos0.copy(), np.zeros(self.model.nu)
+        targets = [*zip(ARM_JOINTS, c.OBSERVATION_QPOS_RAD, strict=True)]
+        targets += [(name, c.FINGER_REST_M) for name in FINGER_JOINTS]
+        for name, value in targets:
+            qpos[self.model.joint(name).qposadr[0]] = value
+            ctrl[self.model.actuator(name.replace("_slide", "") + "_servo").id] = value
+        return qpos, ctrl
+
+    # --- putting -------------------------------------------------------------------------------------------------
+
+    def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
+        """Start anew from ``macrostate``, every cube a little off its slot as the appearance says."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.ctrl[:] = self._rest_qpos, self._rest_ctrl
+        jitter = rng.uniform(-1.0, 1.0, (_N_CUBES, 3))
+        self._pointed = macrostate[_N_CUBES]
+        yaw_rad = -_QUARTER_RAD * np.array(macrostate[:_N_CUBES]) + self._level.object_yaw_rad * jitter[:, 2]
+        pose = np.zeros((_N_CUBES, 7))
+        pose[:, :2] = self._slots + self._level.object_offset_m * jitter[:, :2]
+        pose[:, 2] = c.CUBE_REST_Z_M
+        pose[:, 3], pose[:, 6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
+        self.data.qpos[self._cube_qpos] = pose.ravel()
+        self._point(np.zeros(3), 0.0)
+        self._update()
+
+    def vary(self, rng: np.random.Generator) -> None:
+        """Draw this frame's light, colours, camera and hand as the appearance says."""
+        if not self._level.varies_every_frame:
+            return
+        self._looks.vary(rng)
+        wobble = rng.uniform(-1.0, 1.0, 4)
+        self._point(self._level.hand_offset_m * wobble[:3], self._level.hand_yaw_rad * wobble[3])
+        self._update()
+
+    def _point(self, offset_m: NDArray[np.float64], yaw_rad: float) -> None:
+        slot = self._slots[self._pointed]
+        self.data.mocap_pos[self._hand] = self._fingertip_m + offset_m
+        self.data.mocap_pos[self._hand, :2] += slot
+        self.data.mocap_quat[self._hand] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+
+    def _update(self) -> None:
+        """Bring geoms, cameras and lights up to date with positions."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    # --- acting --------------------------------------------------------------------------------------------------
+
+    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+        """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
+        cube = action // 2
+        start = 7 * cube
+        yaw_rad = -_QUARTER_RAD * intended[cube]
+        self.data.qpos[self._cube_qpos[start : start + 7]] = (
+            *self._slots[cube], c.CUBE_REST_Z_M, math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2),
+        )  # fmt: skip
+        self._update()
+
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+        """Physical execution: the arm turns the cube in contact physics, then everything is at rest again.
+
+        Raises:
+            DivergedError: The simulation blew up.
+        """
+        del intended  # the human keeps pointing
+        if self._executor is None:
+            from .motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
+
+            self._executor = TurnExecutor(self.model)
+        cube, counter_clockwise = divmod(action, 2)
+        self._point(np.zeros(3), 0.0)  # how the hand trembles must not matter to the arm
+        before = self._cube_poses()
+        result = self._executor.turn(
+            self.data, cube=cube, clockwise=not counter_clockwise, capture_motion_hz=capture_motion_hz
+        )
+        self._executor.executor.rest(self.data)
+        self._update()
+        return replace(result, fault=result.fault or self._bystander_problem(cube, before))
+
+    # --- reading -------------------------------------------------------------------------------------------------
+
+    def read(self) -> Reading:
+        """The macrostate as the scene shows it: yaw of each cube, and the slot the fingertip is over."""
+        directions, problem = [], None
+        for cube, pose in enumerate(self._cube_poses()):
+            direction, skew_rad = _direction(pose)
+            directions.append(direction)
+            problem = problem or self._cube_problem(cube, pose, skew_rad)
+        fingertip_y_m = self.data.mocap_pos[self._hand, 1]
+        pointed = int(np.abs(self._slots[:, 1] - fingertip_y_m).argmin())
+        return Reading(macrostate=(*directions, pointed), problem=problem)
+
+    def _cube_poses(self) -> NDArray[np.float64]:
+        """Positions and quaternions of the cubes, copied. Shape (3, 7)."""
+        return self.data.qpos[self._cube_qpos].reshape(_N_CUBES, 7)
+
+    def _cube_problem(self, cube: int, pose: NDArray[np.float64], skew_rad: float) -> str | None:
+        """What is wrong with how a cube stands, or None."""
+        tilt_rad = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (pose[4] ** 2 + pose[5] ** 2))))
+        off_m = math.hypot(*(pose[:2] - self._slots[cube]))
+        if tilt_rad > MAX_TILT_RAD:
+            return f"cube {cube} is tipped by {math.degrees(tilt_rad):.0f} degrees"
+        if off_m > MAX_OFF_SLOT_M:
+            return f"cube {cube} stands {1e3 * off_m:.0f} mm off its slot"
+        if skew_rad > MAX_SKEW_RAD:
+            return f"cube {cube} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
+        return None
+
+    def _bystander_problem(self, turned: int, before: NDArray[np.float64]) -> str | None:
+        shift_m = np.linalg.norm(self._cube_poses()[:, :3] - before[:, :3], axis=1)
+        for cube in range(_N_CUBES):
+            if cube != turned and shift_m[cube] > MAX_BYSTANDER_SHIFT_M:
+                return f"cube {cube} was pushed {1e3 * shift_m[cube]:.0f} mm while cube {turned} was turned"
+        return None
+
+
+def _direction(pose: NDArray[np.float64]) -> tuple[int, float]:
+    """The nearest direction of a cube's arrow, and how far the cube is turned from it, in rad."""
+    w, x, y, z = pose[3:]
+    yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    quarters = round(yaw_rad / _QUARTER_RAD)
+    return -quarters % 4, abs(yaw_rad - quarters * _QUARTER_RAD)

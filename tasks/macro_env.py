@@ -1,0 +1,303 @@
+"""The one Gymnasium environment: exact rules, a world that acts and can be read, and pictures of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Rules, Shape3D, TaskSpec
+
+from .rendering import Renderer, View
+from .scene_reader import body_names, poses_of, shapes_of
+from .scenes.appearance import Appearance, appearance
+from .scenes.constants import AGENT_CAMERA, ARM_GROUP, HUMAN_CAMERA, SCENE_GROUP, SETTING_GROUP
+
+if TYPE_CHECKING:
+    from .motion.executor import MacroResult
+
+FRAME_PX = 64
+MAX_PICTURE_PX = 4096
+_AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
+
+
+def picture_view(camera: str, width: int, height: int) -> View:
+    """A view for people: everything in it, soft edges, shadows and sky."""
+    groups = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
+    return View(
+        camera=camera, width=width, height=height, groups=groups, shadow_px=2048, samples=4, slices=28, sky=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a world shows.
+
+    Attributes:
+        macrostate: The nearest macrostate.
+        problem: What keeps the scene from being a proper macrostate, in words, or None.
+    """
+
+    macrostate: tuple[int, ...]
+    problem: str | None
+
+
+class World(Protocol):
+    """A scene at run time. After each method all derived positions of ``data`` are up to date."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+    def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
+        """Start anew from ``macrostate``; nothing of the time before remains."""
+
+    def vary(self, rng: np.random.Generator) -> None:
+        """Draw this frame's looks."""
+
+    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+        """Kinematic execution: put the scene where a perfect ``action`` leads."""
+
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves."""
+
+    def read(self) -> Reading:
+        """Read the macrostate back."""
+
+
+class MacroEnv(gymnasium.Env[Frame, np.int64]):
+    """Macro-actions on a real scene, seen by the wrist camera.
+
+    Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
+
+    Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``, one upright RGB frame with the human at the top.
+
+    Rewards: those of the task's rules, for the macrostate that was read back from the scene.
+
+    Starting State: one of the rules' start states, equally likely, or ``reset(options={"macrostate": ...})``.
+
+    Episode End: terminated where the rules say so; truncation is the registered time limit.
+
+    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` (with ``fault_reason`` when
+    true), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action.
+
+    Args:
+        spec: The task.
+        make_world: Its world, at an appearance level.
+        execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
+        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
+        render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
+        width: Pixels of :meth:`render`.
+        height: Pixels of :meth:`render`.
+        camera: Camera of :meth:`render`, by name.
+
+    Raises:
+        UnknownNameError: An unknown execution, appearance, render mode or camera.
+        InvalidValueError: A picture size out of range.
+
+    Version History: v0, the first.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  (Gymnasium's own declaration)
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        make_world: Callable[[Appearance], World],
+        *,
+        execution: str = "physics",
+        appearance: str = "clean",
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        camera: str = HUMAN_CAMERA,
+    ) -> None:
+        self.render_mode = None if render_mode is None else _known_render_mode(render_mode)
+        self._execution = require_known("execution", execution, EXECUTIONS)
+        self._rules: Rules = spec.rules
+        self._starts = spec.rules.start_states
+        self._known = frozenset(spec.rules.states)
+        self._world = make_world(_level(appearance))
+        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
+        self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
+        self._eye = Renderer(self._world.model, _AGENT_VIEW)
+        self._picture = Renderer(self._world.model, picture_view(camera, *_picture_size(width, height)))
+        self._human: Renderer | None = None
+        self.capture_motion_hz = 0.0
+        self._macrostate = self._starts[0]
+        self._latest: MacroResult | None = None
+
+    # --- Gymnasium -----------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frame, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds everything random in this environment.
+            options: ``{"macrostate": ...}`` to start there; any macrostate of the rules, terminal ones included.
+
+        Raises:
+            UnknownNameError: An unknown option.
+            InvalidValueError: Not a macrostate of this task.
+        """
+        super().reset(seed=seed)
+        start = self._start(options or {})
+        self._latest = None
+        self._world.place(start, self.np_random)
+        self._world.vary(self.np_random)
+        reading = self._world.read()
+        self._macrostate = reading.macrostate
+        legal = self._rules.is_legal(reading.macrostate)
+        return self._eye.frame(self._world.data), self._info(success=False, legal=legal, fault=reading.problem)
+
+    def step(self, action: np.int64 | int) -> tuple[Frame, float, bool, bool, dict[str, Any]]:
+        """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
+
+        Raises:
+            InvalidValueError: No such action.
+            DivergedError: The simulation blew up.
+        """
+        chosen = self._checked(action)
+        start = self._macrostate
+        intended = self._intended(start, chosen)
+        if self._execution == "physics":
+            self._latest = self._world.execute(chosen, intended.macrostate, self.capture_motion_hz)
+            fault = self._latest.fault
+        else:
+            self._world.set_outcome(chosen, intended.macrostate)
+            fault = None
+        self._world.vary(self.np_random)
+        reading = self._world.read()
+        self._macrostate = reading.macrostate
+        fault = fault or reading.problem
+        outcome = intended
+        if reading.macrostate != intended.macrostate:
+            outcome = self._rules.judge(start, chosen, reading.macrostate)
+            fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
+        legal = outcome.success or not outcome.terminated
+        info = self._info(success=outcome.success, legal=legal, fault=fault)
+        return self._eye.frame(self._world.data), float(outcome.reward), outcome.terminated, False, info
+
+    def render(self) -> Frame | None:  # type: ignore[override]  (Gymnasium allows many kinds of frames)
+        """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
+        return None if self.render_mode is None else self._picture.frame(self._world.data)
+
+    def close(self) -> None:
+        """Free the OpenGL contexts; may be called again."""
+        for renderer in (self._eye, self._picture, self._human):
+            if renderer is not None:
+                renderer.close()
+
+    # --- SceneReader ---------------------------------------------------------------------------------------------
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable part, arm included."""
+        return shapes_of(self._world.model)
+
+    def motion(self) -> Motion:
+        """The motion of the latest macro-action as captured, else one sample of the standing scene."""
+        latest, model, data = self._latest, self._world.model, self._world.data
+        if latest is None or not len(latest.time_s):
+            time_s, qpos = np.zeros(1), data.qpos[None].copy()
+        else:
+            time_s, qpos = latest.time_s, latest.qpos
+        poses = poses_of(model, qpos, data.mocap_pos, data.mocap_quat)
+        return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
+
+    def human_view(self, width: int = 640, height: int = 480) -> Frame:
+        """A picture of the whole scene with the arm. Shape (height, width, 3)."""
+        view = picture_view(HUMAN_CAMERA, *_picture_size(width, height))
+        if self._human is None or self._human.view != view:
+            if self._human is not None:
+                self._human.close()
+            self._human = Renderer(self._world.model, view)
+        return self._human.frame(self._world.data)
+
+    # --- details -------------------------------------------------------------------------------------------------
+
+    def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
+        for key in options:
+            if key != "macrostate":
+                raise UnknownNameError("reset option", key, ("macrostate",))
+        if "macrostate" not in options:
+            return self._starts[int(self.np_random.integers(len(self._starts)))]
+        given = options["macrostate"]
+        try:
+            start = tuple(int(value) for value in given)
+            known = start in self._known and all(a == b for a, b in zip(start, given, strict=True))
+        except (TypeError, ValueError):
+            known = False
+        if not known:
+            top = tuple(max(state[index] for state in self._known) for index in range(len(self._starts[0])))
+            raise InvalidValueError(
+                f"No macrostate {given!r}; give {len(top)} integers from 0 to at most {top}, such as {self._starts[0]}."
+            )
+        return start
+
+    def _checked(self, action: np.int64 | int) -> int:
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        try:
+            chosen = int(action)
+        except (TypeError, ValueError):
+            chosen = -1
+        if chosen != action or not 0 <= chosen < n_actions:
+            raise InvalidValueError(f"Action {action!r} does not exist; give an integer from 0 to {n_actions - 1}.")
+        return chosen
+
+    def _intended(self, start: tuple[int, ...], action: int) -> Outcome:
+        """The rules' outcome of a perfect execution, drawn where they leave a choice."""
+        outcomes = self._rules.outcomes(start, action)
+        if len(outcomes) == 1:
+            return outcomes[0]
+        chances = np.array([outcome.probability for outcome in outcomes])
+        return outcomes[int(self.np_random.choice(len(outcomes), p=chances / chances.sum()))]
+
+    def _info(self, *, success: bool, legal: bool, fault: str | None) -> dict[str, Any]:
+        latest = self._latest
+        info: dict[str, Any] = {
+            "macrostate": np.array(self._macrostate, dtype=np.int64),
+            "is_success": success,
+            "success": success,
+            "legal": legal,
+            "fault": fault is not None,
+            "sim_time_s": 0.0 if latest is None else float(latest.sim_time_s),
+            "ik_error_m": 0.0 if latest is None else float(latest.ik_error_m),
+        }
+        if fault is not None:
+            info["fault_reason"] = fault
+        return info
+
+
+def _level(name: str) -> Appearance:
+    return appearance(name)
+
+
+def _known_render_mode(name: str) -> str:
+    return require_known("render mode", name, MacroEnv.metadata["render_modes"])
+
+
+def _picture_size(width: int, height: int) -> tuple[int, int]:
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_PICTURE_PX:
+            raise InvalidValueError(f"Picture {name} {value!r} must be an integer from 1 to {MAX_PICTURE_PX} pixels.")
+    return int(width), int(height)
+
+
+def frames_of(world: World, macrostates: NDArray[np.int64], eye: Renderer, rng: np.random.Generator) -> Frame:
+    """Frames of macrostates (N, M), each placed and varied anew. Shape (N, 64, 64, 3), uint8."""
+    frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
+    for row, macrostate in enumerate(macrostates.tolist()):
+        world.place(tuple(macrostate), rng)
+        world.vary(rng)
+        frames[row] = eye.frame(world.data)
+    return frames
+
+
+def agent_eye(model: mujoco.MjModel) -> Renderer:
+    """The agent's view of a model."""
+    return Renderer(model, _AGENT_VIEW)

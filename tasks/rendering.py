@@ -1,0 +1,221 @@
+"""The only owner of OpenGL: pictures of a MuJoCo scene, from contexts that are made late and closed with care.
+
+- A context is made at the first picture, in the process that draws it; one inherited through a fork is dropped.
+- Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
+- What is still open when the interpreter exits is closed before MuJoCo closes the display.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import sys
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+from .graphics import choose_platform
+
+choose_platform()
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+
+from imagine_bench.errors import SetupError, UnknownNameError  # noqa: E402
+
+_OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
+_ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
+_N_GROUPS = 6
+_EXTRA_GEOMS = 32
+_MISSING_GL = (
+    "No OpenGL for headless rendering ({reason}): on Debian or Ubuntu install it with "
+    "'apt-get install libegl1 libgl1-mesa-dri', elsewhere set MUJOCO_GL to a platform that works."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What a picture shows and how well.
+
+    Attributes:
+        camera: Name of a camera of the model.
+        width: Pixels.
+        height: Pixels.
+        groups: Geom groups to draw.
+        shadow_px: Edge of the shadow map; 0 draws no shadows.
+        samples: Multisampling; 0 draws hard edges.
+        slices: Corners of a drawn cylinder.
+        sky: Whether to draw the skybox.
+    """
+
+    camera: str
+    width: int = 64
+    height: int = 64
+    groups: tuple[int, ...] = (0,)
+    shadow_px: int = 0
+    samples: int = 0
+    slices: int = 12
+    sky: bool = False
+
+
+def _new_gl_context(width: int, height: int) -> Any:
+    """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one.
+
+    Raises:
+        SetupError: The machine offers none.
+    """
+    try:
+        if sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl":
+            from mujoco.egl import GLContext  # noqa: PLC0415  (also where MuJoCo was imported before we chose)
+        else:
+            from mujoco.gl_context import GLContext  # noqa: PLC0415
+        context = GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # each platform fails in its own way: missing library, no device, no display
+        reason = str(error).strip().splitlines()
+        raise SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__)) from error
+    return context
+
+
+class _Canvas:
+    """An OpenGL context with one model's meshes and textures in it."""
+
+    def __init__(self, model: mujoco.MjModel, view: View) -> None:
+        self.pid = os.getpid()
+        self.gl = _new_gl_context(view.width, view.height)
+        with _quality(model, view):
+            self.mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
+
+    def close(self) -> None:
+        self.gl.make_current()
+        self.mjr.free()
+        self.gl.free()
+
+
+@contextlib.contextmanager
+def _quality(model: mujoco.MjModel, view: View) -> Any:
+    """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
+    quality, size = model.vis.quality, model.vis.global_
+    before = (quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks)
+    size_before = (size.offwidth, size.offheight)
+    quality.shadowsize, quality.offsamples = view.shadow_px, view.samples
+    quality.numslices, quality.numstacks = view.slices, max(view.slices // 2, 3)
+    size.offwidth, size.offheight = view.width, view.height
+    try:
+        yield
+    finally:
+        quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks = before
+        size.offwidth, size.offheight = size_before
+
+
+_open: weakref.WeakSet[Renderer] = weakref.WeakSet()
+_inherited: list[_Canvas] = []
+"""Canvases of a parent process: never used and never freed, since their context belongs to the parent."""
+_exit_hook_pid: int | None = None
+
+
+def _close_all() -> None:
+    for renderer in list(_open):
+        with contextlib.suppress(Exception):  # a context of another thread cannot be closed from here
+            renderer.close()
+
+
+def _close_all_at_exit() -> None:
+    """Register after MuJoCo registered its own clean-up, so that ours runs first."""
+    global _exit_hook_pid  # noqa: PLW0603
+    if _exit_hook_pid != os.getpid():
+        _exit_hook_pid = os.getpid()
+        atexit.register(_close_all)
+
+
+class Renderer:
+    """Pictures of one model from one view.
+
+    Args:
+        model: The scene. Changes of its colours, lights and cameras show in the next picture.
+        view: What to show.
+
+    Raises:
+        UnknownNameError: The model has no such camera.
+    """
+
+    def __init__(self, model: mujoco.MjModel, view: View) -> None:
+        self._canvas: _Canvas | None = None
+        cameras = [model.camera(index).name for index in range(model.ncam)]
+        if view.camera not in cameras:
+            raise UnknownNameError("camera", view.camera, cameras)
+        self.view = view
+        self._model = model
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """What does not need OpenGL."""
+        self._rect = mujoco.MjrRect(0, 0, self.view.width, self.view.height)
+        self._bottom_up = np.empty((self.view.height, self.view.width, 3), dtype=np.uint8)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + _EXTRA_GEOMS)
+        for flag, on in (
+            (mujoco.mjtRndFlag.mjRND_SHADOW, self.view.shadow_px > 0),
+            (mujoco.mjtRndFlag.mjRND_REFLECTION, False),
+            (mujoco.mjtRndFlag.mjRND_HAZE, False),
+            (mujoco.mjtRndFlag.mjRND_SKYBOX, self.view.sky),
+        ):
+            self._scene.flags[flag.value] = on
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [group in self.view.groups for group in range(_N_GROUPS)]
+        self._option.sitegroup[:] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = self._model.camera(self.view.camera).id
+
+    def frame(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """Draw ``data``, whose positions of geoms, cameras and lights are up to date.
+
+        Returns:
+            A new array, upright, RGB. Shape (height, width, 3).
+
+        Raises:
+            SetupError: The machine has no OpenGL.
+        """
+        canvas = self._ready_canvas()
+        canvas.gl.make_current()
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+        mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
+        mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
+        return self._bottom_up[::-1].copy()
+
+    def _ready_canvas(self) -> _Canvas:
+        canvas = self._canvas
+        if canvas is not None and canvas.pid == os.getpid():
+            return canvas
+        if canvas is not None:
+            _inherited.append(canvas)
+        self._canvas = canvas = _Canvas(self._model, self.view)
+        _open.add(self)
+        _close_all_at_exit()
+        return canvas
+
+    def close(self) -> None:
+        """Free the OpenGL context, if this process has one. Safe to call again; a later frame makes a new one."""
+        canvas, self._canvas = self._canvas, None
+        _open.discard(self)
+        if canvas is None:
+            return
+        if canvas.pid == os.getpid():
+            canvas.close()
+        else:
+            _inherited.append(canvas)
+
+    def __del__(self) -> None:
+        if not sys.is_finalizing():
+            self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"view": self.view, "_model": self._model}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.view, self._model = state["view"], state["_model"]
+        self._canvas = None
+        self._prepare()

@@ -1,0 +1,87 @@
+"""A compiled scene as plain shapes and motions, for drawing elsewhere."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Shape3D
+
+from .scenes.constants import ARM_GROUP, SCENE_GROUP, SETTING_GROUP
+
+_DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
+_PLANE_HALF_THICKNESS_M = 0.005
+_KINDS = {
+    mujoco.mjtGeom.mjGEOM_BOX.value: ("box", 3),
+    mujoco.mjtGeom.mjGEOM_SPHERE.value: ("sphere", 1),
+    mujoco.mjtGeom.mjGEOM_CAPSULE.value: ("capsule", 2),
+    mujoco.mjtGeom.mjGEOM_CYLINDER.value: ("cylinder", 2),
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID.value: ("ellipsoid", 3),
+    mujoco.mjtGeom.mjGEOM_MESH.value: ("mesh", 0),
+}
+
+
+def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Every body, the world included, in the model's order."""
+    return tuple(model.body(index).name for index in range(model.nbody))
+
+
+def shapes_of(model: mujoco.MjModel) -> tuple[Shape3D, ...]:
+    """Every geom that some view draws; a plane becomes a thin box under its surface."""
+    return tuple(_shape(model, index) for index in range(model.ngeom) if model.geom_group[index] in _DRAWN_GROUPS)
+
+
+def _shape(model: mujoco.MjModel, index: int) -> Shape3D:
+    geom = model.geom(index)
+    kind_id, pose = int(model.geom_type[index]), np.concatenate([model.geom_pos[index], model.geom_quat[index]])
+    size, vertices, faces = np.zeros(3), None, None
+    if kind_id == mujoco.mjtGeom.mjGEOM_PLANE.value:
+        kind = "box"
+        size[:] = (*model.geom_size[index, :2], _PLANE_HALF_THICKNESS_M)
+        pose[2] -= _PLANE_HALF_THICKNESS_M
+    else:
+        kind, n_sizes = _KINDS[kind_id]
+        size[:n_sizes] = model.geom_size[index, :n_sizes]
+    if kind == "mesh":
+        vertices, faces = _mesh(model, int(model.geom_dataid[index]))
+    material = int(model.geom_matid[index])
+    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[index]
+    return Shape3D(
+        name=geom.name, body=model.body(int(model.geom_bodyid[index])).name, kind=kind, size=size,
+        pose_in_body=pose, rgba=rgba.astype(np.float64), vertices=vertices, faces=faces,
+    )  # fmt: skip
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+    vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])]
+    faces = model.mesh_face[face : face + int(model.mesh_facenum[mesh])]
+    return vertices.astype(np.float64), faces.astype(np.int64)
+
+
+def poses_of(
+    model: mujoco.MjModel,
+    qpos: NDArray[np.float64],
+    mocap_pos: NDArray[np.float64],
+    mocap_quat: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Body poses by forward kinematics.
+
+    Args:
+        model: The scene.
+        qpos: Positions at each time. Shape (K, nq).
+        mocap_pos: Of the mocap bodies, which stand still. Shape (nmocap, 3).
+        mocap_quat: The same. Shape (nmocap, 4).
+
+    Returns:
+        Position (m) and quaternion (w, x, y, z) in the world. Shape (K, nbody, 7).
+    """
+    data = mujoco.MjData(model)
+    data.mocap_pos[:], data.mocap_quat[:] = mocap_pos, mocap_quat
+    poses = np.empty((len(qpos), model.nbody, 7))
+    for row, positions in enumerate(qpos):
+        data.qpos[:] = positions
+        mujoco.mj_kinematics(model, data)
+        poses[row, :, :3], poses[row, :, 3:] = data.xpos, data.xquat
+    return poses

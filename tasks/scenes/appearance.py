@@ -1,0 +1,127 @@
+"""How much a scene's looks vary: frozen levels, and writing one sample of them into a model without recompiling."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import require_known
+
+_CHANNELS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """Half-widths of uniform variation about the nominal scene; 0 means fixed.
+
+    Attributes:
+        name: The level's name.
+        object_offset_m: Of every loose object's start, along x and along y.
+        object_yaw_rad: Of every loose object's start.
+        hand_offset_m: Of the human's hand, along each axis, every frame.
+        hand_yaw_rad: Of the human's hand about the vertical through its fingertip, every frame.
+        light_fraction: Of the brightness of all lights together, every frame.
+        colour_fraction: Of each colour channel of each material, every frame.
+        camera_offset_m: Of the agent's camera, along each axis, every frame.
+        camera_angle_rad: Of the agent's camera, about each axis, every frame.
+    """
+
+    name: str
+    object_offset_m: float
+    object_yaw_rad: float
+    hand_offset_m: float = 0.0
+    hand_yaw_rad: float = 0.0
+    light_fraction: float = 0.0
+    colour_fraction: float = 0.0
+    camera_offset_m: float = 0.0
+    camera_angle_rad: float = 0.0
+
+    @property
+    def varies_every_frame(self) -> bool:
+        """Whether anything but the objects' start varies."""
+        return self.hand_offset_m > 0 or self.light_fraction > 0 or self.camera_offset_m > 0
+
+
+LEVELS: dict[str, Appearance] = {
+    level.name: level
+    for level in (
+        Appearance(name="clean", object_offset_m=0.0025, object_yaw_rad=math.radians(2.0)),
+        Appearance(
+            name="mild",
+            object_offset_m=0.005,
+            object_yaw_rad=math.radians(4.6),
+            hand_offset_m=0.004,
+            hand_yaw_rad=math.radians(4.0),
+            light_fraction=0.10,
+        ),
+        Appearance(
+            name="strong",
+            object_offset_m=0.010,
+            object_yaw_rad=math.radians(8.0),
+            hand_offset_m=0.006,
+            hand_yaw_rad=math.radians(8.0),
+            light_fraction=0.25,
+            colour_fraction=0.06,
+            camera_offset_m=0.003,
+            camera_angle_rad=math.radians(0.5),
+        ),
+    )
+}
+
+
+def appearance(name: str) -> Appearance:
+    """The level of that name.
+
+    Raises:
+        UnknownNameError: No such level; the message lists all of them.
+    """
+    return LEVELS[require_known("appearance", name, LEVELS)]
+
+
+class Looks:
+    """Writes samples of light, colours and camera into one model.
+
+    Args:
+        model: The scene; its arrays are changed by :meth:`vary`.
+        level: How much varies.
+        camera: Name of the camera that moves.
+        materials: Names of the materials whose colours vary.
+    """
+
+    def __init__(self, model: mujoco.MjModel, level: Appearance, *, camera: str, materials: tuple[str, ...]) -> None:
+        self._model, self._level = model, level
+        self._camera = model.camera(camera).id
+        self._materials = np.array([model.material(name).id for name in materials])
+        headlight = model.vis.headlight
+        self._ambient, self._diffuse = headlight.ambient.copy(), headlight.diffuse.copy()
+        self._light_diffuse = model.light_diffuse.copy()
+        self._rgba = model.mat_rgba[self._materials].copy()
+        self._camera_pos = model.cam_pos[self._camera].copy()
+        self._camera_quat = model.cam_quat[self._camera].copy()
+
+    def vary(self, rng: np.random.Generator) -> None:
+        """Write one new sample; it replaces the one before, nothing adds up."""
+        level, model = self._level, self._model
+        if level.light_fraction:
+            brightness = 1.0 + level.light_fraction * rng.uniform(-1.0, 1.0)
+            model.vis.headlight.ambient = self._ambient * brightness
+            model.vis.headlight.diffuse = self._diffuse * brightness
+            model.light_diffuse[:] = self._light_diffuse * brightness
+        if level.colour_fraction:
+            tint = 1.0 + level.colour_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
+            model.mat_rgba[self._materials, :_CHANNELS] = np.minimum(self._rgba[:, :_CHANNELS] * tint, 1.0)
+        if level.camera_offset_m:
+            shift, turn = rng.uniform(-1.0, 1.0, (2, 3))
+            model.cam_pos[self._camera] = self._camera_pos + level.camera_offset_m * shift
+            model.cam_quat[self._camera] = _turned(self._camera_quat, level.camera_angle_rad * turn)
+
+
+def _turned(quat: NDArray[np.float64], rotation_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``quat`` (w, x, y, z) followed in its own frame by a rotation vector. Shape (4,)."""
+    turned = quat.copy()
+    mujoco.mju_quatIntegrate(turned, rotation_rad, 1.0)
+    return turned
