@@ -1,7 +1,8 @@
 """Snapshots that a ``kill -9`` at any moment cannot damage: one folder each, complete once it has its name.
 
-A folder ``checkpoint_000007_episode_120`` (the seventh of its run) holds ``agent.safetensors``, ``runner.safetensors`` and
-``state.json``, which has the digests of the other two. The newest is kept; the one before goes when the newer is complete.
+A folder ``checkpoint_000007_episode_120`` (the seventh of its run) holds ``agent.safetensors``, ``runner.safetensors``
+and ``state.json``, which has the digests of the other two. The newest is kept; the one before it goes when the newer is
+complete.
 """
 
 from __future__ import annotations

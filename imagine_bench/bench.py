@@ -1,0 +1,115 @@
+"""From a protocol to a report: what is still missing is run, and everything is read back from the files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from imagine_bench import encoders, registry
+from imagine_bench.environment import describe_environment, gl_renderer
+from imagine_bench.errors import RunFailedError
+from imagine_bench.launchers import Failure, Job, Launcher
+from imagine_bench.progress import ProgressBars
+from imagine_bench.protocol import Protocol, protocol
+from imagine_bench.results import BenchResult
+from imagine_bench.runs import Observer, Progress, RunSpec
+from imagine_bench.store import BenchStore, load_bench
+
+_CHECK_OVERRIDES = "imagine_bench.agents.presets:resolve"
+_CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
+_NOTE_EVERY_S = 10.0
+
+
+def plan(task: str, preset: str, *, encoder: str | None = None, **changes: object) -> tuple[Protocol, Path | None]:
+    """The protocol of a bench and the encoder it uses, with everything checked that can be before anything is run.
+
+    Args:
+        task: Registered task.
+        preset: Name of a protocol preset.
+        encoder: Bundled name or path, instead of the task's own.
+        changes: Fields of the protocol that differ from the preset's.
+
+    Raises:
+        UnknownNameError: Any name that does not exist; the message lists those that do.
+        InvalidValueError: A value out of its range.
+        ArtefactError: The task has no bundled encoder at this appearance level.
+        SetupError: The device does not exist here.
+    """
+    wanted = protocol(task, preset, **changes)
+    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides))
+    if wanted.device != "cpu":
+        registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
+    if encoder is None and not any(registry.agent_entry(agent).needs_encoder for agent in wanted.agents):
+        return wanted, None
+    path = encoders.resolve(registry.task(task), wanted.appearance, encoder)
+    return protocol(task, preset, **{**changes, "encoder": encoders.identity(path)}), path
+
+
+def bench(wanted: Protocol, encoder: Path | None, *, root: Path, launcher: Launcher, bars: int) -> BenchResult:
+    """Run what is missing of a protocol, and read all of it.
+
+    Args:
+        wanted: What is compared.
+        encoder: The encoder artefact, or None if no agent needs one.
+        root: Folder of all benches.
+        launcher: Carries out the runs.
+        bars: Lines of progress, one a run at a time.
+
+    Raises:
+        RunFailedError: Some runs failed; the others are done, and the message names the logs.
+        BusyError: Another bench works in the same folder.
+        SetupError: The folder cannot be written, or there is no GL.
+        ArtefactError: A file is damaged or foreign; it is left untouched.
+    """
+    store = BenchStore(root, wanted)
+    store.open()
+    with store.lock():
+        jobs = [_job(store, encoder, *pair) for pair in store.missing()]
+        if jobs:
+            gl_renderer()  # fails here, in one sentence, rather than in every run
+            _warn(store.begin_sitting(describe_environment()), store.folder)
+            with ProgressBars([job.spec for job in jobs], bars) as show:
+                failures = launcher.launch(jobs, _noting_time(store, show))
+            store.note_time()
+            _raise_if_any(failures, len(jobs))
+    return load_bench(store.folder)
+
+
+def _job(store: BenchStore, encoder: Path | None, agent: str, seed: int) -> Job:
+    needed = encoder if registry.agent_entry(agent).needs_encoder else None
+    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed)
+    return Job(spec=spec, folder=store.run_folder(agent, seed))
+
+
+def _noting_time(store: BenchStore, show: Observer) -> Observer:
+    noted_s = time.monotonic()
+
+    def observe(progress: Progress) -> None:
+        nonlocal noted_s
+        show(progress)
+        if time.monotonic() - noted_s > _NOTE_EVERY_S:
+            store.note_time()
+            noted_s = time.monotonic()
+
+    return observe
+
+
+def _warn(changed: Sequence[str], folder: Path) -> None:
+    if changed:
+        print(
+            f"Note: {folder} was begun with another {', '.join(changed)}. Runs it finished are kept as they are; give "
+            "another folder with --out to run all of them anew."
+        )
+
+
+def _raise_if_any(failures: Sequence[Failure], jobs: int) -> None:
+    if failures:
+        lines = [
+            f"  {failure.job.spec.agent} seed {failure.job.spec.seed}: {failure.reason} Log: {failure.job.log}"
+            for failure in failures
+        ]
+        raise RunFailedError(
+            f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others.\n"
+            + "\n".join(lines)
+        )

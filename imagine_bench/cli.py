@@ -1,0 +1,230 @@
+"""The command line: words to calls, errors to one line and an exit code. No logic, nothing heavy until it is needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from imagine_bench import registry
+from imagine_bench.bench import bench, plan
+from imagine_bench.doctor import examine
+from imagine_bench.encoders import bundled
+from imagine_bench.environment import usable_cores
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.launchers import LocalPool
+from imagine_bench.protocol import PRESETS
+from imagine_bench.store import load_bench, newest_bench, newest_recording
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+_RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
+_PRESETS_OWN = "(default: the preset's)"
+_OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Train and compare agents on a task; leaves a report and recordings. The same command again goes on."""
+
+    task: str
+    """Task to compare on; 'imagine-bench list' names them."""
+    preset: str = "quick"
+    """Size of the comparison: smoke, quick, thesis or full."""
+    agents: Annotated[tuple[str, ...], _OF_PRESET] = ()
+    """Agents to compare."""
+    seeds: Annotated[tuple[int, ...], _OF_PRESET] = ()
+    """Seeds; each agent has one run a seed."""
+    budgets: Annotated[tuple[int, ...], _OF_PRESET] = ()
+    """Real training episodes at which agents are tested, ascending."""
+    evaluation_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_PRESETS_OWN)] = None
+    """Test episodes at each budget."""
+    execution: str = EXECUTIONS[0]
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    appearance: str = APPEARANCES[0]
+    """How much light, colours and poses vary: clean, mild or strong."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
+    ] = None
+    """Another encoder: a bundled name or a .safetensors file."""
+    set: tuple[str, ...] = ()
+    """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    """Runs at a time."""
+    device: str = DEVICES[0]
+    """Where agents compute: cpu or cuda."""
+    out: Path = Path("runs")
+    """Folder of all benches."""
+
+    def __call__(self) -> None:
+        """Plan, run, report."""
+        names = ("agents", "seeds", "budgets", "evaluation_episodes")
+        changes: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) not in ((), None)}
+        changes.update(execution=self.execution, appearance=self.appearance, device=self.device)
+        wanted, encoder = plan(
+            self.task, self.preset, encoder=self.encoder, overrides=parse_settings(self.set), **changes
+        )
+        workers = usable_cores() if self.workers is None else self.workers
+        _show(bench(wanted, encoder, root=self.out, launcher=LocalPool(workers), bars=workers).folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write the report of a finished bench again, from its files, and show its table."""
+
+    folder: Annotated[Path | None, tyro.conf.Positional] = None
+    """The bench's folder; by default the newest."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Load and write."""
+        _show(self.folder or newest_bench(self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Open a recording in the Rerun viewer."""
+
+    file: Annotated[Path | None, tyro.conf.Positional] = None
+    """The .rrd file; by default the newest recording."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Find and open."""
+        path = self.file or newest_recording(self.out)
+        if not path.is_file():
+            raise ArtefactError(f"There is no recording {path}.")
+        print(f"Recording: {path}")
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            print(f"There is no display here. Copy the file to a machine with one and run: rerun {path.name}")
+            return
+        from imagine_bench.recording import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
+
+        open_in_viewer(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoder:
+    """Train an encoder anew and say how it compares to the bundled one."""
+
+    task: str
+    """Task whose frames it learns."""
+    appearance: str = APPEARANCES[0]
+    """Appearance level of the frames."""
+    recipe: str = "default"
+    """How it is trained: default or thesis."""
+    seed: int = 0
+    """Seed of data and training."""
+    out: Path = Path("encoders")
+    """Folder for artefact, card and picture; never overwritten."""
+
+    def __call__(self) -> None:
+        """Train."""
+        retrain = registry.load(_RETRAIN)
+        spec = registry.task(self.task)
+        print(retrain(spec, recipe=self.recipe, appearance=self.appearance, seed=self.seed, out=self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Say what this machine and installation have, and in words what is wrong with them."""
+
+    def __call__(self) -> None:
+        """Examine."""
+        report = examine()
+        print(report)
+        if report.complaints:
+            sys.exit(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """Name the tasks, agents, presets and bundled encoders."""
+
+    def __call__(self) -> None:
+        """List."""
+        for kind, names in {
+            "tasks": registry.TASKS,
+            "agents": registry.AGENTS,
+            "presets": PRESETS,
+            "executions": EXECUTIONS,
+            "appearances": APPEARANCES,
+            "encoders": bundled(),
+        }.items():
+            print(f"{kind:12}{', '.join(names)}")
+
+
+Command = (
+    Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Encoder, tyro.conf.subcommand("encoder")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="imagine-bench",
+        description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs.",
+        args=words,
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    try:
+        command()
+    except ImagineBenchError as error:
+        print(f"imagine-bench: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("imagine-bench: interrupted; the same command goes on from the last checkpoints.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+    """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
+
+    Raises:
+        InvalidValueError: A word without ``=``, or a name given twice.
+    """
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise InvalidValueError(f"--set {pair!r} is not of the form name=value, such as controller.discount=0.9.")
+        if name in settings:
+            raise InvalidValueError(f"--set names {name!r} twice; give it once.")
+        settings[name] = _value(text)
+    return tuple(sorted(settings.items()))
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _show(folder: Path) -> None:
+    """Write a bench's report, and print its table and where everything lies."""
+    from imagine_bench.report import summary_table, write_report  # noqa: PLC0415 - matplotlib loads slowly
+
+    result = load_bench(folder)
+    page = write_report(result)
+    print(summary_table(result))
+    print(f"\nReport:     {page}")
+    recordings = [run.recording for run in result.runs if run.recording is not None]
+    if recordings:
+        print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (make view opens the newest)")

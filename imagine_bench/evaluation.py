@@ -1,0 +1,92 @@
+"""Episodes, and greedy test episodes: the same starts for every agent and seed, none of them ever a training start."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from imagine_bench.interfaces import Agent, Observation, Transition
+from imagine_bench.seeding import episode_seed
+
+Info = dict[str, Any]
+
+
+def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
+    """What an agent may see of a step: the macrostate only if it is registered as privileged."""
+    return Observation(frame=frame, macrostate=np.asarray(info["macrostate"]) if privileged else None)
+
+
+def play(
+    env: gymnasium.Env[Any, Any], agent: Agent, *, seed: int, explore: bool, privileged: bool
+) -> Iterator[tuple[Transition, Info]]:
+    """One episode, a real transition at a time; the agent learns nothing here.
+
+    Args:
+        env: The task's environment.
+        agent: Chooses the macro-actions.
+        seed: Decides the whole episode but for the agent: the environment carries nothing over from the one before.
+        explore: Whether the agent explores.
+        privileged: Whether it is shown the macrostate.
+
+    Yields:
+        Each transition with the ``info`` that followed it.
+    """
+    frame, info = env.reset(seed=seed)
+    before, over = observation(frame, info, privileged=privileged), False
+    while not over:
+        action = agent.act(before, explore=explore)
+        frame, reward, terminated, truncated, info = env.step(action)
+        after = observation(frame, info, privileged=privileged)
+        yield (
+            Transition(
+                observation=before,
+                action=action,
+                reward=float(reward),
+                next_observation=after,
+                terminated=bool(terminated),
+                truncated=bool(truncated),
+            ),
+            info,
+        )
+        before, over = after, terminated or truncated
+
+
+@dataclass
+class Tally:
+    """Counts over test episodes; a checkpoint may carry them half way.
+
+    Attributes:
+        episodes: Test episodes done.
+        successes: Those that ended in success.
+        env_steps: Macro-actions in them.
+        return_sum: Sum of their undiscounted returns.
+        faults: Macro-actions whose physics disagreed with the rules.
+        cpu_s: CPU seconds spent.
+        diagnostics: The agent's own means at the moment the test began.
+    """
+
+    episodes: int = 0
+    successes: int = 0
+    env_steps: int = 0
+    return_sum: float = 0.0
+    faults: int = 0
+    cpu_s: float = 0.0
+    diagnostics: dict[str, float] = field(default_factory=dict)
+
+    def add_episode(self, env: gymnasium.Env[Any, Any], agent: Agent, *, privileged: bool) -> None:
+        """Play the next test episode greedily and count it; how many were played says which start it has."""
+        start_s = time.process_time()
+        seed, success = episode_seed("evaluation", 0, self.episodes), False
+        for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
+            self.env_steps += 1
+            self.return_sum += transition.reward
+            self.faults += bool(info["fault"])
+            success = bool(info["is_success"])
+        self.episodes += 1
+        self.successes += success
+        self.cpu_s += time.process_time() - start_s

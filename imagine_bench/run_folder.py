@@ -1,0 +1,221 @@
+"""The files of one run: written once, when it is finished, and read back with every number the report needs.
+
+``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz`` and ``imagined.npz`` (of agents
+that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and last ``DONE``, with the digests
+of the results.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.files import read_json, sha256, write_bytes, write_json
+from imagine_bench.interfaces import ImaginedRollout
+from imagine_bench.results import Checkpoint, ComparedRollout, OpenLoop, RunResult
+
+FORMAT = "imagine_bench run 1"
+_DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
+_OPEN_LOOP, _IMAGINED, _TRAINING = "open_loop.npz", "imagined.npz", "training.npz"
+_DIAGNOSTIC = "diagnostics/"
+_INTEGERS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
+_NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
+
+
+def recording_path(folder: Path) -> Path:
+    """Where a run's recording lies."""
+    return folder / _RECORDING
+
+
+def is_done(folder: Path) -> bool:
+    """Whether the run in ``folder`` is finished."""
+    return (folder / _DONE).is_file()
+
+
+def check_config(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write what is run into a new run folder, or see that an old one holds the same.
+
+    Raises:
+        ArtefactError: The folder was begun with something else; the message names the first difference.
+        SetupError: It cannot be written.
+    """
+    path, now = folder / _CONFIG, json.loads(json.dumps({"format": FORMAT, **config}))
+    if not path.exists():
+        write_json(path, now)
+        return
+    then = read_json(path, "a run's configuration")
+    if then == now:
+        return
+    fields = sorted({*then, *now}) if isinstance(then, dict) else []
+    name = next((name for name in fields if then.get(name) != now.get(name)), "format")
+    raise ArtefactError(
+        f"{folder} was begun with another {name} than this version would use; it was left untouched. Finish it with "
+        "the version that began it, or choose another folder with --out."
+    )
+
+
+def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
+    """Write one row a budget done so far, atomically.
+
+    Raises:
+        SetupError: It cannot be written.
+    """
+    names = sorted({name for checkpoint in checkpoints for name in checkpoint.diagnostics})
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*_INTEGERS, *_NUMBERS, *(_DIAGNOSTIC + name for name in names)])
+    for row in checkpoints:
+        values = [getattr(row, name) for name in (*_INTEGERS, *_NUMBERS)]
+        table.writerow([*values, *(row.diagnostics.get(name, "") for name in names)])
+    write_bytes(folder / _METRICS, text.getvalue().encode())
+
+
+def finish(
+    folder: Path,
+    *,
+    checkpoints: Sequence[Checkpoint],
+    training: Mapping[str, NDArray[Any]],
+    imagined: Sequence[ComparedRollout],
+) -> None:
+    """Write the results of a run and mark it as done.
+
+    Args:
+        folder: The run's folder, with its ``config.json``.
+        checkpoints: One a budget.
+        training: ``success`` and ``length`` of each training episode.
+        imagined: Example rollouts.
+
+    Raises:
+        SetupError: Something cannot be written; the run is then not marked.
+    """
+    write_metrics(folder, checkpoints)
+    _write_arrays(folder / _TRAINING, training)
+    loops = {str(row.episodes): row.open_loop for row in checkpoints if row.open_loop is not None}
+    _write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
+    examples = {f"{n}/{k}": v for n, one in enumerate(imagined) for k, v in _arrays(one).items()}
+    _write_arrays(folder / _IMAGINED, examples)
+    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _IMAGINED]
+    write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
+
+
+def load_run(folder: Path) -> RunResult:
+    """Read a finished run.
+
+    Raises:
+        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
+    """
+    done = read_json(folder / _DONE, "the mark of a finished run")
+    if not isinstance(done, dict) or done.get("format") != FORMAT:
+        raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
+    for name, digest in done["sha256"].items():
+        if sha256(folder / name) != digest:
+            raise ArtefactError(
+                f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
+                f"{folder} to run it anew."
+            )
+    config = read_json(folder / _CONFIG, "a run's configuration")
+    training = _read_arrays(folder / _TRAINING)
+    recording = recording_path(folder)
+    return RunResult(
+        agent=config["agent"],
+        seed=config["seed"],
+        checkpoints=_read_metrics(folder),
+        settings=config["settings"],
+        training_success=training["success"],
+        training_length=training["length"],
+        imagined=_read_imagined(folder),
+        folder=folder,
+        recording=recording if recording.is_file() else None,
+    )
+
+
+def checkpoint_to_json(checkpoint: Checkpoint) -> dict[str, Any]:
+    """A row as JSON-serialisable values, for snapshots."""
+    values = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
+    loop = checkpoint.open_loop
+    values["diagnostics"] = dict(checkpoint.diagnostics)
+    values["open_loop"] = None if loop is None else {name: array.tolist() for name, array in _arrays(loop).items()}
+    return values
+
+
+def checkpoint_from_json(values: Mapping[str, Any]) -> Checkpoint:
+    """The inverse of :func:`checkpoint_to_json`."""
+    loop = values["open_loop"]
+    return Checkpoint(**{**values, "open_loop": None if loop is None else _open_loop(loop)})
+
+
+def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:
+    integers = {"count": np.asarray(arrays["count"], dtype=np.int64)}
+    numbers = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "count"}
+    return OpenLoop(**{**numbers, **integers})
+
+
+def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
+    loops = _grouped(_read_arrays(folder / _OPEN_LOOP))
+    rows = csv.DictReader(io.StringIO((folder / _METRICS).read_text()))
+    return tuple(
+        Checkpoint(
+            **{name: int(row[name]) for name in _INTEGERS},
+            **{name: float(row[name]) for name in _NUMBERS},
+            diagnostics={
+                name.removeprefix(_DIAGNOSTIC): float(value)
+                for name, value in row.items()
+                if name.startswith(_DIAGNOSTIC) and value != ""
+            },
+            open_loop=_open_loop(loops[row["episodes"]]) if row["episodes"] in loops else None,
+        )
+        for row in rows
+    )
+
+
+def _read_imagined(folder: Path) -> tuple[ComparedRollout, ...]:
+    examples = []
+    for _, arrays in sorted(_grouped(_read_arrays(folder / _IMAGINED)).items()):
+        rollout = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith("rollout/")}
+        rest = {name: array for name, array in arrays.items() if "/" not in name}
+        examples.append(ComparedRollout(rollout=ImaginedRollout(**rollout), **rest))
+    return tuple(examples)
+
+
+def _arrays(record: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """The arrays of a dataclass by slashed name."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if dataclasses.is_dataclass(value):
+            arrays.update(_arrays(value, f"{prefix}{field.name}/"))
+        else:
+            arrays[prefix + field.name] = np.asarray(value)
+    return arrays
+
+
+def _grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, NDArray[Any]]]:
+    groups: dict[str, dict[str, NDArray[Any]]] = {}
+    for name, array in arrays.items():
+        group, _, rest = name.partition("/")
+        groups.setdefault(group, {})[rest] = array
+    return groups
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ArtefactError(f"{path} is not an array file of a run: {error}. It was left untouched.") from error

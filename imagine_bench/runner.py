@@ -1,0 +1,245 @@
+"""One run: one agent, one seed, through all budgets of a protocol. The only loop that steps an environment to learn.
+
+Whatever is needed to go on is in the newest checkpoint, so a run that was killed at any moment and started again ends
+in the same bits as one that was not; only CPU times differ.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from imagine_bench import registry, run_folder
+from imagine_bench.checkpointing import load_newest, save_snapshot
+from imagine_bench.errors import DivergedError
+from imagine_bench.evaluation import Tally, play
+from imagine_bench.files import lock, make_folder
+from imagine_bench.imagination_quality import Question, ask, examples, open_loop
+from imagine_bench.interfaces import AgentContext, Imaginer
+from imagine_bench.results import Checkpoint, ComparedRollout, RunResult
+from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
+from imagine_bench.seeding import SeedTree, episode_seed
+
+IMAGINED_DEPTH = 10
+"""Steps of the open-loop comparison, the thesis' I_D."""
+_RECENT = 100
+"""Training episodes whose success is shown while running."""
+_REPORT_EVERY_S = 0.25
+
+
+def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult:
+    """Do a run, or what is left of it, and read its result; a finished run is only read.
+
+    Args:
+        spec: What to run.
+        folder: The run's own folder.
+        on_progress: Told now and then how far it is.
+
+    Raises:
+        BusyError: Another process is at this run.
+        ArtefactError: The folder holds something damaged, foreign or begun with other settings.
+        DivergedError: NaN in physics or learning; the message says where the state lies.
+        SetupError: The folder cannot be written, or there is no GL.
+    """
+    make_folder(folder)
+    with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):  # a killed parent's child may be dying
+        if not run_folder.is_done(folder):
+            protocol = spec.protocol
+            entry = registry.task_entry(protocol.task)
+            env = gymnasium.make(
+                entry.env_id,
+                execution=protocol.execution,
+                appearance=protocol.appearance,
+                disable_env_checker=True,  # the tests run it; here it would only cost time
+            )
+            with closing(env):
+                _Run(spec, folder, on_progress, env).to_the_end()
+    return run_folder.load_run(folder)
+
+
+class _Run:
+    def __init__(self, spec: RunSpec, folder: Path, on_progress: Observer, env: gymnasium.Env[Any, Any]) -> None:
+        self.spec, self.folder, self.on_progress, self.env = spec, folder, on_progress, env
+        self.task = registry.task(spec.protocol.task)
+        self.entry = registry.agent_entry(spec.agent)
+        self.seeds = SeedTree(spec.seed)
+        self.agent = registry.make_agent(spec.agent, self._context())
+        self.counters = Counters()
+        run_folder.check_config(folder, self._config())
+        snapshot = load_newest(folder / "checkpoints")
+        if snapshot is not None:
+            self.agent.restore(snapshot.agent)
+            self.counters = Counters.of(snapshot)
+        self.saved_s = self.reported_s = time.monotonic()
+
+    def to_the_end(self) -> None:
+        """Train and test at every budget, look at the imagination, record, and mark the run as done."""
+        try:
+            for budget in self.spec.protocol.budgets[len(self.counters.rows) :]:
+                if self.entry.learns:
+                    self._train(budget)
+                self._test(budget)
+        except DivergedError as error:
+            where = save_snapshot(self.folder / "diverged", self.counters.snapshot(self.agent.state()))
+            raise DivergedError(f"{error} The agent's state lies in {where}.") from error
+        imagined = self._examples()
+        self._record()
+        run_folder.finish(
+            self.folder, checkpoints=self.counters.rows, training=self.counters.training(), imagined=imagined
+        )
+        self._tell("done", at_once=True)
+
+    def _train(self, budget: int) -> None:
+        while self.counters.episode < budget:
+            start_s = time.process_time()
+            self._training_episode()
+            self.counters.train_cpu_s += time.process_time() - start_s
+            self._tell("training")
+            self._save_now_and_then()
+
+    def _training_episode(self) -> None:
+        counters, length, success = self.counters, 0, False
+        seed = episode_seed("training", self.spec.seed, counters.episode)
+        for transition, info in play(self.env, self.agent, seed=seed, explore=True, privileged=self.entry.privileged):
+            self.agent.observe(transition, episode=counters.episode)
+            length, success = length + 1, bool(info["is_success"])
+        counters.episode += 1
+        counters.env_steps += length
+        counters.success.append(success)
+        counters.length.append(length)
+
+    def _test(self, budget: int) -> None:
+        """Test at ``budget``; an agent that does not learn is tested once, and its row stands at every budget."""
+        counters = self.counters
+        if counters.rows and not self.entry.learns:
+            self._add_row(dataclasses.replace(counters.rows[0], episodes=budget))
+            return
+        if counters.test is None:
+            counters.test = Tally(diagnostics=self.agent.diagnostics())
+        while counters.test.episodes < self.spec.protocol.evaluation_episodes:
+            counters.test.add_episode(self.env, self.agent, privileged=self.entry.privileged)
+            self._tell("testing")
+            self._save_now_and_then()
+        self._add_row(self._row(budget, counters.test))
+
+    def _row(self, budget: int, test: Tally) -> Checkpoint:
+        start_s = time.process_time()
+        loop = None
+        if isinstance(self.agent, Imaginer) and self._questions:
+            self._tell("imagining", at_once=True)
+            loop = open_loop(self.agent, self._questions, self.seeds.child("open_loop", budget))
+        return Checkpoint(
+            episodes=budget,
+            env_steps=self.counters.env_steps,
+            test_episodes=test.episodes,
+            successes=test.successes,
+            mean_return=test.return_sum / test.episodes,
+            mean_length=test.env_steps / test.episodes,
+            faults=test.faults,
+            train_cpu_s=self.counters.train_cpu_s,
+            eval_cpu_s=test.cpu_s + time.process_time() - start_s,
+            diagnostics=test.diagnostics,
+            open_loop=loop,
+        )
+
+    def _add_row(self, row: Checkpoint) -> None:
+        self.counters.rows.append(row)
+        self.counters.test = None
+        self._save()
+        run_folder.write_metrics(self.folder, self.counters.rows)
+
+    @functools.cached_property
+    def _questions(self) -> tuple[Question, ...]:
+        protocol = self.spec.protocol
+        return ask(self.task, starts=protocol.open_loop_starts, depth=IMAGINED_DEPTH, appearance=protocol.appearance)
+
+    def _examples(self) -> tuple[ComparedRollout, ...]:
+        if not isinstance(self.agent, Imaginer):
+            return ()
+        self._tell("imagining", at_once=True)
+        seeds = self.seeds.child("examples")
+        return examples(self.agent, self.task, appearance=self.spec.protocol.appearance, seeds=seeds)
+
+    def _record(self) -> None:
+        """Record some test episodes beside the results; the file appears whole or not at all."""
+        protocol = self.spec.protocol
+        if protocol.recorded_episodes == 0:
+            return
+        from imagine_bench.recording import record_run  # noqa: PLC0415 - loading Rerun costs a second
+
+        self._tell("recording", at_once=True)
+        partial = self.folder / "recording.partial.rrd"
+        record_run(
+            protocol.task,
+            self.agent,
+            name=self.spec.agent,
+            seed=self.spec.seed,
+            execution=protocol.execution,
+            appearance=protocol.appearance,
+            episodes=protocol.recorded_episodes,
+            path=partial,
+        )
+        partial.replace(run_folder.recording_path(self.folder))
+
+    def _context(self) -> AgentContext:
+        protocol = self.spec.protocol
+        return AgentContext(
+            n_actions=self.task.n_actions,
+            preprocessing=self.task.preprocessing,
+            encoder=self.spec.encoder if self.entry.needs_encoder else None,
+            seeds=self.seeds.child("agent"),  # the same for every agent: runs of one seed are pairs
+            preset=protocol.preset,
+            overrides=dict(protocol.overrides),
+            device=protocol.device,
+            optimal_action=self.task.rules.optimal_action if self.entry.privileged else None,
+        )
+
+    def _config(self) -> Mapping[str, Any]:
+        settings = getattr(self.agent, "settings", None)
+        return {
+            "protocol": self.spec.protocol.as_dict(),
+            "protocol_hash": self.spec.protocol.hash,
+            "agent": self.spec.agent,
+            "seed": self.spec.seed,
+            "settings": {} if settings is None else dataclasses.asdict(settings),
+        }
+
+    def _save_now_and_then(self) -> None:
+        if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
+            self._save()
+
+    def _save(self) -> None:
+        save_snapshot(self.folder / "checkpoints", self.counters.snapshot(self.agent.state()))
+        self.saved_s = time.monotonic()
+
+    def _tell(self, phase: Phase, *, at_once: bool = False) -> None:
+        now_s = time.monotonic()
+        if not at_once and now_s - self.reported_s < _REPORT_EVERY_S:
+            return
+        self.reported_s = now_s
+        counters, test = self.counters, self.counters.test
+        tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
+        done = counters.episode + tested * self.spec.protocol.evaluation_episodes + (test.episodes if test else 0)
+        recent = counters.success[-_RECENT:]
+        if test is not None and test.episodes:
+            success: float | None = test.successes / test.episodes
+        else:
+            success = sum(recent) / len(recent) if recent else None
+        self.on_progress(
+            Progress(
+                agent=self.spec.agent,
+                seed=self.spec.seed,
+                phase=phase,
+                done=done,
+                work=self.spec.work,
+                episode=counters.episode,
+                success=success,
+            )
+        )

@@ -1,0 +1,126 @@
+"""What a run is, how far it is, and all that its runner must remember to go on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import registry, run_folder
+from imagine_bench.checkpointing import Snapshot
+from imagine_bench.evaluation import Tally
+from imagine_bench.interfaces import AgentState
+from imagine_bench.protocol import Protocol
+from imagine_bench.results import Checkpoint
+
+Phase = Literal["training", "testing", "imagining", "recording", "done"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec:
+    """What one run is.
+
+    Attributes:
+        protocol: The comparison it belongs to.
+        agent: Registered agent.
+        seed: One of the protocol's seeds.
+        encoder: The encoder artefact, or None if the agent needs none.
+        checkpoint_every_s: Seconds of work that a kill may cost.
+    """
+
+    protocol: Protocol
+    agent: str
+    seed: int
+    encoder: Path | None = None
+    checkpoint_every_s: float = 20.0
+
+    @property
+    def work(self) -> int:
+        """Episodes to play, for training and for tests."""
+        tests, budgets = self.protocol.evaluation_episodes, self.protocol.budgets
+        return budgets[-1] + len(budgets) * tests if registry.agent_entry(self.agent).learns else tests
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        agent: Registered agent.
+        seed: The run's seed.
+        phase: What it is doing.
+        done: Episodes played, for training and for tests.
+        work: Episodes to play.
+        episode: Training episodes done.
+        success: Share of successes among recent training episodes, or in the running test; None before the first.
+    """
+
+    agent: str
+    seed: int
+    phase: Phase
+    done: int
+    work: int
+    episode: int
+    success: float | None
+
+
+Observer = Callable[[Progress], None]
+
+
+@dataclass
+class Counters:
+    """The runner's own state, all of it in every checkpoint.
+
+    Attributes:
+        episode: Training episodes done.
+        env_steps: Macro-actions in them.
+        train_cpu_s: CPU seconds of training.
+        rows: One a budget done.
+        success: Whether each training episode succeeded.
+        length: Macro-actions of each training episode.
+        test: The test that is going on, if one is.
+    """
+
+    episode: int = 0
+    env_steps: int = 0
+    train_cpu_s: float = 0.0
+    rows: list[Checkpoint] = field(default_factory=list)
+    success: list[bool] = field(default_factory=list)
+    length: list[int] = field(default_factory=list)
+    test: Tally | None = None
+
+    def training(self) -> dict[str, NDArray[Any]]:
+        """``success`` and ``length`` of every training episode. Each of shape (episodes,)."""
+        return {
+            "success": np.array(self.success, dtype=np.bool_),
+            "length": np.array(self.length, dtype=np.int64),
+        }
+
+    def snapshot(self, agent: AgentState) -> Snapshot:
+        """Everything, with the agent's state, as a checkpoint."""
+        values = {
+            "env_steps": self.env_steps,
+            "train_cpu_s": self.train_cpu_s,
+            "rows": [run_folder.checkpoint_to_json(row) for row in self.rows],
+            "test": None if self.test is None else dataclasses.asdict(self.test),
+        }
+        return Snapshot(episode=self.episode, agent=agent, arrays=self.training(), values=values)
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> Counters:
+        """The inverse of :meth:`snapshot`."""
+        values = snapshot.values
+        return cls(
+            episode=snapshot.episode,
+            env_steps=values["env_steps"],
+            train_cpu_s=values["train_cpu_s"],
+            rows=[run_folder.checkpoint_from_json(row) for row in values["rows"]],
+            success=snapshot.arrays["success"].tolist(),
+            length=snapshot.arrays["length"].tolist(),
+            test=None if values["test"] is None else Tally(**values["test"]),
+        )

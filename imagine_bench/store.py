@@ -1,0 +1,158 @@
+"""Where a bench lies: ``<root>/<task>/<preset>-<protocol hash>/<agent>/seed_<n>/``; other settings lie elsewhere.
+
+``protocol.json`` says what is compared and ``sittings.json`` who worked on it, when, with what; nothing is ever
+overwritten by another protocol, for its hash is in the name.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import run_folder
+from imagine_bench.errors import ArtefactError, ImagineBenchError
+from imagine_bench.files import lock, make_folder, read_json, write_json
+from imagine_bench.protocol import Protocol
+from imagine_bench.results import BenchResult
+
+_PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sittings.json"
+_IDENTITY = ("commit", "versions", "gl_renderer")
+"""Facts that decide the bits of a result."""
+
+
+class BenchStore:
+    """The folder of one protocol.
+
+    Args:
+        root: Folder of all benches, such as ``runs``.
+        protocol: What is compared.
+    """
+
+    def __init__(self, root: Path, protocol: Protocol) -> None:
+        self.protocol = protocol
+        self.folder = root / protocol.task / f"{protocol.preset}-{protocol.hash}"
+        self._began_s = time.monotonic()
+        self._sittings: list[dict[str, Any]] = []
+
+    def open(self) -> None:
+        """Make the folder, or see that the one there is of this protocol.
+
+        Raises:
+            SetupError: It cannot be written.
+            ArtefactError: It holds something else, which is left untouched.
+        """
+        make_folder(self.folder)
+        path = self.folder / _PROTOCOL
+        if not path.exists():
+            write_json(path, self.protocol.as_dict())
+        elif _read_protocol(self.folder) != self.protocol:
+            raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the folder for this process.
+
+        Raises:
+            BusyError: Another bench works there.
+        """
+        return lock(self.folder / ".lock", f"The bench folder {self.folder}")
+
+    def run_folder(self, agent: str, seed: int) -> Path:
+        """The folder of one run."""
+        return _run_folder(self.folder, agent, seed)
+
+    def missing(self) -> list[tuple[str, int]]:
+        """Agents and seeds that are not finished, seed by seed."""
+        wanted = [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
+        return [pair for pair in wanted if not run_folder.is_done(self.run_folder(*pair))]
+
+    def begin_sitting(self, environment: dict[str, Any]) -> list[str]:
+        """Note that work starts now.
+
+        Args:
+            environment: What :func:`imagine_bench.environment.describe_environment` says.
+
+        Returns:
+            Names of facts that decide the bits and are not as in the first sitting.
+        """
+        path, first = self.folder / _ENVIRONMENT, environment
+        if path.exists():
+            first = read_json(path, "a bench's environment")
+            self._sittings = read_json(self.folder / _SITTINGS, "a bench's sittings")
+        else:
+            write_json(path, environment)
+        self._began_s = time.monotonic()
+        changed = [name for name in _IDENTITY if first.get(name) != environment.get(name)]
+        self._sittings.append({
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "wall_s": 0.0,
+            "command": environment["command"],
+            "changed": {name: environment.get(name) for name in changed},
+        })  # fmt: skip
+        self.note_time()
+        return changed
+
+    def note_time(self) -> None:
+        """Note how long this sitting has lasted, so that a kill loses little of the count."""
+        self._sittings[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
+        write_json(self.folder / _SITTINGS, self._sittings)
+
+
+def load_bench(folder: Path) -> BenchResult:
+    """Read a finished bench.
+
+    Raises:
+        ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
+    """
+    protocol = _read_protocol(folder)
+    folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
+    sittings = read_json(folder / _SITTINGS, "a bench's sittings")
+    return BenchResult(
+        protocol=protocol,
+        runs=tuple(run_folder.load_run(run) for run in folders if run_folder.is_done(run)),
+        environment={**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings},
+        folder=folder,
+        wall_s=sum(sitting["wall_s"] for sitting in sittings),
+    )
+
+
+def newest_bench(root: Path) -> Path:
+    """The bench folder below ``root`` that was worked on last.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    found = sorted(root.glob(f"*/*/{_SITTINGS}"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise ArtefactError(f"There is no bench below {root}; run one with 'imagine-bench bench --task arrow_puzzle'.")
+    return found[-1].parent
+
+
+def newest_recording(root: Path) -> Path:
+    """The recording below ``root`` that was written last.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    found = sorted(root.glob("*/*/*/*/recording.rrd"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise ArtefactError(
+            f"There is no recording below {root}; run a bench with 'imagine-bench bench --task arrow_puzzle'."
+        )
+    return found[-1]
+
+
+def _run_folder(folder: Path, agent: str, seed: int) -> Path:
+    return folder / agent / f"seed_{seed}"
+
+
+def _read_protocol(folder: Path) -> Protocol:
+    data = read_json(folder / _PROTOCOL, "a bench's protocol")
+    try:
+        return Protocol.from_dict(data)
+    except (TypeError, ValueError, AttributeError, ImagineBenchError) as error:
+        raise ArtefactError(
+            f"{folder / _PROTOCOL} is not a bench's protocol: {error}. It was left untouched."
+        ) from error
