@@ -17,11 +17,17 @@ from ..scenes.constants import OBSERVATION_QPOS_RAD
 from .arm_model import Floats
 from .trajectory import Trajectory
 
-REST_OPENING_M = 0.0395
-"""Each finger's distance from the grip's middle between macro-actions: a cube's half and 12 mm."""
+REST_OPENING_M = 0.0365
+"""Each finger's distance from the grip's middle between macro-actions: a cube's half and 9 mm."""
 
 _RUNAWAY_RAD_S = 200.0
 """Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
+_INPUTS = int(
+    mujoco.mjtState.mjSTATE_CTRL.value
+    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
+)
+"""What a rollout is told at every step, controls first; mocap bodies left out would fall back to their defaults."""
 _BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
@@ -93,11 +99,12 @@ class MacroExecutor:
         steps = len(trajectory.opening_m)
         states = np.empty((steps + 1, self._state_size))
         mujoco.mj_getState(self.model, data, states[0], self._state)
-        control = np.empty((steps, self.model.nu))
-        control[:] = data.ctrl
+        control = np.empty((steps, mujoco.mj_stateSize(self.model, _INPUTS)))
+        mujoco.mj_getState(self.model, data, control[0], _INPUTS)
+        control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        mujoco.rollout.rollout(self.model, data, states[0], control, state=states[None, 1:])
+        mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
         self._check(data, states, control)
         mujoco.mj_forward(self.model, data)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
@@ -135,7 +142,7 @@ class MacroExecutor:
             return
         handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=states[0], control=control)
+            np.savez(file, start_state=states[0], control=control[:, : self.model.nu])
         raise DivergedError(
             "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
             f"its start state and controls were saved in {path}."

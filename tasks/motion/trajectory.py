@@ -23,7 +23,7 @@ PEAK_ACCELERATION = 10 / math.sqrt(3)
 
 SPEED_SHARE = 0.97
 """Share of the speed limits that a plan uses; the rest is left to the servos."""
-EFFORT_SHARE = 0.7
+EFFORT_SHARE = 0.5
 """Share of the effort limits that accelerating may take; the rest is left to damping, load and the servos."""
 
 

@@ -20,8 +20,9 @@ _QUARTER_RAD = math.pi / 2
 _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
 
-_WRIST_LIMIT_RAD = 4.70
-"""The last joint's upper limit, nearly."""
+_MAX_SKEW_RAD = math.radians(8)
+"""Beyond it the last joint might leave its range, so the other pair of faces is gripped."""
+_PAD_THICKNESS_M, _CLEARANCE_M = 0.008, 0.003
 
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
@@ -32,6 +33,26 @@ _CLOSE_S, _OPEN_S, _SETTLE_S = 0.15, 0.10, 0.05
 _MAX_TILT_RAD = math.radians(10)
 _MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
 _ARM_AT_REST_RAD = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stand:
+    """How a cube stands on the table, as measured.
+
+    Attributes:
+        xy_m: Its centre. Shape (2,).
+        yaw_rad: Heading of its x axis.
+        tilt_rad: Of its z axis from the vertical.
+    """
+
+    xy_m: Floats
+    yaw_rad: float
+    tilt_rad: float
+
+    @property
+    def skew_rad(self) -> float:
+        """Yaw beyond the nearest right angle, in [-pi/4, pi/4]."""
+        return self.yaw_rad - round(self.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,17 +95,19 @@ class TurnExecutor:
         """
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
-        position_m, quat = self._cube_pose(data, cube)
-        tilt_rad = math.acos(min(1.0, 1.0 - 2.0 * (quat[1] ** 2 + quat[2] ** 2)))
-        if tilt_rad > _MAX_TILT_RAD:
-            return self._refuse(data, f"cube {cube} is tipped by {math.degrees(tilt_rad):.0f} degrees")
+        stands = [self._measure(data, each) for each in range(len(self._slots))]
+        stand = stands[cube]
+        if stand.tilt_rad > _MAX_TILT_RAD:
+            return self._refuse(data, f"cube {cube} is tipped by {math.degrees(stand.tilt_rad):.0f} degrees")
         try:
-            grip = self._solve(position_m[:2], self._slots[cube])
+            grip = self._solve(stand.xy_m, self._slots[cube])
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
-        yaw_rad = math.atan2(2.0 * (quat[0] * quat[3] + quat[1] * quat[2]), 1.0 - 2.0 * (quat[2] ** 2 + quat[3] ** 2))
-        skew_rad = yaw_rad - round(yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
-        waypoints = _waypoints(grip, self._slots[cube], skew_rad, clockwise)
+        other_faces = not clockwise and (
+            abs(stand.skew_rad) > _MAX_SKEW_RAD
+            or any(_crowds(other, stand) for each, other in enumerate(stands) if each != cube)
+        )
+        waypoints = _waypoints(grip, self._slots[cube], stand.skew_rad, clockwise, other_faces)
         trajectory = plan(
             self._arm,
             start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
@@ -102,11 +125,15 @@ class TurnExecutor:
             qpos=samples,
         )
 
-    def _cube_pose(self, data: mujoco.MjData, cube: int) -> tuple[Floats, Floats]:
-        """Measured position (3,) in m and unit quaternion (4,) of a cube."""
+    def _measure(self, data: mujoco.MjData, cube: int) -> _Stand:
+        """Read how a cube stands from the simulation."""
         start = self._cube_qpos[cube]
-        quat = data.qpos[start + 3 : start + 7]
-        return data.qpos[start : start + 3].copy(), quat / np.linalg.norm(quat)
+        w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
+        return _Stand(
+            xy_m=data.qpos[start : start + 2].copy(),
+            yaw_rad=math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+            tilt_rad=math.acos(max(-1.0, 1.0 - 2.0 * (x * x + y * y))),
+        )
 
     def _solve(self, place_xy_m: Floats, warm_start: _Grip | None) -> _Grip:
         """Configurations that grip, and hover over, a cube standing at ``place_xy_m``. Shape (2,)."""
@@ -144,19 +171,25 @@ class TurnExecutor:
         return None
 
 
-def _waypoints(grip: _Grip, slot: _Grip, skew_rad: float, clockwise: bool) -> list[Waypoint]:
+def _crowds(other: _Stand, gripped: _Stand) -> bool:
+    """Whether a finger between the two cubes would touch the other one."""
+    reach_m = CUBE_EDGE_M / 2 * (math.cos(other.skew_rad) + abs(math.sin(other.skew_rad)))
+    needed_m = REST_OPENING_M + _PAD_THICKNESS_M + _CLEARANCE_M + reach_m
+    return math.dist(other.xy_m, gripped.xy_m) < needed_m
+
+
+def _waypoints(grip: _Grip, slot: _Grip, skew_rad: float, clockwise: bool, other_faces: bool) -> list[Waypoint]:
     """Down over the cube as it stands, turned to the nominal slot's right angle, and back.
 
-    The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above.
+    The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above. A clockwise turn
+    begins with the fingers along x, clear of the row, and ends along y; a counter-clockwise one goes the other way,
+    unless ``other_faces`` turns the wrist by a quarter more, which takes longer.
     """
     sense = 1.0 if clockwise else -1.0
-    before = np.zeros(7)
-    before[-1] = -sense * _QUARTER_RAD / 2 - skew_rad
-    after = np.zeros(7)
-    after[-1] = sense * _QUARTER_RAD / 2
-    if max(grip.at_qpos_rad[-1], grip.above_qpos_rad[-1]) + before[-1] > _WRIST_LIMIT_RAD:  # a very skew cube
-        before[-1] -= math.pi  # the gripper is the same after half a turn
-        after[-1] -= math.pi
+    extra_rad = -_QUARTER_RAD if other_faces else 0.0
+    before, after = np.zeros(7), np.zeros(7)
+    before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skew_rad
+    after[-1] = extra_rad + sense * _QUARTER_RAD / 2
     squeezed_m = CUBE_EDGE_M / 2 - _SQUEEZE_M
     observe = np.array(OBSERVATION_QPOS_RAD)
     return [
