@@ -79,6 +79,22 @@ def _new_gl_context(width: int, height: int) -> Any:
     return context
 
 
+def gl_renderer() -> str:
+    """Vendor, renderer and version of the OpenGL that draws the frames.
+
+    Raises:
+        SetupError: The machine has no OpenGL.
+    """
+    context = _new_gl_context(64, 64)
+    try:
+        from OpenGL import GL  # noqa: PLC0415  (after the platform is chosen)
+
+        parts = [GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER, GL.GL_VERSION)]
+    finally:
+        context.free()
+    return ", ".join(part.decode() for part in parts if part)
+
+
 class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
