@@ -120,28 +120,28 @@ def difference(
 
 
 def gain(
-    augmented: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
+    treated: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
 ) -> Estimate:
-    """Relative gain (P_aug - P_base) / P_base of mean success rates (thesis tables 5.2 and 5.4), paired by seed.
+    """Relative gain (P_aug - P_base) / P_base of mean success rates (thesis tables 5.2 and 5.4).
+
+    Both sides are resampled independently, as in :func:`difference`: runs of one seed share starts and first weights,
+    but what training makes of them differs, so pairing them would promise more than a few seeds hold.
 
     Args:
-        augmented: Success rates of the augmented agent, one a seed. Shape (seeds,).
-        base: Success rates of the base agent for the same seeds. Shape (seeds,).
-        rng: Draws the resamples; a seed is drawn for both agents together.
+        treated: Success rates of the augmented agent. Shape (runs,) or (runs, strata).
+        base: Success rates of the base agent. Shape (other runs,) or (other runs, strata).
+        rng: Draws the resamples.
         level: Coverage of the interval.
         resamples: Bootstrap samples.
 
     Returns:
         The gain, 0.5 for half as much again; NaN where the base never succeeds.
     """
-    pairs = np.stack([_finite("augmented", augmented), _finite("base", base)], axis=-1)  # [seeds, 2]
-    if pairs.ndim != 2:
-        raise InvalidValueError(f"Gains are paired by seed; give two vectors, not shape {pairs.shape[:-1]}.")
-    value = float(_relative(pairs[None])[0])
-    if len(pairs) < 2 or np.isnan(value):
+    a, b = _table(treated), _table(base)
+    value = float(_relative(a[None], b[None])[0])
+    if min(len(a), len(b)) < 2 or np.isnan(value):
         return Estimate(value, float("nan"), float("nan"))
-    picks = rng.integers(len(pairs), size=(resamples, len(pairs)))
-    draws = _relative(pairs[picks])
+    draws = _relative(_resample(a, rng, resamples), _resample(b, rng, resamples))
     return Estimate(value, *_percentiles(draws[~np.isnan(draws)], level))
 
 
@@ -153,10 +153,10 @@ def _summary(draws: NDArray[np.float64], statistic: Statistic) -> NDArray[np.flo
     return trimmed
 
 
-def _relative(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Relative gains of mean pairs (augmented, base): (resamples, seeds, 2) to (resamples,)."""
-    augmented, base = np.moveaxis(pairs.mean(axis=1), -1, 0)
-    return np.where(base > 0, (augmented - base) / np.where(base > 0, base, 1.0), np.nan)
+def _relative(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Relative gains of mean ``a`` over mean ``b``: two tables with a leading resamples axis to (resamples,)."""
+    treated, base = a.mean(axis=(1, 2)), b.mean(axis=(1, 2))
+    return np.where(base > 0, (treated - base) / np.where(base > 0, base, 1.0), np.nan)
 
 
 def _share_won(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
