@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -50,8 +51,6 @@ class ArrowWorld:
         starts = [int(self.model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(_N_CUBES)]
         self._cube_qpos = (np.array(starts)[:, None] + np.arange(7)).ravel()
         self._hand = int(self.model.body("hand").mocapid[0])
-        self._slots = np.array(c.SLOTS_XY_M)
-        self._fingertip_m = np.array(c.FINGERTIP_IN_SLOT_M) + [0.0, 0.0, c.CUBE_REST_Z_M]
         self._pointed = 0
         self._rest_qpos, self._rest_ctrl = self._arm_at_rest()
         self._executor: TurnExecutor | None = None
@@ -72,15 +71,17 @@ class ArrowWorld:
         """Start anew from ``macrostate``, every cube a little off its slot as the appearance says."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.ctrl[:] = self._rest_qpos, self._rest_ctrl
-        jitter = rng.uniform(-1.0, 1.0, (_N_CUBES, 3))
         self._pointed = macrostate[_N_CUBES]
-        yaw_rad = -_QUARTER_RAD * np.array(macrostate[:_N_CUBES]) + self._level.object_yaw_rad * jitter[:, 2]
-        pose = np.zeros((_N_CUBES, 7))
-        pose[:, :2] = self._slots + self._level.object_offset_m * jitter[:, :2]
-        pose[:, 2] = c.CUBE_REST_Z_M
-        pose[:, 3], pose[:, 6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
-        self.data.qpos[self._cube_qpos] = pose.ravel()
-        self._point(np.zeros(3), 0.0)
+        offset_m, offset_rad = self._level.object_offset_m, self._level.object_yaw_rad
+        poses: list[float] = []
+        for (x_m, y_m), direction, (right, up, turn) in zip(
+            c.SLOTS_XY_M, macrostate, rng.uniform(-1.0, 1.0, (_N_CUBES, 3)).tolist(), strict=False
+        ):
+            half_yaw_rad = (-_QUARTER_RAD * direction + offset_rad * turn) / 2
+            poses += (x_m + offset_m * right, y_m + offset_m * up, c.CUBE_REST_Z_M)
+            poses += (math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad))
+        self.data.qpos[self._cube_qpos] = poses
+        self._point()
         self._update()
 
     def vary(self, rng: np.random.Generator) -> None:
@@ -88,14 +89,17 @@ class ArrowWorld:
         if not self._level.varies_every_frame:
             return
         self._looks.vary(rng)
-        wobble = rng.uniform(-1.0, 1.0, 4)
-        self._point(self._level.hand_offset_m * wobble[:3], self._level.hand_yaw_rad * wobble[3])
+        *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
+        self._point([self._level.hand_offset_m * each for each in wobble], self._level.hand_yaw_rad * turn)
         self._update()
 
-    def _point(self, offset_m: NDArray[np.float64], yaw_rad: float) -> None:
-        slot = self._slots[self._pointed]
-        self.data.mocap_pos[self._hand] = self._fingertip_m + offset_m
-        self.data.mocap_pos[self._hand, :2] += slot
+    def _point(self, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
+        slot_x_m, slot_y_m = c.SLOTS_XY_M[self._pointed]
+        tip_x_m, tip_y_m, tip_z_m = c.FINGERTIP_IN_SLOT_M
+        dx_m, dy_m, dz_m = offset_m
+        self.data.mocap_pos[self._hand] = (
+            slot_x_m + tip_x_m + dx_m, slot_y_m + tip_y_m + dy_m, c.CUBE_REST_Z_M + tip_z_m + dz_m,
+        )  # fmt: skip
         self.data.mocap_quat[self._hand] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
 
     def _update(self) -> None:
@@ -108,10 +112,9 @@ class ArrowWorld:
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
         cube = action // 2
-        start = 7 * cube
         yaw_rad = -_QUARTER_RAD * intended[cube]
-        self.data.qpos[self._cube_qpos[start : start + 7]] = (
-            *self._slots[cube], c.CUBE_REST_Z_M, math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2),
+        self.data.qpos[self._cube_qpos[7 * cube : 7 * cube + 7]] = (
+            *c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M, math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2),
         )  # fmt: skip
         self._update()
 
@@ -127,12 +130,12 @@ class ArrowWorld:
 
             self._executor = TurnExecutor(self.model)
         cube, counter_clockwise = divmod(action, 2)
-        self._point(np.zeros(3), 0.0)  # how the hand trembles must not matter to the arm
         before = self._cube_poses()
         result = self._executor.turn(
             self.data, cube=cube, clockwise=not counter_clockwise, capture_motion_hz=capture_motion_hz
         )
         self._executor.executor.rest(self.data)
+        self._point()  # a rollout forgets mocap bodies
         self._update()
         return replace(result, fault=result.fault or self._bystander_problem(cube, before))
 
@@ -140,30 +143,19 @@ class ArrowWorld:
 
     def read(self) -> Reading:
         """The macrostate as the scene shows it: yaw of each cube, and the slot the fingertip is over."""
+        poses = self._cube_poses().tolist()  # plain floats: three cubes are too few for numpy
         directions, problem = [], None
-        for cube, pose in enumerate(self._cube_poses()):
+        for cube, pose in enumerate(poses):
             direction, skew_rad = _direction(pose)
             directions.append(direction)
-            problem = problem or self._cube_problem(cube, pose, skew_rad)
-        fingertip_y_m = self.data.mocap_pos[self._hand, 1]
-        pointed = int(np.abs(self._slots[:, 1] - fingertip_y_m).argmin())
+            problem = problem or _problem(cube, pose, skew_rad)
+        fingertip_y_m = float(self.data.mocap_pos[self._hand, 1])
+        pointed = min(range(_N_CUBES), key=lambda slot: abs(c.SLOTS_XY_M[slot][1] - fingertip_y_m))
         return Reading(macrostate=(*directions, pointed), problem=problem)
 
     def _cube_poses(self) -> NDArray[np.float64]:
         """Positions and quaternions of the cubes, copied. Shape (3, 7)."""
         return self.data.qpos[self._cube_qpos].reshape(_N_CUBES, 7)
-
-    def _cube_problem(self, cube: int, pose: NDArray[np.float64], skew_rad: float) -> str | None:
-        """What is wrong with how a cube stands, or None."""
-        tilt_rad = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (pose[4] ** 2 + pose[5] ** 2))))
-        off_m = math.hypot(*(pose[:2] - self._slots[cube]))
-        if tilt_rad > MAX_TILT_RAD:
-            return f"cube {cube} is tipped by {math.degrees(tilt_rad):.0f} degrees"
-        if off_m > MAX_OFF_SLOT_M:
-            return f"cube {cube} stands {1e3 * off_m:.0f} mm off its slot"
-        if skew_rad > MAX_SKEW_RAD:
-            return f"cube {cube} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
-        return None
 
     def _bystander_problem(self, turned: int, before: NDArray[np.float64]) -> str | None:
         shift_m = np.linalg.norm(self._cube_poses()[:, :3] - before[:, :3], axis=1)
@@ -173,9 +165,24 @@ class ArrowWorld:
         return None
 
 
-def _direction(pose: NDArray[np.float64]) -> tuple[int, float]:
+def _direction(pose: list[float]) -> tuple[int, float]:
     """The nearest direction of a cube's arrow, and how far the cube is turned from it, in rad."""
     w, x, y, z = pose[3:]
     yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     quarters = round(yaw_rad / _QUARTER_RAD)
     return -quarters % 4, abs(yaw_rad - quarters * _QUARTER_RAD)
+
+
+def _problem(cube: int, pose: list[float], skew_rad: float) -> str | None:
+    """What is wrong with how a cube stands, or None."""
+    x_m, y_m, _, _, qx, qy, _ = pose
+    tilt_rad = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (qx * qx + qy * qy))))
+    slot_x_m, slot_y_m = c.SLOTS_XY_M[cube]
+    off_m = math.hypot(x_m - slot_x_m, y_m - slot_y_m)
+    if tilt_rad > MAX_TILT_RAD:
+        return f"cube {cube} is tipped by {math.degrees(tilt_rad):.0f} degrees"
+    if off_m > MAX_OFF_SLOT_M:
+        return f"cube {cube} stands {1e3 * off_m:.0f} mm off its slot"
+    if skew_rad > MAX_SKEW_RAD:
+        return f"cube {cube} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
+    return None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from .composing import mjcf
 
 from . import constants as c
+from .composing import mjcf
 from .meshes import prism
 
 _ARROW_THICKNESS_M = 0.0008

@@ -6,9 +6,8 @@ sleeve are one mesh each, since every drawn geom costs more than its vertices do
 
 from __future__ import annotations
 
-from .composing import mjcf
-
 from . import constants as c
+from .composing import mjcf
 from .meshes import Mesh, ellipsoid, limb, merge
 
 Joint = tuple[float, float, float, float]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from .composing import mjcf
-
 from . import constants as c
+from .composing import mjcf
 
 _TABLE_HALF_M = (0.34, 0.60, 0.02)
 _TABLE_X_M = 0.72
