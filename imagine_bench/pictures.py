@@ -15,8 +15,8 @@ from imagine_bench.results import ComparedRollout
 
 _CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is invented
 _GAP = 12
-_LABELS = 92  # width of the column that names the rows
-_HEADER, _FOOTER = 46, 92
+_LABELS = 108  # width of the column that names the rows
+_HEADER, _FOOTER = 62, 92
 _ROW = _CELL + _GAP
 _INK, _FAINT, _PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 _RIGHT, _WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: colour-blind safe
@@ -48,7 +48,7 @@ def rollout_strip(
     _row_labels(draw)
     _picture(canvas, compared.start_frame, column=0, row=0)
     _picture(canvas, _gray(compared.rollout.start_frame), column=0, row=1)
-    draw.text((_left(0), 24), "start", font=_font(13, bold=True), fill=_INK)
+    draw.text((_left(0), _HEADER - 20), "start", font=_font(13, bold=True), fill=_INK)
     for index in range(min(depth, room)):
         _column(canvas, draw, compared, index, action_names)
     _cut_mark(draw, compared, room)
@@ -76,7 +76,7 @@ def _column(
     over = index > 0 and bool(compared.real_terminated[index - 1])
     right = np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
     ink = _INK if kept else _FAINT
-    lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=19)[:2]
+    lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
     draw.multiline_text((_left(column), 8), "\n".join(lines), font=_font(12, bold=True), fill=ink, spacing=3)
     _picture(canvas, compared.real_frames[index], column=column, row=0, pale=over)
     if over:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from imagine_bench import report_plots, report_words
 from imagine_bench.files import make_folder, write_bytes
@@ -189,8 +190,9 @@ def _strips(data: ReportData) -> list[Strip]:
 
 def _strip(data: ReportData, agent: str, seed: int, index: int, compared: ComparedRollout) -> Strip:
     title = agent_words(agent).title
-    matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1)
-    depth, cut = len(matches), first_cut(compared)
+    alive = np.concatenate([[True], ~compared.real_terminated[:-1]])  # imagined after the real end: nothing to match
+    matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1) & alive
+    depth, cut = int(alive.sum()), first_cut(compared)
     kept = "the filter would keep it all" if cut is None else f"the filter cuts before macro-action {cut + 1}"
     caption = (
         f"{title[:1].upper()}{title[1:]}, seed {seed}, start {index + 1}: {int(matches.sum())} of {depth} imagined "

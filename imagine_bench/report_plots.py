@@ -53,6 +53,11 @@ _STYLE = {
 }
 
 
+_KINDS = (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":"))
+_LEADER = {"arrowstyle": "-", "linewidth": 0.7, "alpha": 0.45, "linestyle": (0, (1, 2))}
+_REFERENCE_LINE = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Plot:
     """A finished plot.
@@ -92,15 +97,14 @@ def success_figure(data: ReportData) -> Figure:
     figure = Figure(figsize=(9.2, 4.9), layout="constrained")
     axes = figure.add_subplot()
     budgets = np.array(data.budgets)
-    for share, word in ((data.facts.optimum, "optimum"), (data.facts.chance_level, "chance level")):
-        axes.axhline(100.0 * share, color=_INK, linewidth=1.0, linestyle=(0, (4, 3)), alpha=0.7)
-        label = f"{word} {100.0 * share:.1f} %"
-        axes.text(0.005, 100.0 * share + 1.2, label, transform=axes.get_yaxis_transform(), fontsize=9)
+    for share in (data.facts.optimum, data.facts.chance_level):
+        axes.axhline(100.0 * share, **_REFERENCE_LINE)
     for agent, scores in data.scores.items():
         values = np.array([[scores[b].value, scores[b].low, scores[b].high] for b in data.budgets]) * 100.0
         axes.plot(budgets, values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
         axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
     _thesis_points(axes, data)
+    _success_legend(axes, data)
     ticks = sorted({*data.budgets, *(b for rows in data.thesis.values() for b in rows)})
     axes.set_xscale("log")
     axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
@@ -140,8 +144,10 @@ def open_loop_figure(data: ReportData) -> Figure:
             panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", label=label, **style)
         panels[1].plot(depth, loop.reward_mae, label=title, **style)
         panels[2].plot(depth, 100.0 * loop.termination_error, label=title, **style)
-        for name, line in (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":")):
-            panels[3].plot(depth, getattr(loop, name), linestyle=line, label=f"{name}, {title}", color=color(agent))
+        for name, line in _KINDS:
+            panels[3].plot(depth, getattr(loop, name), linestyle=line, color=color(agent))
+    for name, line in _KINDS:
+        panels[3].plot([], [], linestyle=line, label=name, color=_INK)
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
@@ -153,7 +159,7 @@ def open_loop_figure(data: ReportData) -> Figure:
 
 
 def _log_if_positive(data: ReportData) -> str:
-    values = [getattr(loop, name) for loop in data.open_loop.values() for name in ("epistemic", "aleatoric", "modal")]
+    values = [getattr(loop, name) for loop in data.open_loop.values() for name, _ in _KINDS]
     joined = np.concatenate(values)
     return "log" if (joined[np.isfinite(joined)] > 0).all() else "linear"
 
@@ -166,13 +172,17 @@ def _thesis_points(axes: Axes, data: ReportData) -> None:
             *(episodes, means, stds), color=color(agent), marker="D", markersize=5, markerfacecolor="none",
             linestyle=":", linewidth=1.0, elinewidth=0.8, capsize=2, zorder=2,
         )  # fmt: skip
+
+
+def _success_legend(axes: Axes, data: ReportData) -> None:
+    """What the kinds of line mean; which agent a colour is, the right margin says."""
+    axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     if data.thesis:
-        axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
-        axes.plot(
-            *([], []), color=_INK, marker="D", markersize=5, markerfacecolor="none", linestyle=":", linewidth=1.0,
-            label="thesis, bar: standard deviation",
-        )  # fmt: skip
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize=9)
+        style = {"marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0}
+        axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **style)
+    levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
+    axes.plot([], [], label=levels, **_REFERENCE_LINE)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)
 
 
 def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) -> None:
@@ -189,7 +199,7 @@ def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) 
         axes.annotate(
             agent_words(agent).title, xy=(from_x, last[agent]), xycoords="data", xytext=(1.02, y - excess),
             textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
-            arrowprops={"arrowstyle": "-", "color": color(agent), "linewidth": 0.7, "alpha": 0.6},
+            arrowprops={**_LEADER, "color": color(agent)},
         )  # fmt: skip
     axes.set_xlim(right=to_x * 1.04)
 

@@ -1,4 +1,4 @@
-"""Synthetic BenchResults: numbers drawn from a seed, in every shape a report must cope with. Not a task, not an agent."""
+"""Synthetic BenchResults: numbers drawn from a seed, in every shape a report must cope with."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def open_loop(rng: np.random.Generator, *, filters: bool) -> OpenLoop:
 
 
 def compared_rollout(rng: np.random.Generator, depth: int = 5, cut: int | None = 3) -> ComparedRollout:
-    """A rollout of noise whose third macrostate is wrong, whose episode ends at the fourth and which is cut at ``cut``."""
+    """A rollout of noise: its third macrostate is wrong, the episode ends at the fourth, the filter cuts at ``cut``."""
     macrostates = rng.integers(0, 3, (depth, 4))
     imagined = macrostates.copy()
     imagined[min(2, depth - 1)] += 1

@@ -1,0 +1,271 @@
+"""Rerun recordings of what an agent really does and of what it imagines meanwhile.
+
+Timelines: ``sim_time`` (the arm moves; one still second and a half after each episode), ``env_step`` (one a real
+frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``, ``/imagined/...``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.comparison import compare_rollout
+from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.files import make_folder
+from imagine_bench.interfaces import Agent, Frame, Imaginer, Motion, Observation, SceneReader, TaskSpec, ValueReader
+from imagine_bench.pictures import png, rollout_strip
+from imagine_bench.recording_blueprint import blueprint
+from imagine_bench.recording_scene import entity_name, log_motion, log_shapes
+from imagine_bench.results import ComparedRollout
+from imagine_bench.seeding import SeedTree, episode_seed
+
+MOTION_HZ = 20.0
+IMAGINED_DEPTH = 6
+"""Macro-actions imagined at each step; as many as a strip shows legibly."""
+_STILL_S = 1.5
+_KINEMATIC_STEP_S = 1.0
+_CHOSEN, _OTHER = (213, 94, 0), (0, 114, 178)
+_KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}
+
+
+def record_run(
+    task: str, agent: Agent, *, name: str, seed: int, execution: str, appearance: str, episodes: int, path: Path
+) -> Path:
+    """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
+
+    Args:
+        task: Registered task.
+        agent: The agent; recording changes nothing in it.
+        name: Its registered name.
+        seed: The run's seed; the episodes' seeds follow from it and are used for nothing else.
+        execution: ``"physics"`` or ``"kinematic"``.
+        appearance: Appearance level.
+        episodes: Real episodes.
+        path: The file to write, ending in ``.rrd``. Until it is complete it is called ``<stem>.partial.rrd``.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        UnknownNameError: Unknown task, agent, execution or appearance.
+        SetupError: The folder cannot be written.
+    """
+    spec, entry = registry.task(task), registry.agent_entry(name)
+    make_folder(path.parent)
+    env = gymnasium.make(spec.env_id, execution=execution, appearance=appearance)
+    try:
+        scene = env.unwrapped
+        if isinstance(scene, SceneReader):
+            scene.capture_motion_hz = MOTION_HZ
+        env.reset(seed=episode_seed("recording", seed, 0))
+        layout = blueprint(
+            target_m=_target_m(scene),
+            values=isinstance(agent, ValueReader),
+            imagines=isinstance(agent, Imaginer),
+            episodes=episodes,
+        )
+        with recording_file(path, task, layout) as recording:
+            story = _Story(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
+            if isinstance(scene, SceneReader):
+                log_shapes(recording, scene.shapes())
+            for episode in range(episodes):
+                story.tell(env, episode)
+    finally:
+        env.close()
+    return path
+
+
+@contextmanager
+def recording_file(path: Path, task: str, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A recording that is closed however the block ends, and gets its name only if it is complete."""
+    partial = path.with_name(f"{path.stem}.partial.rrd")
+    recording = rr.RecordingStream(f"imagine_bench_{task}")
+    recording.save(partial, default_blueprint=layout)
+    try:
+        yield recording
+    finally:
+        recording.flush()
+        recording.disconnect()
+    partial.replace(path)
+
+
+def open_in_viewer(path: Path) -> None:
+    """Open a recording in the Rerun viewer and return when it is closed.
+
+    Raises:
+        ArtefactError: No such file.
+        SetupError: There is no display; the message says how to look at it elsewhere.
+    """
+    if not path.is_file():
+        raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise SetupError(
+            f"No display here to open {path}; copy it to a machine with one and run 'rerun {path.name}' there, "
+            f"or run 'rerun --serve-web {path}' here and open the address it prints."
+        )
+    subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
+
+
+class _Story:
+    """Tells one episode after the other on a common clock.
+
+    Args:
+        recording: Where to.
+        spec: The task.
+        agent: Whose episodes.
+        appearance: Appearance level of the real counterparts of imagined frames.
+        privileged: Whether the agent is shown the macrostate.
+        seed: The run's seed.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        spec: TaskSpec,
+        agent: Agent,
+        appearance: str,
+        *,
+        privileged: bool,
+        seed: int,
+    ) -> None:
+        self._recording, self._spec, self._agent, self._appearance = recording, spec, agent, appearance
+        self._privileged, self._seed = privileged, seed
+        self._clock_s, self._env_step = 0.0, -1
+
+    def tell(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
+        """One greedy real episode."""
+        frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
+        self._arrive(episode, frame)
+        self._move(env.unwrapped, episode, only_moved=False)
+        done, step, story = False, 0, f"### Episode {episode}\nA new start."
+        while not done:
+            macrostate = np.asarray(info["macrostate"])
+            observation = Observation(frame=frame, macrostate=macrostate if self._privileged else None)
+            action = int(self._agent.act(observation, explore=False))
+            self._say(f"{story}\n\n{self._seen(macrostate)}\n\n**Next: {self._spec.action_names[action]}.**")
+            self._expect(observation, action)
+            self._imagine(frame, macrostate, episode, step)
+            frame, reward, terminated, truncated, info = env.step(np.int64(action))
+            began_s = self._clock_s
+            self._clock_s += self._duration_s(env.unwrapped)
+            self._arrive(episode, frame)
+            self._move(env.unwrapped, episode, only_moved=True, began_s=began_s)
+            self._recording.log("/real/reward", rr.Scalars(float(reward)), strict=True)
+            done, step = terminated or truncated, step + 1
+            story = f"### Episode {episode}, after macro-action {step}\n{self._outcome(action, float(reward), info)}"
+        ending = "**Solved.**" if info["is_success"] else "**Not solved.**"
+        self._say(f"{story}\n\n{self._seen(np.asarray(info['macrostate']))}\n\n{ending}")
+        self._clock_s += _STILL_S
+
+    def _arrive(self, episode: int, frame: Frame) -> None:
+        """A new real frame: set the clocks and show it."""
+        self._env_step += 1
+        self._recording.set_time("sim_time", duration=self._clock_s)
+        self._recording.set_time("env_step", sequence=self._env_step)
+        self._recording.set_time("episode", sequence=episode)
+        self._recording.log("/real/frame", rr.Image(frame), strict=True)
+
+    def _move(self, scene: Any, episode: int, *, only_moved: bool, began_s: float | None = None) -> None:
+        if isinstance(scene, SceneReader):
+            start_s = self._clock_s if began_s is None else began_s
+            sequences = {"env_step": self._env_step, "episode": episode}
+            log_motion(self._recording, scene.motion(), start_s=start_s, sequences=sequences, only_moved=only_moved)
+
+    def _duration_s(self, scene: Any) -> float:
+        """How long the latest macro-action took, in simulated seconds; a kinematic one takes none and is given one."""
+        motion: Motion | None = scene.motion() if isinstance(scene, SceneReader) else None
+        length_s = 0.0 if motion is None else float(motion.time_s[-1])
+        return length_s or _KINEMATIC_STEP_S
+
+    def _say(self, markdown: str) -> None:
+        document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
+        self._recording.log("/real/story", document, strict=True)
+
+    def _seen(self, macrostate: NDArray[np.int64]) -> str:
+        """The macrostate in words."""
+        pairs = zip(self._spec.macrostate_names, self._spec.macrostate_values, macrostate, strict=True)
+        return "\n".join(f"- {name}: {values[int(value)]}" for name, values, value in pairs)
+
+    def _outcome(self, action: int, reward: float, info: dict[str, Any]) -> str:
+        fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
+        return f"Done: {self._spec.action_names[action]}. Reward {reward:+.0f}.{fault}"
+
+    def _expect(self, observation: Observation, action: int) -> None:
+        """The Q-values, a bar a macro-action, the chosen one in another colour."""
+        if not isinstance(self._agent, ValueReader):
+            return
+        values = self._agent.q_values(observation)
+        for index, (name, value) in enumerate(zip(self._spec.action_names, values, strict=True)):
+            color = _CHOSEN if index == action else _OTHER
+            bar = rr.BarChart(np.array([value], dtype=np.float64), abscissa=np.array([index]), color=color)
+            self._recording.log(f"/real/q_values/{entity_name(name)}", bar, strict=True)
+        self._recording.log("/real/best_q_value", rr.Scalars(float(values.max())), strict=True)
+
+    def _imagine(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
+        """The agent's greedy plan, imagined from here and set beside what would really happen."""
+        if not isinstance(self._agent, Imaginer):
+            return
+        rng = SeedTree(self._seed).child("recording", episode, step).generator()
+        rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
+        compared = compare_rollout(
+            self._spec, frame=frame, macrostate=macrostate, rollout=rollout, appearance=self._appearance, rng=rng
+        )
+        strip = png(rollout_strip(compared, self._spec.action_names, columns=IMAGINED_DEPTH))
+        self._recording.log("/imagined/strip", rr.EncodedImage(contents=strip, media_type="image/png"), strict=True)
+        self._uncertainty_bars(compared)
+        if step == 0:
+            self._by_depth(compared, f"/imagined/episode_{episode}")
+
+    def _uncertainty_bars(self, compared: ComparedRollout) -> None:
+        """Three bars, side by side, at each depth."""
+        for index, (kind, color) in enumerate(_KINDS.items()):
+            values = np.asarray(getattr(compared.rollout, kind), dtype=np.float64)
+            places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
+            widths = np.full(len(values), 0.25)
+            bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
+            self._recording.log(f"/imagined/uncertainty/{kind}", bars, strict=True)
+
+    def _by_depth(self, compared: ComparedRollout, root: str) -> None:
+        """The same rollout along ``imagined_depth``; depth 0 is the real start."""
+        rollout, recording = compared.rollout, self._recording
+        for depth in range(len(rollout.actions) + 1):
+            recording.set_time("imagined_depth", sequence=depth)
+            real = compared.start_frame if depth == 0 else compared.real_frames[depth - 1]
+            imagined = rollout.start_frame if depth == 0 else rollout.frames[depth - 1]
+            gray = (np.clip(imagined, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+            recording.log(f"{root}/real_frame", rr.Image(real), strict=True)
+            recording.log(f"{root}/frame", rr.Image(gray, color_model="L"), strict=True)
+            if depth == 0:
+                continue
+            for kind in _KINDS:
+                value = float(getattr(rollout, kind)[depth - 1])
+                recording.log(f"{root}/uncertainty/{kind}", rr.Scalars(value), strict=True)
+            predictions = {
+                "reward": rollout.rewards,
+                "p_terminal": rollout.p_terminated,
+                "true_reward": compared.real_rewards,
+                "kept_by_filter": rollout.accepted,
+            }
+            for word, values in predictions.items():
+                recording.log(f"{root}/prediction/{word}", rr.Scalars(float(values[depth - 1])), strict=True)
+        recording.disable_timeline("imagined_depth")
+
+
+def _target_m(scene: Any) -> NDArray[np.float64]:
+    """What the 3D view looks at: the median place of the scene's bodies, near what the arm handles."""
+    if not isinstance(scene, SceneReader):
+        return np.zeros(3)
+    target: NDArray[np.float64] = np.median(scene.motion().poses_in_world[0, :, :3], axis=0)
+    return target

@@ -1,0 +1,105 @@
+"""The 3D scene in a recording: one transform a body, its shapes fixed below it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Motion, Shape3D
+
+ROOT = "/scene"
+_STILL_M = 1e-6
+"""Bodies whose poses change by less (metres; quaternion components) during a macro-action get no new transforms."""
+
+
+def entity_name(words: str) -> str:
+    """``"Turn left (cube 1)"`` as ``"turn_left_cube_1"``: lower_snake, as entity paths want it."""
+    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
+
+
+def body_path(body: str) -> str:
+    """Entity path of a body."""
+    return f"{ROOT}/{entity_name(body)}"
+
+
+def log_shapes(recording: rr.RecordingStream, shapes: Sequence[Shape3D]) -> None:
+    """Log every shape once, for all times, below its body."""
+    recording.log(ROOT, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+    for shape in shapes:
+        path = f"{body_path(shape.body)}/{entity_name(shape.name)}"
+        recording.log(path, _drawable(shape), static=True, strict=True)
+
+
+def log_motion(
+    recording: rr.RecordingStream, motion: Motion, *, start_s: float, sequences: dict[str, int], only_moved: bool
+) -> None:
+    """Log the bodies' poses over one macro-action.
+
+    Args:
+        recording: Where to.
+        motion: K samples.
+        start_s: When it began on the timeline ``sim_time``, in seconds.
+        sequences: Values of the sequence timelines, the same for all samples.
+        only_moved: Leave out bodies that stood still.
+    """
+    times = [rr.TimeColumn("sim_time", duration=start_s + motion.time_s)]
+    times += [rr.TimeColumn(name, sequence=np.full(len(motion.time_s), value)) for name, value in sequences.items()]
+    for index, body in enumerate(motion.body_names):
+        poses = motion.poses_in_world[:, index]  # [K, 7]
+        if only_moved and np.abs(poses - poses[0]).max() < _STILL_M:
+            continue
+        columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:]))
+        recording.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
+
+
+def _drawable(shape: Shape3D) -> rr.AsComponents:
+    center, quaternion = shape.pose_in_body[None, :3], _xyzw(shape.pose_in_body[None, 3:])
+    color = (np.clip(shape.rgba, 0.0, 1.0) * 255).astype(np.uint8)
+    style = {"colors": [color], "fill_mode": "solid"}
+    if shape.kind == "mesh":
+        return _mesh(shape, color)
+    if shape.kind == "box":
+        return rr.Boxes3D(half_sizes=[shape.size], centers=center, quaternions=quaternion, **style)
+    if shape.kind in {"sphere", "ellipsoid"}:
+        radii = shape.size if shape.kind == "ellipsoid" else np.full(3, shape.size[0])
+        return rr.Ellipsoids3D(half_sizes=[radii], centers=center, quaternions=quaternion, **style)
+    radius, length = [shape.size[0]], 2.0 * shape.size[1]
+    if shape.kind == "cylinder":
+        return rr.Cylinders3D(lengths=[length], radii=radius, centers=center, quaternions=quaternion, **style)
+    if shape.kind == "capsule":  # Rerun's begins at its origin, ours has it in the middle
+        begin = center + _rotate(shape.pose_in_body[3:], np.array([0.0, 0.0, -length / 2]))
+        return rr.Capsules3D(lengths=[length], radii=radius, translations=begin, quaternions=quaternion, **style)
+    raise InvalidValueError(f"Shape {shape.name!r} is of kind {shape.kind!r}, which a recording cannot draw.")
+
+
+def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
+    """Flat-shaded: every face has its own three corners, so that edges stay sharp."""
+    if shape.vertices is None or shape.faces is None:
+        raise InvalidValueError(f"Shape {shape.name!r} is a mesh without vertices or faces.")
+    corners = _rotate(shape.pose_in_body[3:], shape.vertices[shape.faces]) + shape.pose_in_body[:3]  # [F, 3, 3]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3),
+        vertex_normals=np.repeat(normals, 3, axis=0),
+        triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3),
+        albedo_factor=color,
+    )
+
+
+def _rotate(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotate vectors (..., 3) by a unit quaternion (w, x, y, z)."""
+    w, axis = quaternion_wxyz[0], quaternion_wxyz[1:]
+    twice = 2.0 * np.cross(axis, vectors)
+    rotated: NDArray[np.float64] = vectors + w * twice + np.cross(axis, twice)
+    return rotated
+
+
+def _xyzw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rerun's order of quaternion components: (..., wxyz) to (..., xyzw)."""
+    return np.roll(quaternions, -1, axis=-1)
