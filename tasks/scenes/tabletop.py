@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from . import constants as c
 from .composing import mjcf
 
@@ -9,6 +11,8 @@ _TABLE_HALF_M = (0.34, 0.60, 0.02)
 _TABLE_X_M = 0.72
 _FLOOR_Z_M = -0.92
 _LEG_INSET_M = 0.05
+
+_HUMAN_EYE_M, _HUMAN_TARGET_M, _HUMAN_FOVY_DEG = (1.44, 1.14, 0.70), (0.46, 0.03, 0.215), 41.0
 
 
 def set_options(root: mjcf.RootElement) -> None:
@@ -84,11 +88,13 @@ def add_floor(root: mjcf.RootElement) -> None:
 
 
 def add_human_camera(root: mjcf.RootElement) -> None:
-    """The view a person wants: arm, cubes and pointing hand from the front left."""
-    root.worldbody.add(
-        "camera", name=c.HUMAN_CAMERA, pos=(1.35, 1.25, 0.75), fovy=42.0,
-        xyaxes=(-0.74, 0.67, 0.0, -0.27, -0.30, 0.91),
-    )  # fmt: skip
+    """The view a person wants: arm, cubes and pointing hand from the far left."""
+    eye, target = np.array(_HUMAN_EYE_M), np.array(_HUMAN_TARGET_M)
+    backward = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross((0.0, 0.0, 1.0), backward)
+    right /= np.linalg.norm(right)
+    up = np.cross(backward, right)
+    root.worldbody.add("camera", name=c.HUMAN_CAMERA, pos=eye, fovy=_HUMAN_FOVY_DEG, xyaxes=(*right, *up))
 
 
 def add_tabletop(root: mjcf.RootElement) -> None:
