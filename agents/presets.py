@@ -5,7 +5,7 @@ A preset is nothing but its deviations from the thesis, each with its reason; th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -13,6 +13,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 
 from .settings import Settings
+from .uncertainty import reduction
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,7 @@ _QUICK: dict[str, Deviation] = {
     "model.predict_change": Deviation(True, ""),
     "model.reward_unit": Deviation(10.0, ""),
     "model.gradient_clip": Deviation(10.0, ""),
+    "model.sigma_floor": Deviation(0.1, ""),
     "imagination.start_episode": Deviation(200, ""),
     "imagination.temperature": Deviation(0.0, ""),
     "imagination.exploration": Deviation(0.2, ""),
@@ -45,6 +47,42 @@ PRESETS: dict[str, dict[str, Deviation]] = {
     "thesis": {},
     "full": {},
 }
+
+
+@dataclass(frozen=True, slots=True)
+class _Range:
+    """Which numbers a setting takes, in words too. NaN satisfies no comparison, so it is never allowed."""
+
+    holds: Callable[[float], bool]
+    words: str
+
+
+_PROBABILITY = _Range(lambda value: 0.0 <= value <= 1.0, "must lie in [0, 1]")
+_SHARE = _Range(lambda value: 0.0 <= value < 1.0, "must lie in [0, 1)")
+_POSITIVE = _Range(lambda value: value > 0.0, "must be above 0")
+_NOT_NEGATIVE = _Range(lambda value: value >= 0.0, "must be at least 0")
+_COUNT = _Range(lambda value: value >= 1, "must be at least 1")
+_RANGES = {
+    "model.dropout": _SHARE,
+    "model.learning_rate": _POSITIVE,
+    "model.max_norm": _POSITIVE,
+    "model.updates_per_step": _COUNT,
+    "model.reward_unit": _POSITIVE,
+    "model.sigma_floor": _POSITIVE,
+    "model.gradient_clip": _POSITIVE,
+    "controller.learning_rate": _POSITIVE,
+    "controller.discount": _PROBABILITY,
+    "controller.updates_per_step": _NOT_NEGATIVE,
+    "controller.epsilon_min": _PROBABILITY,
+    "controller.epsilon_max": _PROBABILITY,
+    "controller.epsilon_decay": _NOT_NEGATIVE,
+    "imagination.start_episode": _NOT_NEGATIVE,
+    "imagination.updates_per_step": _NOT_NEGATIVE,
+    "imagination.temperature": _NOT_NEGATIVE,
+    "imagination.exploration": _PROBABILITY,
+    "imagination.threshold": _NOT_NEGATIVE,
+}
+"""Ranges of the numbers; every other number is a count of at least 1."""
 
 
 def flatten(settings: Any, prefix: str = "") -> dict[str, Any]:
@@ -70,7 +108,18 @@ def resolve(preset: str, overrides: Mapping[str, Any]) -> Settings:
     """
     deviations = PRESETS[require_known("preset", preset, PRESETS)]
     values = {name: deviation.value for name, deviation in deviations.items()}
-    return _with_values(Settings(), {**values, **overrides})
+    settings = _with_values(Settings(), {**values, **overrides})
+    _require_ranges(settings)
+    return settings
+
+
+def _require_ranges(settings: Settings) -> None:
+    reduction(settings.imagination.reduction)
+    for name, value in flatten(settings).items():
+        allowed = _RANGES.get(name, _COUNT)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(type(number) in (int, float) and not allowed.holds(number) for number in numbers):
+            raise InvalidValueError(f"Setting {name} is {value}; it {allowed.words}.")
 
 
 def _with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:

@@ -1,0 +1,108 @@
+"""Imagined rollouts: where they end, what the filter discards, where they are stored."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from imagine_bench.agents.controller import Controller
+from imagine_bench.agents.imagination import Imagination
+from imagine_bench.agents.mixture import Mixture
+from imagine_bench.agents.settings import ImaginationSettings, Settings
+
+from imagine_bench.seeding import SeedTree
+
+CPU = torch.device("cpu")
+T = 4
+
+
+class CountingModel:
+    """An identifiable world model: latent (i, c) goes to (i, c + 1), and doubt and end come at chosen counts.
+
+    The first latent dimension tells the rollouts apart by the action taken first.
+    """
+
+    def __init__(self, *, doubt_at: int = -1, end_at: int = -1) -> None:
+        self.doubt_at, self.end_at = doubt_at, end_at
+
+    def draw_weights(self, count: int, dropout: torch.Generator) -> None:
+        return None
+
+    def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+        following = z + torch.tensor([0.0, 1.0])
+        doubtful = (following[:, 1] == self.doubt_at).float()  # [N]
+        spread = torch.linspace(-1.0, 1.0, T)[:, None] * doubtful * 3.0  # [T, N]; zero mean over weight samples
+        means = following.expand(T, *following.shape).clone()
+        means[..., 0] += spread
+        return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
+
+    def assess(self, next_z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return 10.0 * next_z[:, 1], (next_z[:, 1] == self.end_at).float()
+
+
+def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Imagination, Controller]:
+    values = {"breadth": 3, "depth": 10, "temperature": 0.0, "threshold": 0.3, "weight_samples": T}
+    settings = Settings(imagination=ImaginationSettings(**(values | changes)))
+    imagination = Imagination(2, 2, settings, filtered=filtered, seeds=SeedTree(0), device=CPU)
+    imagination.model = model  # type: ignore[assignment]
+    return imagination, Controller(2, 2, settings.controller, torch.Generator().manual_seed(0))
+
+
+def stored_counts(imagination: Imagination) -> list[float]:
+    memory = imagination.memory
+    return sorted(memory.arrays()["next_z"][:, 1].tolist())
+
+
+def test_rollouts_run_to_their_full_depth_in_closed_loop() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel())
+    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    assert dataclasses.astuple(counts) == (3, 30, 30)
+    assert stored_counts(imagination) == sorted(3 * [float(c) for c in range(1, 11)])
+    rows = imagination.memory.arrays()
+    assert (rows["reward"] == 10.0 * rows["next_z"][:, 1]).all()
+    assert (rows["next_z"][:, 1] - rows["z"][:, 1] == 1.0).all()
+
+
+def test_a_predicted_end_is_stored_and_ends_the_rollout() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(end_at=4))
+    imagination.rollouts(controller, torch.zeros(2), 0.5)
+    rows = imagination.memory.arrays()
+    assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
+    assert (rows["terminated"] == (rows["next_z"][:, 1] == 4.0)).all()
+
+
+def test_the_filter_discards_the_doubtful_transition_and_the_rest_of_its_rollout() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5))
+    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
+    assert dataclasses.astuple(counts) == (3, 15, 12)
+
+
+def test_without_the_filter_doubt_is_kept() -> None:
+    imagination, controller = make(filtered=False, model=CountingModel(doubt_at=5))
+    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    assert counts.accepted == counts.predicted == 30
+
+
+@pytest.mark.parametrize(("reduction", "accepted"), [("max", 12), ("mean", 30)])
+def test_the_threshold_is_compared_with_the_named_reduction(reduction: str, accepted: int) -> None:
+    # The epistemic variance at the doubtful step is (5, 0): 5 at most, 2.5 on average.
+    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5), reduction=reduction, threshold=4.0)
+    assert imagination.rollouts(controller, torch.zeros(2), 0.5).accepted == accepted
+
+
+def test_everything_doubtful_stores_nothing() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=1))
+    assert imagination.rollouts(controller, torch.zeros(2), 0.5).accepted == 0
+    assert len(imagination.memory) == 0
+
+
+def test_exploration_inside_rollouts_is_at_least_that_of_the_settings() -> None:
+    greedy, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1)
+    greedy.rollouts(controller, torch.zeros(2), 0.0)
+    assert len(set(greedy.memory.arrays()["action"].tolist())) == 1
+    exploring, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1, exploration=0.5)
+    exploring.rollouts(controller, torch.zeros(2), 0.0)
+    share = (exploring.memory.arrays()["action"] != greedy.memory.arrays()["action"][0]).mean()
+    assert 0.1 < share < 0.4  # half of the random half

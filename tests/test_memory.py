@@ -1,0 +1,80 @@
+"""The two memories: what goes in comes out, in pairs, and each by itself."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from imagine_bench.agents.memory import Batch, ImaginedMemory, RealMemory
+
+from imagine_bench.errors import InvalidValueError
+
+CPU = torch.device("cpu")
+
+
+def fill(memory: RealMemory, count: int, sigma: float = 0.0) -> None:
+    """Row i leads from latent i to latent i + 0.5, so every pair is recognisable."""
+    for i in range(count):
+        now, then = torch.full((2,), float(i)), torch.full((2,), i + 0.5)
+        spread = torch.full((2,), sigma)
+        memory.add((now, spread), i % 3, float(i), (then, spread), terminated=i % 2 == 0)
+
+
+def test_no_batch_pairs_states_of_different_transitions() -> None:
+    memory = RealMemory(8, 2, CPU)
+    fill(memory, 20)  # overwritten twice: rows 12 to 19 remain
+    batch = memory.sample(500, torch.Generator().manual_seed(0))
+    assert torch.equal(batch.next_z, batch.z + 0.5)
+    assert torch.equal(batch.reward, batch.z[:, 0])
+    assert torch.equal(batch.action, batch.z[:, 0].long() % 3)
+    assert torch.equal(batch.terminated, (batch.z[:, 0] % 2 == 0).float())
+    assert set(batch.z[:, 0].tolist()) == set(map(float, range(12, 20)))
+
+
+def test_latents_are_drawn_anew_from_their_posteriors() -> None:
+    memory, generator = RealMemory(4, 2, CPU), torch.Generator().manual_seed(0)
+    fill(memory, 1, sigma=0.3)
+    batch = memory.sample(20_000, generator)
+    for drawn, center in ((batch.z, 0.0), (batch.next_z, 0.5)):
+        torch.testing.assert_close(drawn.mean(0), torch.full((2,), center), atol=0.01, rtol=0.0)
+        torch.testing.assert_close(drawn.std(0), torch.full((2,), 0.3), atol=0.01, rtol=0.0)
+    both = torch.corrcoef(torch.cat([batch.z, batch.next_z], dim=1).T)
+    assert (both - torch.eye(4)).abs().max() < 0.03, "noise must be independent"
+
+
+def test_the_imagined_memory_keeps_only_recent_imagination() -> None:
+    memory = ImaginedMemory(5, 2, CPU)
+    for start in range(0, 12, 4):
+        z = torch.arange(start, start + 4, dtype=torch.float32)[:, None].expand(4, 2)
+        memory.add(Batch(z, torch.zeros(4, dtype=torch.int64), z[:, 0], z + 0.5, torch.zeros(4)))
+    assert (len(memory), memory.added) == (5, 12)
+    batch = memory.sample(300, torch.Generator().manual_seed(0))
+    assert set(batch.reward.tolist()) == {7.0, 8.0, 9.0, 10.0, 11.0}
+    assert torch.equal(batch.next_z, batch.z + 0.5)
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_a_memory_is_restored_exactly_and_independently(count: int) -> None:
+    memory, other = RealMemory(8, 2, CPU), RealMemory(8, 2, CPU)
+    fill(memory, count, sigma=0.1)
+    arrays = memory.arrays()
+    assert len(arrays["mu"]) == min(count, 8), "only filled rows are stored"
+    other.load(arrays, memory.added)
+    fill(memory, 1)
+    fill(other, 1)
+    first, second = (each.sample(50, torch.Generator().manual_seed(1)) for each in (memory, other))
+    assert torch.equal(first.z, second.z)
+    assert torch.equal(first.reward, second.reward)
+
+
+def test_a_stored_memory_does_not_follow_later_writes() -> None:
+    memory = RealMemory(8, 2, CPU)
+    fill(memory, 8)
+    arrays = memory.arrays()
+    fill(memory, 8, sigma=0.5)
+    assert (memory.arrays()["sigma"] == 0.5).all()
+    assert (arrays["sigma"] == 0.0).all()
+
+
+def test_sampling_an_empty_memory_is_an_error() -> None:
+    with pytest.raises(InvalidValueError, match="The memory is empty; store a transition before"):
+        RealMemory(4, 2, CPU).sample(1, torch.Generator())

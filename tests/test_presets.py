@@ -1,0 +1,112 @@
+"""Presets and overrides: what is named is set, what is not exists nowhere."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+from imagine_bench.agents.presets import PRESETS, flatten, resolve
+from imagine_bench.agents.settings import Settings
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+
+
+def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None:
+    assert resolve("thesis", {}) == resolve("full", {}) == Settings()
+    flat = flatten(Settings())
+    printed = {
+        "model.dynamics_hidden": (256, 256, 256),
+        "model.components": 5,
+        "model.reward_hidden": (512, 512, 512),
+        "model.termination_hidden": (256, 256),
+        "model.dropout": 0.5,
+        "model.max_norm": 3.0,
+        "model.updates_per_step": 16,
+        "model.batch_size": 512,
+        "controller.hidden": (512, 256, 128),
+        "controller.learning_rate": 1e-3,
+        "controller.batch_size": 64,
+        "controller.epsilon_min": 0.001,
+        "controller.epsilon_max": 0.8,
+        "controller.epsilon_decay": 0.03,
+        "imagination.start_episode": 1000,
+        "imagination.breadth": 3,
+        "imagination.depth": 10,
+        "imagination.temperature": 1.0,
+        "imagination.threshold": 0.3,
+        "memory.real": 50_000,
+        "memory.imagined": 3_000,
+    }
+    assert {name: flat[name] for name in printed} == printed
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_deviation_is_applied_and_has_a_reason(preset: str) -> None:
+    flat, thesis = flatten(resolve(preset, {})), flatten(Settings())
+    for name, deviation in PRESETS[preset].items():
+        assert flat[name] == deviation.value != thesis[name]
+        assert len(deviation.reason) > 20
+    assert {name for name in flat if flat[name] != thesis[name]} == set(PRESETS[preset])
+
+
+def test_an_override_replaces_one_value_of_the_preset() -> None:
+    before, after = flatten(resolve("quick", {})), flatten(resolve("quick", {"controller.discount": 0.5}))
+    assert {name for name in after if after[name] != before[name]} == {"controller.discount"}
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "kept"),
+    [
+        ("controller.hidden", [4, 5], (4, 5)),
+        ("controller.discount", 1, 1.0),
+        ("model.gradient_clip", None, None),
+        ("model.gradient_clip", 3, 3.0),
+    ],
+)
+def test_values_are_taken_as_json_gives_them(name: str, given: Any, kept: Any) -> None:
+    value = flatten(resolve("thesis", {name: given}))[name]
+    assert value == kept
+    assert type(value) is type(kept)
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Settings().controller.discount = 0.1  # type: ignore[misc]
+
+
+def test_an_unknown_setting_lists_what_exists_and_the_nearest_name() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"No setting 'controller.discont'. Did you mean 'controller.discount'"
+    ) as e:
+        resolve("quick", {"controller.discont": 0.9})
+    assert all(name in str(e.value) for name in flatten(Settings()))
+
+
+def test_an_unknown_preset_lists_what_exists() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"No preset 'quik'. Did you mean 'quick'\? Known: smoke, quick, thesis, f"
+    ):
+        resolve("quik", {})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("controller.discount", "high", "'controller.discount' was given 'high'; it takes float"),
+        ("controller.discount", True, "'controller.discount' was given True; it takes float"),
+        ("controller.discount", 1.5, r"controller.discount is 1.5; it must lie in \[0, 1\]"),
+        ("controller.hidden", (8, 0), r"controller.hidden is \(8, 0\); it must be at least 1"),
+        ("controller.epsilon_min", -0.1, r"controller.epsilon_min is -0.1; it must lie in \[0, 1\]"),
+        ("model.dropout", 1.0, r"model.dropout is 1.0; it must lie in \[0, 1\)"),
+        ("model.gradient_clip", 0.0, "model.gradient_clip is 0.0; it must be above 0"),
+        ("model.components", 2.5, "'model.components' was given 2.5; it takes int"),
+        ("imagination.reduction", "median", "No uncertainty reduction 'median'"),
+        ("imagination.depth", 0, "imagination.depth is 0; it must be at least 1"),
+        ("imagination.temperature", float("nan"), "imagination.temperature is nan; it must be at least 0"),
+        ("memory.real", -5, "memory.real is -5; it must be at least 1"),
+    ],
+)
+def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
+    with pytest.raises((InvalidValueError, UnknownNameError), match=message):
+        resolve("quick", {name: value})

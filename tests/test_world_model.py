@@ -1,0 +1,111 @@
+"""The world model: losses, weight samples, and a chain it must learn."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench.agents import mixture as mdn
+from imagine_bench.agents.memory import Batch
+from imagine_bench.agents.settings import WorldModelSettings
+from imagine_bench.agents.world_model import WorldModel, log_cosh
+
+from imagine_bench.errors import DivergedError
+
+Z, A, N_STATES = 3, 2, 5
+CODES = torch.from_numpy(np.random.default_rng(2).normal(size=(N_STATES, Z)).astype(np.float32))
+SETTINGS = WorldModelSettings(
+    dynamics_hidden=(32, 32), components=2, reward_hidden=(32,), termination_hidden=(32,), dropout=0.5
+)
+
+
+def make(**changes: object) -> WorldModel:
+    return WorldModel(Z, A, dataclasses.replace(SETTINGS, **changes), torch.Generator().manual_seed(0))
+
+
+def chain_batch(count: int, generator: torch.Generator) -> Batch:
+    """Action 1 steps up a chain of 5 states, action 0 down; the top earns 2 and ends."""
+    state = torch.randint(N_STATES - 1, (count,), generator=generator)
+    action = torch.randint(A, (count,), generator=generator)
+    following = (state + 2 * action - 1).clamp(0, N_STATES - 1)
+    top = (following == N_STATES - 1).float()
+    return Batch(CODES[state], action, 2.0 * top, CODES[following], top)
+
+
+def test_log_cosh_is_itself_and_does_not_overflow() -> None:
+    x = torch.linspace(-5.0, 5.0, 101, dtype=torch.float64)
+    torch.testing.assert_close(log_cosh(x), x.cosh().log())
+    assert log_cosh(torch.tensor(1e4)).item() == pytest.approx(1e4 - math.log(2.0))
+
+
+@pytest.mark.parametrize("predict_change", [False, True])
+def test_it_learns_a_small_deterministic_chain(predict_change: bool) -> None:
+    model = make(dropout=0.0, predict_change=predict_change, sigma_floor=0.1, learning_rate=5e-3)
+    draws, dropout = torch.Generator().manual_seed(1), torch.Generator().manual_seed(2)
+    for _ in range(600):
+        model.update(chain_batch(64, draws), dropout)
+    test = chain_batch(100, torch.Generator().manual_seed(3))
+    predicted = mdn.mean(mdn.average(model.predict(test.z, test.action, None)))
+    reward, p_terminated = model.assess(test.next_z)
+    assert (predicted - test.next_z).abs().max() < 0.25  # states are 0.9 apart and more
+    assert (reward - test.reward).abs().max() < 0.15
+    assert ((p_terminated > 0.5).float() == test.terminated).all()
+    assert test.terminated.sum() > 5, "the end of the chain must be among the tests"
+
+
+def test_one_backward_pass_trains_three_independent_networks() -> None:
+    """Ruining one loss leaves the updates of the other networks as they were."""
+    one, other = make(), make()
+    batch = chain_batch(16, torch.Generator().manual_seed(1))
+    one.update(batch, torch.Generator().manual_seed(2))
+    other.update(dataclasses.replace(batch, reward=batch.reward * -7.0), torch.Generator().manual_seed(2))
+    for name, same in (("dynamics", True), ("termination", True), ("reward", False)):
+        first, second = (getattr(model, name).weights[0] for model in (one, other))
+        assert torch.equal(first, second) is same, name
+
+
+def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
+    model, generator = make(), torch.Generator().manual_seed(1)
+    weights = model.draw_weights(6, generator)
+    z, action = CODES[:4], torch.tensor([0, 1, 0, 1])
+    together = model.predict(z, action, weights)
+    assert together.means.shape == (6, 4, 2, Z)
+    for row in range(4):
+        alone = model.predict(z[row : row + 1], action[row : row + 1], weights)
+        torch.testing.assert_close(together.means[:, row], alone.means[:, 0])
+        torch.testing.assert_close(together.log_weights[:, row], alone.log_weights[:, 0])
+    assert together.means.std(dim=0).min() > 0.0, "weight samples must disagree"
+    repeated = model.predict(z, action, model.draw_weights(6, torch.Generator().manual_seed(1)))
+    assert torch.equal(repeated.means, together.means)
+
+
+def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
+    model = make()
+    z, action = CODES[:4], torch.zeros(4, dtype=torch.int64)
+    assert torch.equal(model.predict(z, action, None).means, model.predict(z, action, None).means)
+    assert torch.equal(model.assess(z)[0], model.assess(z)[0])
+    batch, generator = chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2)
+    first, second = model.losses(batch, generator), model.losses(batch, generator)
+    assert all(not torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_reward_unit_changes_the_scale_of_learning_and_not_of_prediction() -> None:
+    plain, scaled = make(), make(reward_unit=10.0)
+    torch.testing.assert_close(scaled.assess(CODES)[0], 10.0 * plain.assess(CODES)[0])
+
+
+def test_max_norm_holds_after_an_update() -> None:
+    model = make(max_norm=0.5)
+    model.update(chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
+    for network in model.networks:
+        for weight in network.weights:
+            assert weight.norm(dim=1).max() <= 0.5 + 1e-6
+
+
+def test_a_loss_that_is_no_number_stops_the_run() -> None:
+    model, batch = make(), chain_batch(4, torch.Generator().manual_seed(1))
+    with pytest.raises(DivergedError, match="world model's losses are no longer finite"):
+        model.update(dataclasses.replace(batch, z=batch.z * float("inf")), torch.Generator())
