@@ -123,9 +123,9 @@ def test_arm_carries_itself(model):
     assert np.abs(data.qpos[:7] - OBSERVATION_QPOS_RAD).max() < 1e-6
 
 
-def test_only_the_pads_touch(model):
+def test_only_the_fingertips_touch(model):
     touching = {model.geom(index).name for index in range(model.ngeom) if model.geom_contype[index]}
-    assert touching == {"finger_left_pad", "finger_right_pad"}
+    assert touching == {f"finger_{side}_tip_{end}" for side in ("left", "right") for end in ("front", "back")}
     assert set(model.geom_group) == {ARM_GEOM_GROUP}
 
 
@@ -146,9 +146,11 @@ def test_fingers_open_along_the_tools_y(model):
     data.qpos[7:] = 0.03
     mujoco.mj_kinematics(model, data)
     frame = data.site("tcp").xmat.reshape(3, 3)
-    for name, side in (("finger_left_pad", 1), ("finger_right_pad", -1)):
-        in_tool = frame.T @ (data.geom(name).xpos - data.site("tcp").xpos)
-        np.testing.assert_allclose(in_tool, (0, side * (0.03 + model.geom(name).size[1]), 0), atol=1e-12)
+    for finger, side in (("left", 1), ("right", -1)):
+        for end, along_m in (("front", 0.007), ("back", -0.007)):
+            tip = f"finger_{finger}_tip_{end}"
+            in_tool = frame.T @ (data.geom(tip).xpos - data.site("tcp").xpos)
+            np.testing.assert_allclose(in_tool, (along_m, side * (0.03 + model.geom(tip).size[0]), 0), atol=1e-12)
 
 
 def test_everything_is_named(model):

@@ -337,8 +337,8 @@ def test_turns_leave_mocap_bodies_where_they_are(turner):
     np.testing.assert_array_equal(data.mocap_pos[0], (0.9, 0.1, 0.2))
 
 
-def pads(model):
-    return [model.geom(f"finger_{side}_pad").id for side in ("left", "right")]
+def tips(model):
+    return [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
 
 
 def turned_deg(turner, model, change=None):
@@ -353,14 +353,14 @@ def turned_deg(turner, model, change=None):
 
 
 def test_only_contact_turns_the_cube(turner):
-    """No weld, no teleport: pads that pass through the cube leave it alone, and the robot feels that it holds none."""
+    """No weld, no teleport: fingertips that pass through the cube leave it alone, and the robot feels it holds none."""
 
-    def ghost_pads(model):
-        model.geom_contype[pads(model)] = 0
-        model.geom_conaffinity[pads(model)] = 0
+    def ghost_tips(model):
+        model.geom_contype[tips(model)] = 0
+        model.geom_conaffinity[tips(model)] = 0
 
     assert turned_deg(turner, compile_arrow_scene())[0] == pytest.approx(90, abs=1)
-    angle, fault = turned_deg(turner, compile_arrow_scene(), ghost_pads)
+    angle, fault = turned_deg(turner, compile_arrow_scene(), ghost_tips)
     assert angle == pytest.approx(0, abs=0.1)
     assert fault == "the fingers closed past cube 1"
 

@@ -36,12 +36,14 @@ class Waypoint:
         qpos_rad: Arm joints. Shape (7,).
         opening_m: Commanded distance of each pad from the grip's middle. Less than the object's half width squeezes it.
         min_duration_s: The motion takes at least so long, such as the time fingers need.
+        blend_s: The next motion begins so long before this one has ended; the two add up.
     """
 
     name: str
     qpos_rad: Floats
     opening_m: float
     min_duration_s: float = 0.0
+    blend_s: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,12 +102,12 @@ def plan(
         timestep_s: Of the simulation.
     """
     at_qpos_rad, at_opening_m = start_qpos_rad, start_opening_m
-    motions: list[Floats] = []
+    motions: list[tuple[int, Floats]] = []  # first step, rows [steps, 15]
     last_step: dict[str, int] = {}
-    step = -1
+    first = 0
     for waypoint in waypoints:
         delta_rad = waypoint.qpos_rad - at_qpos_rad
-        inertia = arm.inertia(at_qpos_rad + delta_rad / 2)
+        inertia = arm.inertia(at_qpos_rad + delta_rad / 2) if delta_rad.any() else np.zeros((7, 7))
         duration_s = max(shortest_duration_s(arm, delta_rad, inertia), waypoint.min_duration_s, timestep_s)
         steps = math.ceil(duration_s / timestep_s - 1e-9)
         duration_s = steps * timestep_s
@@ -115,10 +117,13 @@ def plan(
         weights[0, 14] = waypoint.opening_m - at_opening_m
         weights[1, 7:14] = arm.damping_nms_rad * delta_rad / (duration_s * arm.stiffness_nm_rad)
         weights[2, 7:14] = inertia @ delta_rad / (duration_s**2 * arm.stiffness_nm_rad)
-        start = np.concatenate([at_qpos_rad, at_qpos_rad, [at_opening_m]])  # [15]
-        motions.append(start + minimum_jerk(steps) @ weights)  # [steps, 15]
-        step += steps
-        last_step[waypoint.name] = step
+        motions.append((first, minimum_jerk(steps) @ weights))
+        last_step[waypoint.name] = first + steps - 1
+        first += max(0, steps - math.floor(waypoint.blend_s / timestep_s + 1e-9))
         at_qpos_rad, at_opening_m = waypoint.qpos_rad, waypoint.opening_m
-    rows = np.concatenate(motions)  # [N, 15]
+    rows = np.empty((max(last_step.values()) + 1, 15))
+    rows[:] = np.concatenate([start_qpos_rad, start_qpos_rad, [start_opening_m]])
+    for first, motion in motions:
+        rows[first : first + len(motion)] += motion
+        rows[first + len(motion) :] += motion[-1]
     return Trajectory(qpos_rad=rows[:, :7], arm_command_rad=rows[:, 7:14], opening_m=rows[:, 14], last_step=last_step)

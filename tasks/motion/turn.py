@@ -28,7 +28,9 @@ _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
 """Each finger's command lies so far inside the cube: about 13 N."""
-_CLOSE_S, _OPEN_S, _SETTLE_S = 0.15, 0.10, 0.05
+_CLOSE_S, _OPEN_S, _SETTLE_S = 0.10, 0.07, 0.03
+_BLEND_S = 0.10
+"""Going down begins so long before the reach ends, and the return so long before the fingers are fully up."""
 
 _MAX_TILT_RAD = math.radians(10)
 _MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
@@ -193,12 +195,12 @@ def _waypoints(grip: _Grip, slot: _Grip, skew_rad: float, clockwise: bool, other
     squeezed_m = CUBE_EDGE_M / 2 - _SQUEEZE_M
     observe = np.array(OBSERVATION_QPOS_RAD)
     return [
-        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M),
+        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=_BLEND_S),
         Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M),
         Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=squeezed_m, min_duration_s=_CLOSE_S),
         Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=squeezed_m),
         Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
-        Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M),
+        Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=_BLEND_S),
         Waypoint(name="return", qpos_rad=observe, opening_m=REST_OPENING_M),
         Waypoint(name="settle", qpos_rad=observe, opening_m=REST_OPENING_M, min_duration_s=_SETTLE_S),
     ]
