@@ -24,61 +24,63 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
     """
 
     def __init__(self, specs: Sequence[RunSpec], workers: int) -> None:
-        self._live = sys.stderr.isatty()
+        self._work = sum(spec.work for spec in specs)
         self._runs, self._finished = len(specs), 0
         self._done: dict[tuple[str, int], int] = {}
-        self._shown_s = time.monotonic()
-        self._total = tqdm(
-            total=sum(spec.work for spec in specs),
-            unit="episode",
-            desc=self._description(),
-            bar_format="{desc} |{bar:30}| {percentage:3.0f} %  {elapsed} elapsed, {remaining} left",
-            disable=not self._live,
-            leave=False,
-        )
-        self._lines: list[tuple[tuple[str, int] | None, tqdm]] = [
-            (None, tqdm(bar_format="{desc}", position=row + 1, leave=False, disable=not self._live))
-            for row in range(min(workers, len(specs)))
-        ]
+        self._before = 0
+        self._began_s = self._shown_s = time.monotonic()
+        self._total: tqdm | None = None
+        self._lines: list[tuple[tuple[str, int] | None, tqdm]] = []
+        if sys.stderr.isatty():
+            form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
+            self._total = tqdm(total=self._work, desc=self._description(), bar_format=form, leave=False)
+            rows = range(1, min(workers, len(specs)) + 1)
+            self._lines = [(None, tqdm(bar_format="{desc}", position=row, leave=False)) for row in rows]
 
     def __exit__(self, *_: object) -> None:
         for _, line in self._lines:
             line.close()
-        self._total.close()
+        if self._total is not None:
+            self._total.close()
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
-        run = (progress.agent, progress.seed)
-        first = run not in self._done
-        self._total.update(progress.done - self._done.get(run, 0))
+        run, finished = (progress.agent, progress.seed), progress.phase == "done"
+        if run not in self._done:  # what an earlier sitting did took no time now and promises nothing
+            self._before += progress.done
         self._done[run] = progress.done
-        if first:  # what an earlier sitting did takes no time now, and must not promise too early an end
-            self._total.initial += progress.done
-        finished = progress.phase == "done"
         self._finished += finished
-        self._total.set_description_str(self._description(), refresh=False)
-        if self._live:
-            self._show_on_line(run, "" if finished else _sentence(progress), free=finished)
+        if self._total is not None:
+            self._show_on_bars(self._total, run, "" if finished else _sentence(progress))
         elif finished or time.monotonic() - self._shown_s > _LINE_EVERY_S:
             self._shown_s = time.monotonic()
-            print(f"{self._description()}: {_sentence(progress)}", file=sys.stderr, flush=True)
+            print(f"{self._description()},{self._times()}; {_sentence(progress)}", file=sys.stderr, flush=True)
 
     def _description(self) -> str:
         return f"{self._finished} of {self._runs} runs done"
 
-    def _show_on_line(self, run: tuple[str, int], text: str, *, free: bool) -> None:
-        rows = [row for row, (owner, _) in enumerate(self._lines) if owner == run]
-        rows += [row for row, (owner, _) in enumerate(self._lines) if owner is None]
-        if not rows:
-            return
-        line = self._lines[rows[0]][1]
-        line.set_description_str(text)
-        self._lines[rows[0]] = (None if free else run, line)
+    def _times(self) -> str:
+        """Time gone and, once there is something to judge by, time left."""
+        gone_s, done = time.monotonic() - self._began_s, sum(self._done.values())
+        played = done - self._before
+        left = f", {tqdm.format_interval(gone_s * (self._work - done) / played)} left" if played else ""
+        return f" {tqdm.format_interval(gone_s)} gone{left}"
+
+    def _show_on_bars(self, total: tqdm, run: tuple[str, int], text: str) -> None:
+        total.n = sum(self._done.values())
+        total.set_description_str(self._description(), refresh=False)
+        total.set_postfix_str(self._times(), refresh=True)
+        own = [row for row, (owner, _) in enumerate(self._lines) if owner == run]
+        free = [row for row, (owner, _) in enumerate(self._lines) if owner is None]
+        for row in (own + free)[:1]:
+            line = self._lines[row][1]
+            line.set_description_str(text)
+            self._lines[row] = (run if text else None, line)
 
 
 def _sentence(progress: Progress) -> str:
     success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
     return (
         f"{progress.agent} seed {progress.seed}: {progress.phase}, training episode {progress.episode}, "
-        f"{100 * progress.done / progress.work:.0f} % done{success}"
+        f"{100 * progress.done / progress.work:.0f} % of its episodes{success}"
     )

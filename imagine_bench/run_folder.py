@@ -115,7 +115,7 @@ def load_run(folder: Path) -> RunResult:
         ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
     """
     done = read_json(folder / _DONE, "the mark of a finished run")
-    if not isinstance(done, dict) or done.get("format") != FORMAT:
+    if not isinstance(done, dict) or done.get("format") != FORMAT or "sha256" not in done:
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
     for name, digest in done["sha256"].items():
         if sha256(folder / name) != digest:
