@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from imagine_bench.files import make_folder
 from imagine_bench.interfaces import Agent, Frame, Imaginer, Motion, Observation, SceneReader, TaskSpec, ValueReader
 from imagine_bench.pictures import png, rollout_strip
 from imagine_bench.recording_blueprint import blueprint
-from imagine_bench.recording_scene import entity_name, log_motion, log_shapes
+from imagine_bench.recording_scene import entity_name, extent_m, log_motion, log_shapes
 from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed
 
@@ -35,8 +35,9 @@ MOTION_HZ = 20.0
 IMAGINED_DEPTH = 6
 """Macro-actions imagined at each step; as many as a strip shows legibly."""
 _STILL_S = 1.5
+_SMALL_M = 0.07
 _KINEMATIC_STEP_S = 1.0
-_CHOSEN, _OTHER = (213, 94, 0), (0, 114, 178)
+_BAR_CELLS = 16
 _KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}
 
 
@@ -69,7 +70,7 @@ def record_run(
         scene = env.unwrapped
         if isinstance(scene, SceneReader):
             scene.capture_motion_hz = MOTION_HZ
-        env.reset(seed=episode_seed("recording", seed, 0))
+        env.reset(seed=episode_seed("recording", seed, 1))
         layout = blueprint(
             target_m=_target_m(scene),
             values=isinstance(agent, ValueReader),
@@ -80,7 +81,7 @@ def record_run(
             story = _Story(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
             if isinstance(scene, SceneReader):
                 log_shapes(recording, scene.shapes())
-            for episode in range(episodes):
+            for episode in range(1, episodes + 1):
                 story.tell(env, episode)
     finally:
         env.close()
@@ -118,6 +119,23 @@ def open_in_viewer(path: Path) -> None:
     subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
 
 
+def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
+    """Q-values as Markdown: a monospaced row each with a bar from the lowest value to the highest.
+
+    Args:
+        names: Macro-actions. Length A.
+        values: Their values. Shape (A,).
+        chosen: The one that is carried out, marked by an arrow head.
+    """
+    low, high = float(values.min()), float(values.max())
+    width = max(len(name) for name in names)
+    rows = []
+    for index, (name, value) in enumerate(zip(names, values, strict=True)):
+        cells = round(1 + (_BAR_CELLS - 1) * (float(value) - low) / (high - low or 1.0))
+        rows.append(f"{'>' if index == chosen else ' '} {name:<{width}} {value:+7.2f} {'█' * cells}")
+    return "\n".join(["```", *rows, "```", "\\> is the one it carries out."])
+
+
 class _Story:
     """Tells one episode after the other on a common clock.
 
@@ -145,11 +163,11 @@ class _Story:
         self._clock_s, self._env_step = 0.0, -1
 
     def tell(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
-        """One greedy real episode."""
+        """One greedy real episode, numbered from 1."""
         frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
         self._arrive(episode, frame)
         self._move(env.unwrapped, episode, only_moved=False)
-        done, step, story = False, 0, f"### Episode {episode}\nA new start."
+        done, step, story = False, 0, f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
             observation = Observation(frame=frame, macrostate=macrostate if self._privileged else None)
@@ -164,7 +182,7 @@ class _Story:
             self._move(env.unwrapped, episode, only_moved=True, began_s=began_s)
             self._recording.log("/real/reward", rr.Scalars(float(reward)), strict=True)
             done, step = terminated or truncated, step + 1
-            story = f"### Episode {episode}, after macro-action {step}\n{self._outcome(action, float(reward), info)}"
+            story = f"### Episode {episode}, after macro-action {step}\n\n{self._outcome(action, float(reward), info)}"
         ending = "**Solved.**" if info["is_success"] else "**Not solved.**"
         self._say(f"{story}\n\n{self._seen(np.asarray(info['macrostate']))}\n\n{ending}")
         self._clock_s += _STILL_S
@@ -190,7 +208,7 @@ class _Story:
         return length_s or _KINEMATIC_STEP_S
 
     def _say(self, markdown: str) -> None:
-        document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
+        document = rr.TextDocument(f"*{self._spec.description}*\n\n{markdown}", media_type=rr.MediaType.MARKDOWN)
         self._recording.log("/real/story", document, strict=True)
 
     def _seen(self, macrostate: NDArray[np.int64]) -> str:
@@ -203,15 +221,14 @@ class _Story:
         return f"Done: {self._spec.action_names[action]}. Reward {reward:+.0f}.{fault}"
 
     def _expect(self, observation: Observation, action: int) -> None:
-        """The Q-values, a bar a macro-action, the chosen one in another colour."""
+        """The Q-values: a series each, and a table with bars, the chosen one marked."""
         if not isinstance(self._agent, ValueReader):
             return
-        values = self._agent.q_values(observation)
-        for index, (name, value) in enumerate(zip(self._spec.action_names, values, strict=True)):
-            color = _CHOSEN if index == action else _OTHER
-            bar = rr.BarChart(np.array([value], dtype=np.float64), abscissa=np.array([index]), color=color)
-            self._recording.log(f"/real/q_values/{entity_name(name)}", bar, strict=True)
-        self._recording.log("/real/best_q_value", rr.Scalars(float(values.max())), strict=True)
+        names, values = self._spec.action_names, self._agent.q_values(observation)
+        for name, value in zip(names, values, strict=True):
+            self._recording.log(f"/real/q_values/{entity_name(name)}", rr.Scalars(float(value)), strict=True)
+        table = rr.TextDocument(q_table(names, values, action), media_type=rr.MediaType.MARKDOWN)
+        self._recording.log("/real/q_table", table, strict=True)
 
     def _imagine(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
         """The agent's greedy plan, imagined from here and set beside what would really happen."""
@@ -264,8 +281,11 @@ class _Story:
 
 
 def _target_m(scene: Any) -> NDArray[np.float64]:
-    """What the 3D view looks at: the median place of the scene's bodies, near what the arm handles."""
+    """What the 3D view looks at: the middle of the small bodies, which are the objects and the fingers."""
     if not isinstance(scene, SceneReader):
         return np.zeros(3)
-    target: NDArray[np.float64] = np.median(scene.motion().poses_in_world[0, :, :3], axis=0)
-    return target
+    motion = scene.motion()
+    large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
+    small = [index for index, body in enumerate(motion.body_names) if body not in large]
+    places: NDArray[np.float64] = motion.poses_in_world[0, small or slice(None), :3]
+    return places.mean(axis=0)

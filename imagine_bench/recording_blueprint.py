@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.recording_scene import ROOT
 
-_EYE_FROM_TARGET_M = np.array([0.95, -1.0, 0.75])
+_EYE_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
 """Beside the human's hand, across the table from the arm: neither hides the objects."""
 
 
@@ -34,8 +34,8 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, ep
     story = rrb.TextDocumentView(origin="/real/story", name="What happens")
     side = [rrb.Horizontal(story, frame)]
     if values:
-        side.append(rrb.BarChartView(origin="/real/q_values", name="Q-values: return expected of each macro-action"))
-    top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.15, 1.0])
+        side.append(rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action"))
+    top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.1, 1.0])
     pages = [_over_time(values=values)]
     if imagines:
         pages = [_imagined_now(), *pages, _by_depth(episodes)]
@@ -54,21 +54,25 @@ def _imagined_now() -> rrb.Horizontal:
         name="The agent's own plan from here: what would really happen (above), what it imagines (below)",
         background=[255, 255, 255],
     )
-    bars = rrb.BarChartView(origin="/imagined/uncertainty", name="Uncertainty of each imagined macro-action (variance)")
-    return rrb.Horizontal(strip, bars, column_shares=[3.0, 1.0], name="Imagination from the current frame")
+    bars = rrb.BarChartView(
+        origin="/imagined/uncertainty",
+        name="Variance by depth: epistemic pink, aleatoric blue, modal green",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+    return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
 
 
 def _over_time(*, values: bool) -> rrb.Horizontal:
     views = [rrb.TimeSeriesView(origin="/real/reward", name="Reward of each real macro-action")]
     if values:
-        views.append(rrb.TimeSeriesView(origin="/real/best_q_value", name="Highest Q-value before each macro-action"))
+        views.append(rrb.TimeSeriesView(origin="/real/q_values", name="Q-value of each macro-action"))
     return rrb.Horizontal(*views, name="Rewards and values over time")
 
 
 def _by_depth(episodes: int) -> rrb.Vertical:
     """For the timeline ``imagined_depth``: the rollout from each episode's first frame, imagined step by step."""
     rows = []
-    for episode in range(min(episodes, 3)):
+    for episode in range(1, 1 + min(episodes, 3)):
         root = f"/imagined/episode_{episode}"
         rows.append(
             rrb.Horizontal(

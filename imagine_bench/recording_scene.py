@@ -17,6 +17,16 @@ _STILL_M = 1e-6
 """Bodies whose poses change by less (metres; quaternion components) during a macro-action get no new transforms."""
 
 
+_BACKDROP_M = 2.0
+
+
+def extent_m(shape: Shape3D) -> float:
+    """How far a shape reaches from its middle, in metres, along its longest axis."""
+    if shape.vertices is not None:
+        return float(np.abs(shape.vertices).max())
+    return float(shape.size.max())
+
+
 def entity_name(words: str) -> str:
     """``"Turn left (cube 1)"`` as ``"turn_left_cube_1"``: lower_snake, as entity paths want it."""
     return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
@@ -28,9 +38,11 @@ def body_path(body: str) -> str:
 
 
 def log_shapes(recording: rr.RecordingStream, shapes: Sequence[Shape3D]) -> None:
-    """Log every shape once, for all times, below its body."""
+    """Log every shape once, for all times, below its body; a backdrop as wide as a room is left out."""
     recording.log(ROOT, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
     for shape in shapes:
+        if extent_m(shape) > _BACKDROP_M:
+            continue
         path = f"{body_path(shape.body)}/{entity_name(shape.name)}"
         recording.log(path, _drawable(shape), static=True, strict=True)
 
