@@ -1,0 +1,101 @@
+"""The bench folder: one protocol each, one process at a time, nothing overwritten, nothing silently missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_runner import do, same_but_for_time, small
+
+from imagine_bench import run_folder
+from imagine_bench.errors import ArtefactError, BusyError
+from imagine_bench.results import OpenLoop
+from imagine_bench.store import BenchStore, load_bench, newest_bench, newest_recording
+
+_ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
+
+
+def opened(root: Path, **changes: object) -> BenchStore:
+    store = BenchStore(root, small(**changes))
+    store.open()
+    return store
+
+
+def test_a_finished_bench_is_read_back(tmp_path: Path) -> None:
+    store = opened(tmp_path, seeds=(0, 2))
+    assert store.begin_sitting(_ENVIRONMENT) == []
+    assert store.missing() == [("table", 0), ("table", 2)]
+    runs = [do(store.run_folder("table", seed), seed=seed, seeds=(0, 2)) for seed in (0, 2)]
+    assert store.missing() == []
+    result = load_bench(store.folder)
+    assert result.protocol == store.protocol
+    assert all(same_but_for_time(a, b) for a, b in zip(runs, result.runs, strict=True))
+    assert result.environment["commit"] == "abc"
+    assert newest_bench(tmp_path) == store.folder == tmp_path / "arrow_puzzle" / f"smoke-{store.protocol.hash}"
+
+
+def test_a_missing_run_is_an_error_that_says_how_to_go_on(tmp_path: Path) -> None:
+    store = opened(tmp_path, seeds=(0, 2))
+    store.begin_sitting(_ENVIRONMENT)
+    do(store.run_folder("table", 0), seeds=(0, 2))
+    with pytest.raises(ArtefactError, match=r"missing: \[\('table', 2\)\]\. Run the same bench command again"):
+        load_bench(store.folder)
+
+
+def test_other_settings_live_elsewhere(tmp_path: Path) -> None:
+    assert opened(tmp_path).folder != opened(tmp_path, budgets=(4, 10)).folder
+    assert opened(tmp_path).folder != opened(tmp_path, encoder="other@0123456789ab").folder
+
+
+def test_two_benches_in_one_folder_are_refused(tmp_path: Path) -> None:
+    store = opened(tmp_path)
+    with store.lock(), pytest.raises(BusyError, match=r"The bench folder .* is in use by process \d+"):
+        with opened(tmp_path).lock():
+            pass
+    with store.lock():
+        pass  # and afterwards it is free
+
+
+def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
+    store = opened(tmp_path)
+    path = store.folder / "protocol.json"
+    other = small(budgets=(1, 2)).as_dict()
+    path.write_text(json.dumps(other))
+    with pytest.raises(ArtefactError, match=r"protocol\.json is of another protocol .* left untouched"):
+        store.open()
+    path.write_text('{"task": "arrow_puzzle", "colour": "red"}')
+    with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol: .*colour"):
+        load_bench(store.folder)
+    assert "colour" in path.read_text()
+
+
+def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
+    opened(tmp_path).begin_sitting(_ENVIRONMENT)
+    changed = opened(tmp_path).begin_sitting({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
+    assert changed == ["versions"]
+    sittings = json.loads((opened(tmp_path).folder / "sittings.json").read_text())
+    assert [sitting["changed"] for sitting in sittings] == [{}, {"versions": {"torch": "2"}}]
+
+
+def test_no_bench_and_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="There is no bench below"):
+        newest_bench(tmp_path)
+    with pytest.raises(ArtefactError, match="There is no recording below"):
+        newest_recording(tmp_path)
+
+
+def test_imagined_rollouts_and_open_loop_come_back(tmp_path: Path) -> None:
+    result = do(tmp_path / "run", "imaginer", agents=("imaginer",), open_loop_starts=6)
+    assert len(result.imagined) == 5
+    assert result.imagined[0].rollout.frames.dtype == np.float32
+    assert result.imagined[0].real_frames.shape == (10, 64, 64, 3)
+    for row in result.checkpoints:
+        assert isinstance(row.open_loop, OpenLoop)
+        assert row.open_loop.count.tolist() == [6] * 10
+        assert row.open_loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
+        again = run_folder.checkpoint_from_json(json.loads(json.dumps(run_folder.checkpoint_to_json(row))))
+        assert again.open_loop is not None
+        np.testing.assert_array_equal(again.open_loop.correct_accepted, row.open_loop.correct_accepted)
+        assert np.isnan(row.open_loop.correct_accepted[3:]).all()
