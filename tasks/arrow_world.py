@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .macro_env import Reading
+from .motion.executor import REST_OPENING_M, MacroResult
 from .scenes import constants as c
 from .scenes.appearance import Appearance, Looks
 from .scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from .scenes.arrow_scene import compile_arrow_scene
 
 if TYPE_CHECKING:
-    from .motion.executor import MacroResult
     from .motion.turn import TurnExecutor
 
 _N_CUBES = len(c.SLOTS_XY_M)
@@ -59,7 +59,7 @@ class ArrowWorld:
         """Positions and controls of the whole scene with the arm at its observation pose."""
         qpos, ctrl = self.model.qpos0.copy(), np.zeros(self.model.nu)
         targets = [*zip(ARM_JOINTS, c.OBSERVATION_QPOS_RAD, strict=True)]
-        targets += [(name, c.FINGER_REST_M) for name in FINGER_JOINTS]
+        targets += [(name, REST_OPENING_M) for name in FINGER_JOINTS]
         for name, value in targets:
             qpos[self.model.joint(name).qposadr[0]] = value
             ctrl[self.model.actuator(name.replace("_slide", "") + "_servo").id] = value

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrow_rules import ArrowPuzzleRules
+from imagine_bench.tasks.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
-from imagine_bench.tasks.arrow_rules import ArrowPuzzleRules
-from imagine_bench.tasks.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
 EASY, HARD = ArrowPuzzleRules(), ArrowPuzzleRules(hard=True)
 BOTH = pytest.mark.parametrize("rules", [EASY, HARD], ids=["easy", "hard"])

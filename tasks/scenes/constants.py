@@ -29,9 +29,6 @@ OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
-FINGER_REST_M = CUBE_EDGE_M / 2 + 0.012
-"""Each finger's distance from the grip's middle between macro-actions: 12 mm of air beside a cube."""
-
 SCENE_GROUP, ARM_GROUP, SETTING_GROUP = 0, 2, 3
 """Geom groups: table top, cubes and hand; the arm; what only the human's view shows (floor, legs, person)."""
 
