@@ -147,7 +147,7 @@ def test_fingers_open_along_the_tools_y(model):
     mujoco.mj_kinematics(model, data)
     frame = data.site("tcp").xmat.reshape(3, 3)
     for finger, side in (("left", 1), ("right", -1)):
-        for end, along_m in (("front", 0.007), ("back", -0.007)):
+        for end, along_m in (("front", 0.01), ("back", -0.01)):
             tip = f"finger_{finger}_tip_{end}"
             in_tool = frame.T @ (data.geom(tip).xpos - data.site("tcp").xpos)
             np.testing.assert_allclose(in_tool, (along_m, side * (0.03 + model.geom(tip).size[0]), 0), atol=1e-12)

@@ -81,9 +81,9 @@ def shortest_duration_s(arm: ArmModel, delta_rad: Floats, inertia: Floats) -> fl
         delta_rad: Joint differences. Shape (7,).
         inertia: Joint-space inertia along the way, kg·m². Shape (7, 7).
     """
-    by_speed = PEAK_SPEED * np.max(np.abs(delta_rad) / (SPEED_SHARE * arm.speed_limit_rad_s))
-    by_effort = PEAK_ACCELERATION * np.max(np.abs(inertia @ delta_rad) / (EFFORT_SHARE * arm.effort_limit_nm))
-    return float(max(by_speed, math.sqrt(by_effort)))
+    by_speed = np.abs(delta_rad / arm.speed_limit_rad_s).max() * PEAK_SPEED / SPEED_SHARE
+    by_effort = np.abs(inertia @ delta_rad / arm.effort_limit_nm).max() * PEAK_ACCELERATION / EFFORT_SHARE
+    return max(float(by_speed), math.sqrt(by_effort))
 
 
 def plan(
@@ -107,8 +107,11 @@ def plan(
     first = 0
     for waypoint in waypoints:
         delta_rad = waypoint.qpos_rad - at_qpos_rad
-        inertia = arm.inertia(at_qpos_rad + delta_rad / 2) if delta_rad.any() else np.zeros((7, 7))
-        duration_s = max(shortest_duration_s(arm, delta_rad, inertia), waypoint.min_duration_s, timestep_s)
+        duration_s, inertial_nms2 = max(waypoint.min_duration_s, timestep_s), np.zeros(7)
+        if delta_rad.any():
+            inertia = arm.inertia(at_qpos_rad + delta_rad / 2)
+            inertial_nms2 = inertia @ delta_rad
+            duration_s = max(shortest_duration_s(arm, delta_rad, inertia), duration_s)
         steps = math.ceil(duration_s / timestep_s - 1e-9)
         duration_s = steps * timestep_s
         # Rows weigh s, s' and s''; columns are the planned joints, the commands and the opening.
@@ -116,7 +119,7 @@ def plan(
         weights[0, :7] = weights[0, 7:14] = delta_rad
         weights[0, 14] = waypoint.opening_m - at_opening_m
         weights[1, 7:14] = arm.damping_nms_rad * delta_rad / (duration_s * arm.stiffness_nm_rad)
-        weights[2, 7:14] = inertia @ delta_rad / (duration_s**2 * arm.stiffness_nm_rad)
+        weights[2, 7:14] = inertial_nms2 / (duration_s**2 * arm.stiffness_nm_rad)
         motions.append((first, minimum_jerk(steps) @ weights))
         last_step[waypoint.name] = first + steps - 1
         first += max(0, steps - math.floor(waypoint.blend_s / timestep_s + 1e-9))
