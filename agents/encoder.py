@@ -24,8 +24,8 @@ from .probe import Probe
 from .vae import Vae, build_vae
 
 FORMAT = "imagine_bench.encoder/1"
-PROBE_HIDDEN = 128
-"""Hidden units of the stored probe."""
+PROBE_HIDDEN = 256
+"""Units of each hidden layer of the stored probe."""
 _CHUNK = 512  # frames encoded at once, to bound memory
 _FRAME_SHAPE = (64, 64, 3)
 

@@ -36,7 +36,7 @@ class Probe(nn.Module):
     Args:
         latent_size: Latents Z.
         cardinalities: Values of each of the M coordinates.
-        hidden: Units of the hidden layer; 0 makes it linear.
+        hidden: Units of each of two hidden layers; 0 makes it linear.
     """
 
     def __init__(self, latent_size: int, cardinalities: Sequence[int], hidden: int) -> None:
@@ -46,9 +46,8 @@ class Probe(nn.Module):
         self.register_buffer("scale", torch.ones(latent_size))
         outputs = sum(cardinalities)
         if hidden:
-            self.layers: nn.Module = nn.Sequential(
-                nn.Linear(latent_size, hidden), nn.ReLU(), nn.Linear(hidden, outputs)
-            )
+            layers = [nn.Linear(latent_size, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()]
+            self.layers: nn.Module = nn.Sequential(*layers, nn.Linear(hidden, outputs))
         else:
             self.layers = nn.Linear(latent_size, outputs)
 
