@@ -18,7 +18,7 @@ from .probe import Latents
 COLUMNS = 8
 _ZOOM = 3
 _GAP = 8  # pixels
-_HEADING = 62  # pixels
+_HEADING = 80  # pixels
 _LABEL = 150  # pixels, left of the rows
 _CAPTION = 40  # pixels, below the rows
 _INK, _MUTED, _WRONG, _PAPER = (20, 20, 20), (110, 110, 110), (190, 20, 20), (255, 255, 255)
@@ -56,7 +56,7 @@ def sample_sheet(
         for column, picture in enumerate(pictures):
             sheet.paste(_enlarged(picture), (_LABEL + column * cell, top))
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
-        names = " ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
+        names = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
         colour = _INK if (right == found).all() else _WRONG
         draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=colour, font=_font(14))
     return sheet
@@ -68,10 +68,12 @@ def _write_heading(draw: ImageDraw.ImageDraw, encoder: Encoder) -> None:
     numbers = (
         f"whole macrostate read right on {card.recipe.held_out_frames} fresh frames: {card.probe['mlp']:.2%} "
         f"(sampled latents {card.probe['mlp_sampled']:.2%}, linear reader {card.probe['linear']:.2%}) · "
-        f"KL {card.kl_nats:.1f} nats · {card.cpu_s['total']:.0f} CPU s. Below: what the probe reads, red where wrong."
+        f"KL {card.kl_nats:.1f} nats · {card.cpu_s['total']:.0f} CPU s."
     )
+    reading = f"Below each column what the probe reads ({' · '.join(card.macrostate_names)}), red where it is wrong."
     draw.text((_GAP, _GAP), title, fill=_INK, font=_font(20))
     draw.text((_GAP, _GAP + 27), numbers, fill=_MUTED, font=_font(14))
+    draw.text((_GAP, _GAP + 46), reading, fill=_MUTED, font=_font(14))
 
 
 def _short(name: str) -> str:
