@@ -66,7 +66,8 @@ class MacroExecutor:
         self._finger_ctrl = np.array([model.actuator(name).id for name in fingers])
         self._state = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         self._qpos_column = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME.value)
-        self._state_size = mujoco.mj_stateSize(model, self._state)
+        self._states = np.empty((0, mujoco.mj_stateSize(model, self._state)))
+        self._control = np.empty((0, mujoco.mj_stateSize(model, _INPUTS)))
 
     def rest(self, data: mujoco.MjData) -> None:
         """Bring ``data`` to the canonical start: the arm at its observation pose, everything still.
@@ -86,27 +87,25 @@ class MacroExecutor:
         """Execute ``trajectory`` from the canonical start.
 
         Args:
-            data: Changed in place; its derived quantities (such as ``xpos``) fit the final positions.
+            data: Changed in place; its derived quantities (such as ``xpos``) are those of the last step.
             trajectory: Planned at the model's timestep.
 
         Returns:
-            Positions of the whole scene, row 0 at the start, row k after step k. Shape (N + 1, nq).
+            Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
+            Shape (N + 1, nq).
 
         Raises:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data)
-        steps = len(trajectory.opening_m)
-        states = np.empty((steps + 1, self._state_size))
+        states, control = self._buffers(len(trajectory.opening_m))
         mujoco.mj_getState(self.model, data, states[0], self._state)
-        control = np.empty((steps, mujoco.mj_stateSize(self.model, _INPUTS)))
         mujoco.mj_getState(self.model, data, control[0], _INPUTS)
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
         mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
         self._check(data, states, control)
-        mujoco.mj_forward(self.model, data)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
 
     def arm_qpos_rad(self, qpos: Floats) -> Floats:
@@ -134,6 +133,13 @@ class MacroExecutor:
         stride = max(1.0, 1.0 / (motion_hz * timestep_s))
         rows = np.unique(np.append(np.round(np.arange(0, last, stride)).astype(np.int64), last))
         return rows * timestep_s, qpos[rows].copy()
+
+    def _buffers(self, steps: int) -> tuple[Floats, Floats]:
+        """Rows for states (steps + 1, nstate) and inputs (steps, ninput), kept between runs: fresh pages cost time."""
+        if len(self._control) < steps:
+            self._states = np.empty((steps + 1, self._states.shape[1]))
+            self._control = np.empty((steps, self._control.shape[1]))
+        return self._states[: steps + 1], self._control[:steps]
 
     def _check(self, data: mujoco.MjData, states: Floats, control: Floats) -> None:
         """Raise if the simulation blew up."""

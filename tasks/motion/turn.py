@@ -158,7 +158,6 @@ class TurnExecutor:
     def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
         """The arm stays where it is."""
         self.executor.rest(data)
-        mujoco.mj_forward(self.executor.model, data)
         return MacroResult(
             sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.executor.model.nq))
         )
