@@ -84,7 +84,7 @@ def unmet_requirements(found: dict[str, str]) -> list[str]:
         if version is None or (wanted.marker is not None and not wanted.marker.evaluate({"extra": ""})):
             continue
         if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
-            state = "is missing" if version == "missing" else f"is {version}"
+            state = "is missing" if version == "missing" else f"{version} is installed"
             complaints.append(
                 f"{wanted.name} {state}, but {wanted.specifier} is needed.{_REASONS.get(wanted.name, '')} "
                 "Run 'make setup' in a fresh .venv."

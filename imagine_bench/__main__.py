@@ -1,0 +1,10 @@
+"""``python -m imagine_bench`` is the command ``imagine-bench``."""
+
+from __future__ import annotations
+
+import sys
+
+from imagine_bench.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,152 @@
+"""The command line: what it says to wrong words, and that a bench ends in a table, a report and an honest exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bench_fakes  # noqa: F401 - registers the fakes
+import pytest
+
+from imagine_bench.cli import main, parse_settings
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.launchers import LocalPool
+from imagine_bench.store import newest_bench
+
+_HERE = Path(__file__).parent
+
+
+def bench_words(out: Path, *more: str) -> list[str]:
+    return [
+        "bench",
+        "--task",
+        "arrow_puzzle",
+        "--preset",
+        "smoke",
+        "--execution",
+        "kinematic",
+        "--out",
+        str(out),
+        *more,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--task", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'? Known: arrow_puzzle, arrow_"),
+        (["--preset", "quik"], "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full."),
+        (["--agents", "dnq"], "No agent 'dnq'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
+        (["--appearance", "strng"], "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong."),
+        (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
+        (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
+        (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
+        (["--encoder", "./none.safetensors"], "No encoder './none.safetensors'."),
+        (["--budgets", "10", "5"], "budgets (10, 5) must be one or more different integers of at least 1, ascending."),
+        (["--seeds", "-1"], "seeds (-1,) must be one or more different integers of at least 0"),
+        (["--evaluation-episodes", "0"], "evaluation_episodes is 0; give at least 1."),
+        (
+            ["--set", "controller.discnt=0.9"],
+            "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: ",
+        ),
+        (["--set", "controller.discount"], "--set 'controller.discount' is not of the form name=value"),
+        (["--workers", "0"], "0 workers cannot run anything; give at least 1."),
+    ],
+)
+def test_wrong_words_get_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    given = bench_words(tmp_path / "runs", *words)
+    assert main(given) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert line.startswith(f"imagine-bench: {sentence}")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, sentence in (
+        (["report", "--out", str(tmp_path)], "There is no bench below"),
+        (["report", str(tmp_path)], "protocol.json is not a bench's protocol"),
+        (["view", "--out", str(tmp_path)], "There is no recording below"),
+        (["view", str(tmp_path / "x.rrd")], "There is no recording"),
+        (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
+    ):
+        assert main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("imagine-bench: ") and sentence in line
+
+
+def test_the_program_itself_exits_without_a_traceback() -> None:
+    command = [sys.executable, "-m", "imagine_bench", "bench", "--task", "pick"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("imagine-bench: No task 'pick'.") and len(done.stderr.splitlines()) == 1
+
+
+def test_help_is_quick_and_loads_nothing_heavy() -> None:
+    probe = (
+        "import sys, runpy; sys.argv = ['imagine-bench', '--help']\n"
+        "try: runpy.run_module('imagine_bench', run_name='__main__')\n"
+        "except SystemExit: pass\n"
+        "print([name for name in ('torch', 'mujoco', 'rerun', 'matplotlib', 'dm_control') if name in sys.modules])"
+    )
+    before = os.times()
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert "bench" in done.stdout and "doctor" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+    after = os.times()
+    assert after.children_user + after.children_system - before.children_user - before.children_system < 1.5
+
+
+def test_settings_are_json_where_they_can_be() -> None:
+    assert parse_settings(["b.x=1e-3", "a.y=mean", "c=[1, 2]"]) == (("a.y", "mean"), ("b.x", 0.001), ("c", [1, 2]))
+    with pytest.raises(InvalidValueError, match="names 'a' twice"):
+        parse_settings(["a=1", "a=2"])
+
+
+def test_a_failing_seed_fails_the_command_and_names_its_log(tmp_path: Path) -> None:
+    words = bench_words(tmp_path, "--agents", "failing", "--seeds", "0", "1", "--budgets", "5", "--workers", "1")
+    command = [sys.executable, str(_HERE / "bench_fakes.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    folder = newest_bench(tmp_path)
+    assert done.stderr.splitlines()[-2:] == [
+        "imagine-bench: 1 of 2 runs failed; the same command tries them again and keeps the others.",
+        f"  failing seed 1: RuntimeError: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
+    ]
+    assert "Traceback" not in done.stderr
+    assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()
+    assert main(["report", str(folder)]) == 2  # what is missing is never left out
+
+
+def test_a_bench_ends_with_a_table_a_report_and_recordings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = bench_words(tmp_path, "--agents", "random", "oracle", "--evaluation-episodes", "10", "--workers", "1")
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert "oracle" in said.out and "100.0" in said.out
+    folder = newest_bench(tmp_path)
+    assert f"Report:     {folder}/report/index.html" in said.out
+    assert (folder / "report" / "index.html").stat().st_size > 10_000
+    assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
+    assert json.loads((folder / "environment.json").read_text())["versions"]["mujoco"].startswith("3.17")
+
+    def launch(*_: object) -> None:
+        raise AssertionError("a finished bench was run again")
+
+    monkeypatch.setattr(LocalPool, "launch", launch)
+    assert main(words) == 0
+    assert capsys.readouterr().out.splitlines()[-4:] == said.out.splitlines()[-4:]
+
+
+def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    out = capsys.readouterr().out
+    for name in ("arrow_puzzle_hard", "imagination_uncertainty", "thesis", "kinematic", "strong", "arrow_puzzle-mild"):
+        assert name in out

@@ -1,0 +1,53 @@
+"""The doctor and the facts it reads: what is wrong is said in words, what is right is left alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from imagine_bench import doctor, environment
+from imagine_bench.cli import main
+from imagine_bench.errors import SetupError
+
+
+def test_this_installation_works(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    for word in ("mujoco", "dm-control", "torch", "GL renderer", "64x64 frame", "processor", "Everything works."):
+        assert word in out
+
+
+def test_the_broken_pair_is_named() -> None:
+    found = {**environment.versions(), "mujoco": "4.0.0"}
+    (complaint,) = doctor.unmet_requirements(found)
+    assert complaint.startswith("mujoco 4.0.0 is installed, but")
+    assert "MuJoCo 4.0 breaks dm-control 1.0.50" in complaint and "make setup" in complaint
+
+
+def test_a_missing_package_is_named() -> None:
+    (complaint,) = doctor.unmet_requirements({**environment.versions(), "mink": "missing"})
+    assert complaint.startswith("mink is missing, but")
+
+
+def test_versions_of_this_machine_satisfy_every_requirement() -> None:
+    assert doctor.unmet_requirements(environment.versions()) == []
+
+
+def test_missing_gl_is_a_complaint_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def none() -> str:
+        raise SetupError("No OpenGL for headless rendering: install libegl1.")
+
+    monkeypatch.setattr(doctor, "gl_renderer", none)
+    with pytest.raises(SystemExit) as caught:
+        main(["doctor"])
+    assert caught.value.code == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "Wrong: No OpenGL for headless rendering: install libegl1."
+
+
+def test_the_environment_is_json_and_complete() -> None:
+    facts = environment.describe_environment()
+    assert set(facts) == {"command", "commit", "versions", "machine", "gl_renderer", "threads_a_run"}
+    assert "missing" not in facts["versions"].values()
+    assert facts["machine"]["cores"] >= 1 and facts["machine"]["cpu"]
+    assert facts["gl_renderer"] and not facts["gl_renderer"].startswith("none")
