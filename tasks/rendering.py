@@ -100,15 +100,22 @@ class _Canvas:
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self.pid = os.getpid()
-        self.gl = _new_gl_context(view.width, view.height)
+        self.gl: Any = _new_gl_context(view.width, view.height)
         with _quality(model, view):
-            self.mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            self.mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
 
     def close(self) -> None:
-        self.gl.make_current()
-        self.mjr.free()
-        self.gl.free()
+        """Free everything; nothing if that was done before or belongs to a parent process."""
+        gl, mjr, self.gl, self.mjr = self.gl, self.mjr, None, None
+        if gl is None:
+            return
+        if self.pid != os.getpid():
+            _inherited.append((gl, mjr))
+            return
+        gl.make_current()
+        mjr.free()
+        gl.free()
 
 
 @contextlib.contextmanager
@@ -128,8 +135,8 @@ def _quality(model: mujoco.MjModel, view: View) -> Any:
 
 
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
-_inherited: list[_Canvas] = []
-"""Canvases of a parent process: never used and never freed, since their context belongs to the parent."""
+_inherited: list[Any] = []
+"""Contexts of a parent process: never used and never freed, since their context belongs to the parent."""
 _exit_hook_pid: int | None = None
 
 
@@ -206,9 +213,11 @@ class Renderer:
         canvas = self._canvas
         if canvas is not None and canvas.pid == os.getpid():
             return canvas
-        if canvas is not None:
-            _inherited.append(canvas)
+        self.close()
         self._canvas = canvas = _Canvas(self._model, self.view)
+        # A renderer that is merely forgotten must free its context with it current, too.
+        self._finalizer = weakref.finalize(self, canvas.close)
+        self._finalizer.atexit = False
         _open.add(self)
         _close_all_at_exit()
         return canvas
@@ -217,16 +226,9 @@ class Renderer:
         """Free the OpenGL context, if this process has one. Safe to call again; a later frame makes a new one."""
         canvas, self._canvas = self._canvas, None
         _open.discard(self)
-        if canvas is None:
-            return
-        if canvas.pid == os.getpid():
+        if canvas is not None:
+            self._finalizer.detach()
             canvas.close()
-        else:
-            _inherited.append(canvas)
-
-    def __del__(self) -> None:
-        if not sys.is_finalizing():
-            self.close()
 
     def __getstate__(self) -> dict[str, Any]:
         return {"view": self.view, "_model": self._model}

@@ -229,7 +229,7 @@ def _pointing(dark):
     down = int(dark[:2].sum()) - int(dark[-2:].sum())
     right = int(dark[:, :2].sum()) - int(dark[:, -2:].sum())
     assert min(abs(down), abs(right)) <= 1
-    assert max(abs(down), abs(right)) >= 3
+    assert max(abs(down), abs(right)) >= 2
     return ("down" if down > 0 else "up") if abs(down) > abs(right) else ("right" if right > 0 else "left")
 
 
