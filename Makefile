@@ -1,0 +1,53 @@
+# The two commands of a newcomer: make bench TASK=arrow_puzzle, make test. Each sets everything up first.
+
+TASK ?= arrow_puzzle
+PRESET ?= quick
+ARGS ?=
+PYTEST ?= -n auto --dist loadfile
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup bench view report encoder doctor test test-slow lint speed clean
+
+help:  ## Show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "  Options: TASK=$(TASK) PRESET=smoke|quick|thesis|full ARGS='--seeds 0 1 2 ...' (imagine-bench --help)"
+
+$(READY): pyproject.toml setup.sh
+	@./setup.sh $(VENV) $(READY)
+
+setup: $(READY)  ## Install everything into .venv and stop
+
+bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
+	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) $(ARGS)
+
+view: $(READY)  ## Open the newest recording in the Rerun viewer
+	@$(BIN)/imagine-bench view $(ARGS)
+
+report: $(READY)  ## Write the newest bench's report again and show its table
+	@$(BIN)/imagine-bench report $(ARGS)
+
+encoder: $(READY)  ## Train an encoder for TASK anew and say how it compares to the bundled one
+	@$(BIN)/imagine-bench encoder --task $(TASK) $(ARGS)
+
+doctor: $(READY)  ## Say what this machine has, and in words what is wrong with it
+	@$(BIN)/imagine-bench doctor
+
+test: $(READY)  ## Run the tests, but for those that take minutes each
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST) $(ARGS)
+
+test-slow: $(READY)  ## Run the tests that take minutes each
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST) $(ARGS)
+
+lint: $(READY)  ## Check style and format
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+speed: $(READY)  ## Measure every speed and fidelity figure that is promised
+	@OMP_NUM_THREADS=1 $(BIN)/python -m imagine_bench.speed $(ARGS)
+
+clean:  ## Remove caches and build leftovers; results and .venv stay
+	@rm -rf build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
