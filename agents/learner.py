@@ -20,8 +20,6 @@ from .perception import Perception
 from .presets import flatten
 from .settings import Settings
 
-_LOSSES = {"dynamics": "loss/dynamics", "reward": "loss/reward", "termination": "loss/termination"}
-
 
 class Learner:
     """A DQN on latents and, where it has one, an imagination that feeds it.
@@ -95,7 +93,7 @@ class Learner:
         with self.meters.cpu_time("time/model_s"):
             for losses in imagination.learn(self.real):
                 for name, value in asdict(losses).items():
-                    self.meters.add(_LOSSES[name], value)
+                    self.meters.add(f"loss/{name}", value)
 
     def _learn_values(self, memory: RealMemory | ImaginedMemory, updates: int) -> None:
         if len(memory) == 0:

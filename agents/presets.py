@@ -25,24 +25,37 @@ class Deviation:
 
 
 _QUICK: dict[str, Deviation] = {
-    "model.dynamics_hidden": Deviation((256, 256), ""),
-    "model.reward_hidden": Deviation((128, 128), ""),
-    "model.termination_hidden": Deviation((128, 128), ""),
-    "model.dropout": Deviation(0.25, ""),
-    "model.updates_per_step": Deviation(4, ""),
-    "model.batch_size": Deviation(128, ""),
-    "model.predict_change": Deviation(True, ""),
-    "model.reward_unit": Deviation(10.0, ""),
-    "model.gradient_clip": Deviation(10.0, ""),
-    "model.sigma_floor": Deviation(0.1, ""),
-    "imagination.start_episode": Deviation(200, ""),
-    "imagination.temperature": Deviation(0.0, ""),
-    "imagination.exploration": Deviation(0.2, ""),
-    "imagination.weight_samples": Deviation(10, ""),
+    "model.dynamics_hidden": Deviation(
+        (512,), "shallow and wide generalises: right on 80 % of unseen transitions after 500 episodes, 3 x 256 on 40 %"
+    ),
+    "model.components": Deviation(2, "the rules are deterministic; two components cost less than five"),
+    "model.reward_hidden": Deviation((256, 256), "an eighth of the arithmetic of 3 x 512, with as small an error"),
+    "model.termination_hidden": Deviation((128, 128), "a third of the arithmetic, with as few errors"),
+    "model.dropout": Deviation(0.25, "at 50 % the dynamics are right on 42 % of transitions, at 25 % on 64 %"),
+    "model.learning_rate": Deviation(2e-3, "fewer updates a step; more right after as many than with 1e-3"),
+    "model.updates_per_step": Deviation(3, "CPU time: with the batch, 21 times fewer rows a real step"),
+    "model.batch_size": Deviation(128, "CPU time; see updates_per_step"),
+    "model.predict_change": Deviation(True, "a macro-action moves one cube: 64 % of transitions right, 43 % without"),
+    "model.sigma_floor": Deviation(0.2, "narrower components stop learning of the transitions they miss"),
+    "model.gradient_clip": Deviation(10.0, "the likelihood of narrow components has steep walls"),
+    "controller.epsilon_decay": Deviation(
+        0.003, "0.03 ends exploration after 100 episodes, before most goals are seen"
+    ),
+    "imagination.start_episode": Deviation(300, "the quick model is right early; 1000 would leave nothing to compare"),
+    "imagination.temperature": Deviation(0.0, "sampled latents leave the manifold that the networks know"),
+    "imagination.exploration": Deviation(0.2, "a greedy rollout repeats the real actions"),
+    "imagination.weight_samples": Deviation(10, "CPU time; the filter needs a rank, not a precise variance"),
+    "imagination.reduction": Deviation("max", "0.3 on the sum of 24 latents keeps nothing, on their mean everything"),
+}
+
+_SMOKE: dict[str, Deviation] = {
+    **_QUICK,
+    "model.updates_per_step": Deviation(1, "shows that every part works, within a minute"),
+    "imagination.start_episode": Deviation(10, "imagination must happen within a few dozen episodes"),
 }
 
 PRESETS: dict[str, dict[str, Deviation]] = {
-    "smoke": {},
+    "smoke": _SMOKE,
     "quick": _QUICK,
     "thesis": {},
     "full": {},
@@ -67,7 +80,6 @@ _RANGES = {
     "model.learning_rate": _POSITIVE,
     "model.max_norm": _POSITIVE,
     "model.updates_per_step": _COUNT,
-    "model.reward_unit": _POSITIVE,
     "model.sigma_floor": _POSITIVE,
     "model.gradient_clip": _POSITIVE,
     "controller.learning_rate": _POSITIVE,

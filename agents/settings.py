@@ -23,7 +23,6 @@ class WorldModelSettings:
         updates_per_step: Model updates a real step, N_E.
         batch_size: Transitions an update.
         predict_change: Whether the mixture describes z' - z instead of z'.
-        reward_unit: Reward that the reward network outputs as 1.
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each of the three networks; None clips nothing.
     """
@@ -38,7 +37,6 @@ class WorldModelSettings:
     updates_per_step: int = 16
     batch_size: int = 512
     predict_change: bool = False
-    reward_unit: float = 1.0
     sigma_floor: float = 0.01
     gradient_clip: float | None = None
 

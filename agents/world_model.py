@@ -86,7 +86,7 @@ class WorldModel(nn.Module):
         logit = self.termination(next_z, self.termination.draw_masks(rows, dropout)).view(-1)
         return (
             -mdn.log_likelihood(mixture, batch.next_z).mean(),
-            log_cosh(reward - batch.reward / self.settings.reward_unit).mean(),
+            log_cosh(reward - batch.reward).mean(),
             functional.binary_cross_entropy_with_logits(logit, batch.terminated),
         )
 
@@ -136,5 +136,4 @@ class WorldModel(nn.Module):
     def assess(self, next_z: Tensor) -> tuple[Tensor, Tensor]:
         """Predicted rewards and termination probabilities of next states (N, Z), without dropout: two of shape (N,)."""
         states = next_z.unsqueeze(0)
-        reward = self.reward(states).view(-1) * self.settings.reward_unit
-        return reward, self.termination(states).view(-1).sigmoid()
+        return self.reward(states).view(-1), self.termination(states).view(-1).sigmoid()

@@ -92,11 +92,6 @@ def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
     assert all(not torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_reward_unit_changes_the_scale_of_learning_and_not_of_prediction() -> None:
-    plain, scaled = make(), make(reward_unit=10.0)
-    torch.testing.assert_close(scaled.assess(CODES)[0], 10.0 * plain.assess(CODES)[0])
-
-
 def test_max_norm_holds_after_an_update() -> None:
     model = make(max_norm=0.5)
     model.update(chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
