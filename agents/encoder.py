@@ -86,7 +86,7 @@ class EncoderCard:
                 raise InvalidValueError("its format is another one")
             recipe = values.pop("recipe")
             recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
-            tuples = {key: tuple(values.pop(key)) for key in ("macrostate_names", "cardinalities")}
+            tuples: dict[str, Any] = {key: tuple(values.pop(key)) for key in ("macrostate_names", "cardinalities")}
             card = cls(recipe=recipe, **tuples, **values)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise InvalidValueError(f"Not an {FORMAT} card: {error}.") from error
@@ -221,7 +221,7 @@ def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float3
     """One grey image of the whole view from preprocessed pictures: (N, C, H, W) to (N, H', W')."""
     if preprocessing == "gray_strips":
         return join_strips(pictures)
-    return pictures.mean(axis=1, dtype=np.float32)
+    return np.asarray(pictures.mean(axis=1), dtype=np.float32)
 
 
 def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:

@@ -39,7 +39,7 @@ def sample_sheet(
     frames, macrostates = frames[:COLUMNS], macrostates[:COLUMNS]
     mu, sigma = encoder.encode(frames)
     latents = Latents(mu=mu, sigma=sigma)
-    rows = {
+    rows: dict[str, NDArray[Any]] = {
         "camera": frames,
         "encoder's view": view(preprocess(encoder.card.preprocessing)(frames), encoder.card.preprocessing),
         "decoded mean": encoder.decode(latents.mu),

@@ -220,7 +220,7 @@ def _rounded_to_half(network: _Network) -> _Network:
 @torch.no_grad()
 def latents_of(vae: Vae, data: FrameSet) -> Latents:
     """The latents of every frame."""
-    parts = [vae.posterior(data.batch(rows)) for rows in torch.arange(len(data.pictures)).split(_CHUNK)]
+    parts = [vae.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK)]
     mu, log_variance = (torch.cat(column) for column in zip(*parts, strict=True))
     return Latents(mu=mu, sigma=(0.5 * log_variance).exp())
 
@@ -244,7 +244,7 @@ def _measure(vae: Vae, probe: Probe, linear: Probe, held_out: FrameSet, generato
 def _squared_error(vae: Vae, data: FrameSet, latents: Latents) -> float:
     """Squared error of the mean latents' pictures, mean a pixel."""
     total = 0.0
-    for rows in torch.arange(len(data.pictures)).split(_CHUNK):
+    for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK):
         pictures = data.batch(rows)
         total += (vae.mean(latents.mu[rows]) - vae.target(pictures)).square().sum().item()
     return total / vae.target(data.batch(torch.arange(1))).numel() / len(data.pictures)

@@ -39,6 +39,9 @@ class Probe(nn.Module):
         hidden: Units of each of two hidden layers; 0 makes it linear.
     """
 
+    centre: Tensor
+    scale: Tensor
+
     def __init__(self, latent_size: int, cardinalities: Sequence[int], hidden: int) -> None:
         super().__init__()
         self.cardinalities = tuple(cardinalities)
@@ -53,7 +56,8 @@ class Probe(nn.Module):
 
     def logits(self, latents: Tensor) -> tuple[Tensor, ...]:
         """Unnormalised log probabilities of each coordinate's values. M tensors of shape (N, cardinality)."""
-        return self.layers((latents - self.centre) / self.scale).split(self.cardinalities, dim=1)  # type: ignore[no-any-return]
+        joined: Tensor = self.layers((latents - self.centre) / self.scale)  # [N, sum of cardinalities]
+        return torch.split(joined, list(self.cardinalities), dim=1)
 
     @torch.no_grad()
     def read(self, latents: Tensor) -> NDArray[np.int64]:
