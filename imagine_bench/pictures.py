@@ -58,7 +58,7 @@ def rollout_strip(
 def png(picture: NDArray[np.uint8]) -> bytes:
     """Encode a picture (height, width, 3), uint8, as PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
+    Image.fromarray(picture).save(buffer, format="PNG")
     return buffer.getvalue()
 
 

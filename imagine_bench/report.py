@@ -193,7 +193,7 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
     alive = np.concatenate([[True], ~compared.real_terminated[:-1]])  # imagined after the real end: nothing to match
     matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1) & alive
     depth, cut = int(alive.sum()), first_cut(compared)
-    kept = "the filter would keep it all" if cut is None else f"the filter cuts before macro-action {cut + 1}"
+    kept = "nothing is cut" if cut is None else f"the filter cuts before macro-action {cut + 1}"
     caption = (
         f"{title[:1].upper()}{title[1:]}, seed {seed}, start {index + 1}: {int(matches.sum())} of {depth} imagined "
         f"macrostates are what the rules say; {kept}."

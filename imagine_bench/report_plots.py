@@ -105,7 +105,8 @@ def success_figure(data: ReportData) -> Figure:
         axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
     _thesis_points(axes, data)
     _success_legend(axes, data)
-    ticks = sorted({*data.budgets, *(b for rows in data.thesis.values() for b in rows)})
+    printed = sorted({budget for rows in data.thesis.values() for budget in rows})
+    ticks = sorted({*data.budgets, *printed[:1], *printed[-1:]})  # more would overlap on the logarithmic axis
     axes.set_xscale("log")
     axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
     axes.minorticks_off()
@@ -208,7 +209,8 @@ def _render(name: str, draw: object, data: ReportData, alt: str) -> Plot:
     assert callable(draw)
     with mpl.rc_context(_STYLE):
         figure: Figure = draw(data)
-        FigureCanvasAgg(figure)
+        FigureCanvasAgg(figure).draw()
+        figure.set_layout_engine("none")  # laid out once, for both files
         svg, png = io.StringIO(), io.BytesIO()
         figure.savefig(svg, format="svg", metadata={"Date": None})
         figure.savefig(png, format="png", dpi=180, facecolor="white", metadata={"Software": None})

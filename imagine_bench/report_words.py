@@ -90,8 +90,8 @@ def answers(data: ReportData) -> list[str]:
     if BASE_AGENT in data.scores:
         sentences.append(
             f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
-            f"{percent(data.scores[BASE_AGENT][budget].value)} % of the test episodes "
-            f"(chance {percent(data.facts.chance_level)} %, optimum {percent(data.facts.optimum)} %)."
+            f"{percent(data.scores[BASE_AGENT][budget].value)}\u00a0% of the test episodes "
+            f"(chance {percent(data.facts.chance_level)}\u00a0%, optimum {percent(data.facts.optimum)}\u00a0%)."
         )
     sentences += [_verdict(data, agent) for agent in data.comparisons]
     if not data.comparisons:
@@ -112,7 +112,7 @@ def _verdict(data: ReportData, agent: str) -> str:
     title = agent_words(agent).title
     score = percent(data.scores[agent][budgets[-1]].value)
     difference = last.difference
-    head = f"“{title}” solves {score} %, {_points(difference)} than DQN"
+    head = f"“{title}” solves {score}\u00a0%, {_points(difference)}"
     if math.isnan(difference.low):
         return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
@@ -140,8 +140,10 @@ def _over_budgets(comparisons: dict[int, Comparison]) -> str:
 
 
 def _points(difference: Estimate) -> str:
+    if difference.value == 0:
+        return "exactly as much as DQN"
     points = f"{abs(100.0 * difference.value):.1f}"
-    return f"{points} percentage points {'less' if difference.value < 0 else 'more'}"
+    return f"{points} percentage points {'less' if difference.value < 0 else 'more'} than DQN"
 
 
 def _listing(words: list[str]) -> str:
