@@ -133,6 +133,7 @@ def _words(data: ReportData) -> dict[str, Any]:
         "thesis_only": _thesis_only(data),
         "seed_index": {seed: index for index, seed in enumerate(protocol.seeds)},
         "facts": _facts(data.result),
+        "settings": {agent: rows for agent in protocol.agents if (rows := _settings(data.result, agent))},
         "recordings": [_relative(run.recording, data.result.folder) for run in data.result.runs if run.recording],
     }
 
@@ -169,6 +170,11 @@ def _facts(result: BenchResult) -> list[tuple[str, str]]:
     where = f"git checkout {str(commit).split('+')[0]} && " if commit else ""
     rows.append(("reproduce", f"{where}{command}"))
     return rows
+
+
+def _settings(result: BenchResult, agent: str) -> list[tuple[str, str]]:
+    """An agent's settings as run, by dotted name; the protocol gives all its seeds the same."""
+    return _flat("", result.of(agent)[0].settings)
 
 
 def _flat(prefix: str, value: Any) -> list[tuple[str, str]]:
