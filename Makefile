@@ -20,6 +20,7 @@ $(READY): pyproject.toml setup.sh
 	@./setup.sh $(VENV) $(READY)
 
 setup: $(READY)  ## Install everything into .venv and stop
+	@:
 
 bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
 	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) $(ARGS)

@@ -51,13 +51,17 @@ make_venv() {
     fi
 }
 
-# uv does not read pip's settings; what it cannot find with its own, pip may.
+# uv installs in seconds what takes pip a minute. It reads none of pip's settings, so what it cannot find, pip may.
 install() {
-    if command -v uv >/dev/null; then
-        UV_FIND_LINKS=${UV_FIND_LINKS:-${PIP_FIND_LINKS:-}} uv pip install -q --python "$venv/bin/python" "$@" && return
+    local uv
+    uv=$(command -v uv || command -v "$venv/bin/uv") || true
+    if [ -n "$uv" ]; then
+        UV_FIND_LINKS=${UV_FIND_LINKS:-${PIP_FIND_LINKS:-}} "$uv" pip install -q --python "$venv/bin/python" "$@" && return
     fi
-    "$venv/bin/python" -m pip install -q --disable-pip-version-check --retries 1 "$@"
+    pip_install "$@"
 }
+
+pip_install() { "$venv/bin/python" -m pip install -qq --disable-pip-version-check --retries 1 "$@"; }
 
 install_torch() {
     if [ "$system" = Linux ] && ! nvidia-smi -L >/dev/null 2>&1; then
@@ -99,6 +103,7 @@ if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$key" ]; then
 fi
 say "installing into $venv (once; about a minute)"
 make_venv
+command -v uv >/dev/null || pip_install uv 2>/dev/null || say "uv is out of reach; pip takes a few minutes instead"
 install_torch || fail "torch $torch could not be installed; the lines above say why."
 install -e '.[dev]' || fail "the dependencies could not be installed; the lines above say why."
 check_gl
