@@ -155,7 +155,7 @@ class ArrowWorld:
 
     def _cube_poses(self) -> NDArray[np.float64]:
         """Positions and quaternions of the cubes, copied. Shape (3, 7)."""
-        return self.data.qpos[self._cube_qpos].reshape(_N_CUBES, 7)
+        return np.asarray(self.data.qpos[self._cube_qpos]).reshape(_N_CUBES, 7)
 
     def _bystander_problem(self, turned: int, before: NDArray[np.float64]) -> str | None:
         shift_m = np.linalg.norm(self._cube_poses()[:, :3] - before[:, :3], axis=1)

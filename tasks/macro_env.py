@@ -16,7 +16,8 @@ from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Rules, 
 
 from .rendering import Renderer, View
 from .scene_reader import body_names, poses_of, shapes_of
-from .scenes.appearance import Appearance, appearance
+from .scenes.appearance import Appearance
+from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, ARM_GROUP, HUMAN_CAMERA, SCENE_GROUP, SETTING_GROUP
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._rules: Rules = spec.rules
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
-        self._world = make_world(_level(appearance))
+        self._world = make_world(appearance_level(appearance))
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._eye = Renderer(self._world.model, _AGENT_VIEW)
@@ -183,7 +184,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         info = self._info(success=outcome.success, legal=legal, fault=fault)
         return self._eye.frame(self._world.data), float(outcome.reward), outcome.terminated, False, info
 
-    def render(self) -> Frame | None:  # type: ignore[override]  (Gymnasium allows many kinds of frames)
+    def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
         return None if self.render_mode is None else self._picture.frame(self._world.data)
 
@@ -271,10 +272,6 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         if fault is not None:
             info["fault_reason"] = fault
         return info
-
-
-def _level(name: str) -> Appearance:
-    return appearance(name)
 
 
 def _known_render_mode(name: str) -> str:

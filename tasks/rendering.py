@@ -12,6 +12,7 @@ import contextlib
 import os
 import sys
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,9 +75,13 @@ def _new_gl_context(width: int, height: int) -> Any:
         context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # each platform fails in its own way: missing library, no device, no display
-        reason = str(error).strip().splitlines()
-        raise SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__)) from error
+        raise _missing_gl(error) from error
     return context
+
+
+def _missing_gl(error: Exception) -> SetupError:
+    reason = str(error).strip().splitlines()
+    return SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__))
 
 
 def gl_renderer() -> str:
@@ -101,8 +106,11 @@ class _Canvas:
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self.pid = os.getpid()
         self.gl: Any = _new_gl_context(view.width, view.height)
-        with _quality(model, view):
-            self.mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        try:
+            with _quality(model, view):
+                self.mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
+            raise _missing_gl(error) from error
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
 
     def close(self) -> None:
@@ -119,7 +127,7 @@ class _Canvas:
 
 
 @contextlib.contextmanager
-def _quality(model: mujoco.MjModel, view: View) -> Any:
+def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
     """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
     quality, size = model.vis.quality, model.vis.global_
     before = (quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks)

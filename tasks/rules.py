@@ -69,7 +69,7 @@ def optimal_values(tables: RuleTables) -> NDArray[np.float64]:
     """
     values = np.full(tables.reward.shape[1], tables.reward.min(initial=0.0))
     for _ in range(_SWEEPS):
-        action_values = tables.reward + tables.alive @ values  # [A, S]
+        action_values: NDArray[np.float64] = tables.reward + tables.alive @ values  # [A, S]
         best = action_values.max(axis=0)
         if np.abs(best - values).max() < _VALUE_TOLERANCE:
             return action_values
@@ -80,8 +80,8 @@ def optimal_values(tables: RuleTables) -> NDArray[np.float64]:
 def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
     action_values = optimal_values(tables)
-    near_best = action_values >= action_values.max(axis=0) - _TIE_TOLERANCE
-    return near_best.argmax(axis=0).astype(np.int64)
+    near_best: NDArray[np.bool_] = action_values >= action_values.max(axis=0) - _TIE_TOLERANCE
+    return np.asarray(near_best.argmax(axis=0), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ def evaluate(tables: RuleTables, policy: NDArray[np.float64], horizon: int) -> P
 
 def greedy(policy: NDArray[np.int64], n_actions: int) -> NDArray[np.float64]:
     """A deterministic policy (S,) as action probabilities (A, S)."""
-    return np.eye(n_actions)[:, policy]
+    return np.asarray(np.eye(n_actions)[:, policy])
 
 
 def facts(rules: Rules, horizon: int) -> RuleFacts:

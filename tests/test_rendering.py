@@ -163,6 +163,15 @@ def test_missing_gl_says_what_to_install(world, monkeypatch, failure):
     assert "\n" not in str(caught.value)
 
 
+def test_a_display_that_is_missing_is_named_like_missing_gl(world, monkeypatch):
+    def no_display(*_):
+        raise mujoco.FatalError("an OpenGL platform library has not been loaded into this process")
+
+    monkeypatch.setattr(mujoco, "MjrContext", no_display)
+    with pytest.raises(SetupError, match=r"has not been loaded .* 'apt-get install libegl1 libgl1-mesa-dri'"):
+        agent_eye(world.model).frame(world.data)
+
+
 _FRAME = """
     {before}
     import gymnasium, imagine_bench
@@ -181,8 +190,8 @@ _FRAME = """
     ids=["collected", "mujoco_first_and_closed", "left_open"],
 )
 def test_a_headless_script_draws_and_exits_in_silence(before, after):
-    """MUJOCO_GL is unset and there is no display; nothing is said on stderr, however the script ends."""
-    done = run_script(_FRAME.format(before=before, after=after))
+    """MUJOCO_GL is empty and there is no display; nothing is said on stderr, however the script ends."""
+    done = run_script(_FRAME.format(before=before, after=after), MUJOCO_GL="")
     assert done.returncode == 0
     assert done.stdout.strip() == "True"
     assert done.stderr == ""
