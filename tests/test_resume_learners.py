@@ -1,0 +1,62 @@
+"""The real learners, killed in the midst of a run and resumed, end in the bits of an uninterrupted one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_runner import final_arrays, small
+
+from imagine_bench import encoders, registry, runner
+from imagine_bench.results import RunResult
+from imagine_bench.runs import RunSpec
+
+
+class _KilledError(Exception):
+    pass
+
+
+def do(folder: Path, agent: str, every_s: float) -> RunResult:
+    overrides = (("imagination.start_episode", 3),)
+    protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=overrides)
+    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
+    return runner.run(spec, folder, lambda progress: None)
+
+
+def measured(result: RunResult) -> list[dict[str, Any]]:
+    """Every number of every row but the times; a NaN equals itself as text."""
+    rows = []
+    for row in result.checkpoints:
+        values = dataclasses.asdict(row)
+        values["diagnostics"] = {k: v for k, v in values["diagnostics"].items() if not k.startswith("time/")}
+        rows.append({name: repr(value) for name, value in values.items() if not name.endswith("_cpu_s")})
+    return rows
+
+
+@pytest.mark.parametrize("agent", ["dqn", "imagination_uncertainty"])
+def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str) -> None:
+    whole = do(tmp_path / "whole", agent, 1e9)
+    real, saves = runner.save_snapshot, []
+
+    def killing(folder: Path, snapshot: Any) -> Path:
+        saves.append(real(folder, snapshot))
+        if len(saves) in (5, 9, 15):  # training before and after the first test, and within a test
+            raise _KilledError
+        return saves[-1]
+
+    monkeypatch.setattr(runner, "save_snapshot", killing)
+    for _ in range(3):
+        with pytest.raises(_KilledError):
+            do(tmp_path / "run", agent, 0.0)
+    resumed = do(tmp_path / "run", agent, 0.0)
+    assert measured(whole) == measured(resumed)
+    assert "loss/bellman" in measured(whole)[-1]["diagnostics"]
+    before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
+    assert set(before) == set(after)
+    assert [name for name in before if before[name].tobytes() != after[name].tobytes()] == []
+    for one, other in zip(whole.imagined, resumed.imagined, strict=True):
+        assert np.array_equal(one.rollout.frames, other.rollout.frames)
