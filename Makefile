@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench view report encoder doctor test test-slow lint speed clean
+.PHONY: help setup bench view report encoder film doctor test test-slow lint speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,9 @@ report: $(READY)  ## Write the newest bench's report again and show its table
 encoder: $(READY)  ## Train an encoder for TASK anew and say how it compares to the bundled one
 	@$(BIN)/imagine-bench encoder --task $(TASK) $(ARGS)
 
+film: $(READY)  ## Film an episode of TASK as a GIF
+	@$(BIN)/imagine-bench film --task $(TASK) $(ARGS)
+
 doctor: $(READY)  ## Say what this machine has, and in words what is wrong with it
 	@$(BIN)/imagine-bench doctor
 
@@ -47,7 +50,7 @@ lint: $(READY)  ## Check style and format
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 
 speed: $(READY)  ## Measure every speed and fidelity figure that is promised
-	@OMP_NUM_THREADS=1 $(BIN)/python -m imagine_bench.speed $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(ARGS)
 
 clean:  ## Remove caches and build leftovers; results and .venv stay
 	@rm -rf build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -163,11 +163,50 @@ class List:
             print(f"{kind:12}{', '.join(names)}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """Film an episode of optimal macro-actions in contact physics, as a GIF."""
+
+    task: str
+    """Task to film."""
+    appearance: str = APPEARANCES[0]
+    """Appearance level."""
+    seed: int = 0
+    """Chooses the episode."""
+    out: Path = Path("film.gif")
+    """The GIF to write; never overwritten."""
+
+    def __call__(self) -> None:
+        """Film."""
+        from imagine_bench.film import film  # noqa: PLC0415 - numpy and pillow only when filming
+
+        print(film(self.task, self.out, seed=self.seed, appearance=self.appearance))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed:
+    """Measure every speed and fidelity figure that is promised, beside the promise."""
+
+    turns: int = 2_000
+    """Macro-actions of the fidelity measurement."""
+    out: Path = Path("runs/speed.json")
+    """Where the figures are kept, with the machine's description."""
+
+    def __call__(self) -> None:
+        """Measure."""
+        from imagine_bench.speed import speed_report  # noqa: PLC0415 - nothing else needs it
+
+        if not speed_report(self.out, self.turns):
+            sys.exit(1)
+
+
 Command = (
     Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Encoder, tyro.conf.subcommand("encoder")]
+    | Annotated[Film, tyro.conf.subcommand("film")]
+    | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )

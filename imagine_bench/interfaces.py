@@ -346,3 +346,6 @@ class SceneReader(Protocol):
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """A picture of the whole scene with the arm. Shape (height, width, 3)."""
+
+    def film(self, width: int = 640, height: int = 480) -> Frame:
+        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""

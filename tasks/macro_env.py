@@ -219,6 +219,21 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             self._human = Renderer(self._world.model, view)
         return self._human.frame(self._world.data)
 
+    def film(self, width: int = 640, height: int = 480) -> Frame:
+        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        world, latest = self._world, self._latest
+        if latest is None or not len(latest.time_s):
+            return self.human_view(width, height)[None]
+        standing = world.data.qpos.copy()
+        pictures = []
+        for qpos in latest.qpos:
+            world.data.qpos[:] = qpos
+            mujoco.mj_kinematics(world.model, world.data)
+            pictures.append(self.human_view(width, height))
+        world.data.qpos[:] = standing
+        mujoco.mj_kinematics(world.model, world.data)
+        return np.stack(pictures)
+
     # --- details -------------------------------------------------------------------------------------------------
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
