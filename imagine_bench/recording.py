@@ -75,7 +75,6 @@ def record_run(
             target_m=_target_m(scene),
             values=isinstance(agent, ValueReader),
             imagines=isinstance(agent, Imaginer),
-            episodes=episodes,
         )
         with recording_file(path, task, layout) as recording:
             story = _Story(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
@@ -165,6 +164,8 @@ class _Story:
     def tell(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
         frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
+        if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
+            self._recording.set_time("imagined_depth", sequence=0)
         self._arrive(episode, frame)
         self._move(env.unwrapped, episode, only_moved=False)
         done, step, story = False, 0, f"### Episode {episode}: a new start"
@@ -174,6 +175,7 @@ class _Story:
             action = int(self._agent.act(observation, explore=False))
             self._say(f"{story}\n\n{self._seen(macrostate)}\n\n**Next: {self._spec.action_names[action]}.**")
             self._expect(observation, action)
+            self._recording.disable_timeline("imagined_depth")
             self._imagine(frame, macrostate, episode, step)
             frame, reward, terminated, truncated, info = env.step(np.int64(action))
             began_s = self._clock_s
@@ -199,6 +201,8 @@ class _Story:
         if isinstance(scene, SceneReader):
             start_s = self._clock_s if began_s is None else began_s
             sequences = {"env_step": self._env_step, "episode": episode}
+            if self._env_step == 0:
+                sequences["imagined_depth"] = 0
             log_motion(self._recording, scene.motion(), start_s=start_s, sequences=sequences, only_moved=only_moved)
 
     def _duration_s(self, scene: Any) -> float:
@@ -246,9 +250,10 @@ class _Story:
             self._by_depth(compared, f"/imagined/episode_{episode}")
 
     def _uncertainty_bars(self, compared: ComparedRollout) -> None:
-        """Three bars, side by side, at each depth."""
+        """Three bars, side by side, at each depth; none after the rollout's end, so that the axis stays the same."""
         for index, (kind, color) in enumerate(_KINDS.items()):
-            values = np.asarray(getattr(compared.rollout, kind), dtype=np.float64)
+            imagined = np.asarray(getattr(compared.rollout, kind), dtype=np.float64)
+            values = np.pad(imagined, (0, IMAGINED_DEPTH - len(imagined)))
             places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
             widths = np.full(len(values), 0.25)
             bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
@@ -269,7 +274,7 @@ class _Story:
             for kind in _KINDS:
                 value = float(getattr(rollout, kind)[depth - 1])
                 recording.log(f"{root}/uncertainty/{kind}", rr.Scalars(value), strict=True)
-            predictions = {
+            predictions: dict[str, NDArray[Any]] = {
                 "reward": rollout.rewards,
                 "p_terminal": rollout.p_terminated,
                 "true_reward": compared.real_rewards,
@@ -287,5 +292,6 @@ def _target_m(scene: Any) -> NDArray[np.float64]:
     motion = scene.motion()
     large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
     small = [index for index, body in enumerate(motion.body_names) if body not in large]
-    places: NDArray[np.float64] = motion.poses_in_world[0, small or slice(None), :3]
+    chosen = small or list(range(len(motion.body_names)))
+    places: NDArray[np.float64] = motion.poses_in_world[0, chosen, :3]
     return places.mean(axis=0)

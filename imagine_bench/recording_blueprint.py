@@ -12,14 +12,13 @@ _EYE_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
 """Beside the human's hand, across the table from the arm: neither hides the objects."""
 
 
-def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, episodes: int) -> rrb.Blueprint:
+def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) -> rrb.Blueprint:
     """The layout: the scene large, beside it what the agent sees, says and expects, below it what it imagines.
 
     Args:
         target_m: What the 3D view looks at. Shape (3,).
         values: Whether the agent has Q-values.
         imagines: Whether the agent imagines.
-        episodes: Real episodes in the recording.
     """
     scene = rrb.Spatial3DView(
         origin=ROOT,
@@ -30,15 +29,15 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, ep
         background=[214, 222, 230],
         line_grid=False,
     )
-    frame = rrb.Spatial2DView(origin="/real/frame", name="What the agent sees (64 x 64 pixels)")
+    frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
     story = rrb.TextDocumentView(origin="/real/story", name="What happens")
-    side = [rrb.Horizontal(story, frame)]
+    side: list[rrb.Container | rrb.View] = [rrb.Horizontal(story, frame)]
     if values:
         side.append(rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action"))
     top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.1, 1.0])
-    pages = [_over_time(values=values)]
+    pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
     if imagines:
-        pages = [_imagined_now(), *pages, _by_depth(episodes)]
+        pages = [_imagined_now(), *pages, _by_depth()]
     bottom = rrb.Tabs(*pages, active_tab=0)
     return rrb.Blueprint(
         rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]),
@@ -69,18 +68,14 @@ def _over_time(*, values: bool) -> rrb.Horizontal:
     return rrb.Horizontal(*views, name="Rewards and values over time")
 
 
-def _by_depth(episodes: int) -> rrb.Vertical:
-    """For the timeline ``imagined_depth``: the rollout from each episode's first frame, imagined step by step."""
-    rows = []
-    for episode in range(1, 1 + min(episodes, 3)):
-        root = f"/imagined/episode_{episode}"
-        rows.append(
-            rrb.Horizontal(
-                rrb.Spatial2DView(origin=f"{root}/real_frame", name=f"Episode {episode}: really"),
-                rrb.Spatial2DView(origin=f"{root}/frame", name=f"Episode {episode}: imagined"),
-                rrb.TimeSeriesView(origin=f"{root}/uncertainty", name="Uncertainty by depth"),
-                rrb.TimeSeriesView(origin=f"{root}/prediction", name="Predicted reward and P(end) by depth"),
-                column_shares=[1, 1, 2, 2],
-            )
-        )
-    return rrb.Vertical(*rows, name="By depth (choose the timeline imagined_depth below)")
+def _by_depth() -> rrb.Horizontal:
+    """For the timeline ``imagined_depth``: the rollout from the first episode's first frame, step by step."""
+    root = "/imagined/episode_1"
+    return rrb.Horizontal(
+        rrb.Spatial2DView(origin=f"{root}/real_frame", name="Real"),
+        rrb.Spatial2DView(origin=f"{root}/frame", name="Imagined"),
+        rrb.TimeSeriesView(origin=f"{root}/uncertainty", name="Uncertainty by depth"),
+        rrb.TimeSeriesView(origin=f"{root}/prediction", name="Predicted reward and P(end) by depth"),
+        column_shares=[1, 1, 2, 2],
+        name="Episode 1 by depth (choose the timeline imagined_depth below)",
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -72,7 +73,7 @@ def log_motion(
 def _drawable(shape: Shape3D) -> rr.AsComponents:
     center, quaternion = shape.pose_in_body[None, :3], _xyzw(shape.pose_in_body[None, 3:])
     color = (np.clip(shape.rgba, 0.0, 1.0) * 255).astype(np.uint8)
-    style = {"colors": [color], "fill_mode": "solid"}
+    style: dict[str, Any] = {"colors": [color], "fill_mode": "solid"}
     if shape.kind == "mesh":
         return _mesh(shape, color)
     if shape.kind == "box":

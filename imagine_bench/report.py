@@ -69,7 +69,7 @@ def write_report(result: BenchResult) -> Path:
         "encoder": encoder,
         "encoder_picture": base64.b64encode(picture).decode(),
     }
-    files = {f"{image.name}.png": image.png for image in (*plots, *strips)}
+    files = {f"{plot.name}.png": plot.png for plot in plots} | {f"{strip.name}.png": strip.png for strip in strips}
     if picture:
         files["encoder.png"] = picture
     files["results.csv"] = results_csv(result).encode()

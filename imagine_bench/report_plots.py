@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -24,7 +26,7 @@ _COLORS = {  # Okabe and Ito's palette
     "imagination_uncertainty": "#009e73",
 }
 _SPARE_COLORS = ("#cc79a7", "#56b4e9", "#e69f00")
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",
     "font.family": "DejaVu Sans",
@@ -54,8 +56,11 @@ _STYLE = {
 
 
 _KINDS = (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":"))
-_LEADER = {"arrowstyle": "-", "linewidth": 0.7, "alpha": 0.45, "linestyle": (0, (1, 2))}
-_REFERENCE_LINE = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
+_THESIS_LINE: dict[str, Any] = {
+    "marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0,
+}  # fmt: skip
+_LEADER: dict[str, Any] = {"arrowstyle": "-", "linewidth": 0.7, "alpha": 0.45, "linestyle": (0, (1, 2))}
+_REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +132,7 @@ def acceptance_figure(data: ReportData) -> Figure:
     last = {agent: 100.0 * list(rates.values())[-1] for agent, rates in data.acceptance.items()}
     end = max(max(rates) for rates in data.acceptance.values())
     _end_labels(axes, last, end, end)
+    axes.set_xlim(left=0)
     return figure
 
 
@@ -137,7 +143,7 @@ def open_loop_figure(data: ReportData) -> Figure:
     panels: list[Axes] = list(grid.ravel())
     for agent, loop in data.open_loop.items():
         depth = np.arange(1, len(loop.correct) + 1)
-        style = {"color": color(agent), "marker": "o", "markersize": 3.5}
+        style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
         title = agent_words(agent).title
         panels[0].plot(depth, 100.0 * loop.correct, label=title, **style)
         if np.isfinite(loop.correct_accepted).any() and (loop.accepted < 1.0).any():
@@ -179,7 +185,13 @@ def _success_legend(axes: Axes, data: ReportData) -> None:
     """What the kinds of line mean; which agent a colour is, the right margin says."""
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     if data.thesis:
-        style = {"marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0}
+        style: dict[str, Any] = {
+            "marker": "D",
+            "markersize": 5,
+            "markerfacecolor": "none",
+            "linestyle": ":",
+            "linewidth": 1.0,
+        }
         axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **style)
     levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
     axes.plot([], [], label=levels, **_REFERENCE_LINE)
@@ -189,7 +201,7 @@ def _success_legend(axes: Axes, data: ReportData) -> None:
 def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) -> None:
     """Name each line in the right margin, spread so that no two names overlap, with a thin leader to its last point."""
     low, high = axes.get_ylim()
-    step = 0.065 * (high - low) * 4.9 / axes.figure.get_figheight()
+    step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     placed: dict[str, float] = {}
     floor = -np.inf
     for agent, value in sorted(last.items(), key=lambda item: item[1]):
@@ -205,10 +217,9 @@ def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) 
     axes.set_xlim(right=to_x * 1.04)
 
 
-def _render(name: str, draw: object, data: ReportData, alt: str) -> Plot:
-    assert callable(draw)
+def _render(name: str, draw: Callable[[ReportData], Figure], data: ReportData, alt: str) -> Plot:
     with mpl.rc_context(_STYLE):
-        figure: Figure = draw(data)
+        figure = draw(data)
         FigureCanvasAgg(figure).draw()
         figure.set_layout_engine("none")  # laid out once, for both files
         svg, png = io.StringIO(), io.BytesIO()

@@ -69,9 +69,18 @@ def test_entities_and_timelines(imagined: Path) -> None:
     assert set(found) >= REAL | IMAGINED | BY_DEPTH | VALUES
     for path in REAL - {"/scene/cube_1/cube_1_arrow"}:
         assert found[path] >= {"sim_time", "env_step", "episode"}
-        assert "imagined_depth" not in found[path]
     assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
     assert all("imagined_depth" in found[path] for path in BY_DEPTH)
+
+
+def test_on_the_depth_timeline_only_the_first_start_is_real(imagined: Path) -> None:
+    depths = [
+        depth
+        for chunk in RrdReader(imagined).stream()
+        if chunk.entity_path == "/real/frame" and "imagined_depth" in chunk.timeline_names
+        for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
+    ]
+    assert depths == [0]
 
 
 def test_application_and_blueprint(imagined: Path) -> None:
