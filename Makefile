@@ -16,8 +16,8 @@ help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "  Options: TASK=$(TASK) PRESET=smoke|quick|thesis|full ARGS='--seeds 0 1 2 ...' (imagine-bench --help)"
 
-$(READY): pyproject.toml setup.sh
-	@./setup.sh $(VENV) $(READY)
+$(READY): pyproject.toml .ci/setup.sh
+	@.ci/setup.sh $(VENV) $(READY)
 
 setup: $(READY)  ## Install everything into .venv and stop
 	@:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs the project into its own virtual environment: setup.sh VENV STAMP. 'make setup' calls it; again it is instant.
+# Installs the project into its own virtual environment: .ci/setup.sh VENV STAMP. 'make setup' calls it; again it is instant.
 #
 # PYTHON names the interpreter (3.11 to 3.13), TORCH_INDEX the index of torch's CPU builds (PyTorch's install page has
 # it) for machines without an NVIDIA GPU whose package index offers no '+cpu' build. uv is used where it is installed.
@@ -96,7 +96,7 @@ check_gl() {
     fail "$problem Then run the same command again."
 }
 
-key=$(cat pyproject.toml setup.sh | cksum)
+key=$(cat pyproject.toml .ci/setup.sh | cksum)
 if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$key" ]; then
     touch "$stamp"
     exit 0
