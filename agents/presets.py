@@ -39,7 +39,7 @@ _QUICK: dict[str, Deviation] = {
     "model.sigma_floor": Deviation(0.2, "narrower components stop learning of the transitions they miss"),
     "model.gradient_clip": Deviation(10.0, "the likelihood of narrow components has steep walls"),
     "controller.epsilon_decay": Deviation(
-        0.003, "0.03 ends exploration after 100 episodes, before most goals are seen"
+        0.003, "0.03 ends exploration after 100 episodes; 64 % against 58 % after 1000"
     ),
     "imagination.start_episode": Deviation(300, "the quick model is right early; 1000 would leave nothing to compare"),
     "imagination.temperature": Deviation(0.0, "sampled latents leave the manifold that the networks know"),
