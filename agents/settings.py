@@ -50,7 +50,7 @@ class ControllerSettings:
         learning_rate: Of Adam.
         batch_size: Transitions an update, real or imagined.
         updates_per_step: Updates on real transitions a real step, N_R.
-        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; ``docs/deviations.md`` measures three.
+        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/deviations.md.
         epsilon_min: Exploration probability in the limit.
         epsilon_max: Exploration probability at step 0.
         epsilon_decay: Decay rate lambda, a real step.
