@@ -29,6 +29,7 @@ Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
 
 _CHUNK = 500  # frames rendered at once, to bound memory
+_CHECK_EVERY = 50  # steps between looks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
 _Network = TypeVar("_Network", bound=torch.nn.Module)
@@ -103,10 +104,9 @@ def train_vae(vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generat
         optimiser.zero_grad()
         elbo.loss.backward()
         optimiser.step()
-        if step % 50 == 0 or step == recipe.steps - 1:
-            if not elbo.loss.isfinite():
-                raise DivergedError(f"The encoder's loss became {elbo.loss.item()} at step {step} of {recipe.steps}.")
-            progress("training", (step + 1) / recipe.steps)
+        if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not elbo.loss.isfinite():
+            raise DivergedError(f"The encoder's loss became {elbo.loss.item()} at step {step} of {recipe.steps}.")
+        progress("training", (step + 1) / recipe.steps)
 
 
 def train_encoder(

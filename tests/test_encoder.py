@@ -219,6 +219,18 @@ def test_training_lowers_the_loss_and_reports_progress() -> None:
     assert [stage for stage, done in stages if done == 1.0] == ["frames", "frames", "training", "probe"]
 
 
+@pytest.mark.slow
+def test_thesis_recipe_learns_more_than_the_mean_picture() -> None:
+    """The full recipe costs days on a CPU; a thousandth of it must already beat the best constant picture."""
+    recipe = replace(RECIPES["thesis"], frames=2000, held_out_frames=200, steps=120, batch=64, probe_steps=200)
+    encoder = train_encoder(arrow_spec(), recipe=recipe, appearance="clean", seed=0)
+    frames, _ = draw_frames(arrow_spec(), "clean", 200, np.random.default_rng(5))
+    target = encoder._vae.target(torch.from_numpy(gray_strips(frames)))
+    constant = (target - target.mean(dim=0)).square().mean().item()
+    assert encoder.card.reconstruction < 0.8 * constant
+    assert encoder.card.kl_nats > 1.0  # the posterior has not collapsed
+
+
 def test_training_and_held_out_frames_differ() -> None:
     first, second = (
         draw_frames(arrow_spec(), "mild", 20, SeedTree(0).child(name, "drawn_arrows", "mild").generator())[0]
