@@ -96,10 +96,8 @@ class Learner:
                     self.meters.add(f"loss/{name}", value)
 
     def _learn_values(self, memory: RealMemory | ImaginedMemory, updates: int) -> None:
-        if len(memory) == 0:
-            return
         with self.meters.cpu_time("time/controller_s"):
-            for _ in range(updates):
+            for _ in range(updates if len(memory) else 0):  # the filter may have kept nothing yet
                 batch = memory.sample(self.settings.controller.batch_size, self._replay)
                 self.meters.add("loss/bellman", self.controller.update(batch))
 
@@ -145,8 +143,7 @@ class Learner:
         self.controller.optimiser.load(snapshot.below("controller", arrays))
         snapshot.load_generator(self._replay, arrays["generator/replay"])
         self.real.load(snapshot.below("real", arrays), values["real_added"])
-        self.rng.bit_generator.state = values["exploration"]
         self.meters.restore(values["meters"])
-        self.steps = values["steps"]
+        self.rng.bit_generator.state, self.steps = values["exploration"], values["steps"]
         if self.imagination is not None:
             self.imagination.load(snapshot.below("imagination", arrays), values["imagined_added"])
