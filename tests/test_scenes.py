@@ -81,7 +81,7 @@ def test_every_element_is_named(world):
 
 def test_physics_options(world):
     option = world.model.opt
-    assert option.timestep == 0.005
+    assert option.timestep == c.TIMESTEP_S
     assert option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert option.solver == mujoco.mjtSolver.mjSOL_NEWTON
     assert option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
