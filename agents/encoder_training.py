@@ -150,23 +150,27 @@ def train_encoder(
     )
     clock.lap("probe")
     progress("probe", 1.0)
-    card = EncoderCard(
+    noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
+    measured = _measure(vae, probe, linear, held_out, noise)
+    card = _card(spec, recipe, appearance, seed, latent_size=vae.latent_size, cpu_s=clock.seconds(), **measured)
+    return Encoder(vae, probe, card)
+
+
+def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured: Any) -> EncoderCard:
+    return EncoderCard(
         task=spec.id,
         appearance=appearance,
         recipe=recipe,
         preprocessing=spec.preprocessing,
-        latent_size=vae.latent_size,
         macrostate_names=spec.macrostate_names,
-        cardinalities=cardinalities,
+        cardinalities=tuple(len(values) for values in spec.macrostate_values),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
         f"--recipe {recipe.name} --seed {seed}",
         data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
         versions={name: version(name) for name in _LIBRARIES},
-        cpu_s=clock.seconds(),
-        **_measure(vae, probe, linear, held_out, torch.Generator().manual_seed(probe_seeds.child("torch").integer())),
+        **measured,
     )
-    return Encoder(vae, probe, card)
 
 
 class _Clock:
