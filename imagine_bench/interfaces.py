@@ -344,6 +344,9 @@ class SceneReader(Protocol):
     def motion(self) -> Motion:
         """The motion of the latest macro-action; after ``reset`` one sample of the standing scene."""
 
+    def agent_view(self) -> Frame:
+        """The frame that agents see, drawn now. Shape (64, 64, 3)."""
+
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """A picture of the whole scene with the arm. Shape (height, width, 3)."""
 

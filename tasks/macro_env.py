@@ -154,7 +154,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         reading = self._world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
-        return self._eye.frame(self._world.data), self._info(success=False, legal=legal, fault=reading.problem)
+        return self.agent_view(), self._info(success=False, legal=legal, fault=reading.problem)
 
     def step(self, action: np.int64 | int) -> tuple[Frame, float, bool, bool, dict[str, Any]]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
@@ -182,7 +182,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         legal = outcome.success or not outcome.terminated
         info = self._info(success=outcome.success, legal=legal, fault=fault)
-        return self._eye.frame(self._world.data), float(outcome.reward), outcome.terminated, False, info
+        return self.agent_view(), float(outcome.reward), outcome.terminated, False, info
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
@@ -209,6 +209,10 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             time_s, qpos = latest.time_s, latest.qpos
         poses = poses_of(model, qpos, data.mocap_pos, data.mocap_quat)
         return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
+
+    def agent_view(self) -> Frame:
+        """The frame that agents see, drawn now. Shape (64, 64, 3)."""
+        return self._eye.frame(self._world.data)
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """A picture of the whole scene with the arm. Shape (height, width, 3)."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import os
 import sys
 import weakref
@@ -100,6 +101,17 @@ def gl_renderer() -> str:
     return ", ".join(part.decode() for part in parts if part)
 
 
+def _is_current(context: Any) -> bool:
+    """Whether ``context`` is EGL's current one; False where another platform draws."""
+    mine = getattr(context, "_context", None)
+    if mine is None or not type(context).__module__.endswith("egl"):
+        return False
+    from OpenGL import EGL  # noqa: PLC0415  (after the platform is chosen)
+
+    addresses = [ctypes.cast(pointer, ctypes.c_void_p).value for pointer in (EGL.eglGetCurrentContext(), mine)]
+    return addresses[0] is not None and addresses[0] == addresses[1]
+
+
 class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
@@ -112,6 +124,11 @@ class _Canvas:
         except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
             raise _missing_gl(error) from error
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
+
+    def make_current(self) -> None:
+        """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
+        if not _is_current(self.gl):
+            self.gl.make_current()
 
     def close(self) -> None:
         """Free everything; nothing if that was done before or belongs to a parent process."""
@@ -211,7 +228,7 @@ class Renderer:
             SetupError: The machine has no OpenGL.
         """
         canvas = self._ready_canvas()
-        canvas.gl.make_current()
+        canvas.make_current()
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
         mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
         mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
