@@ -20,6 +20,9 @@ from .perception import Perception
 from .presets import flatten
 from .settings import Settings
 
+_TIMES = ("time/controller_s", "time/model_s", "time/imagination_s")
+"""What a real step costs in CPU seconds; all but the first belong to imagination."""
+
 
 class Learner:
     """A DQN on latents and, where it has one, an imagination that feeds it.
@@ -87,6 +90,7 @@ class Learner:
         if self.imagination is not None and episode >= self.settings.imagination.start_episode:
             self._imagine(self.imagination, now[0])
             self._learn_values(self.imagination.memory, self.settings.imagination.updates_per_step)
+        self.meters.count(*_TIMES[: 1 if self.imagination is None else None])
         self.steps += 1
 
     def _learn_model(self, imagination: Imagination) -> None:
@@ -108,7 +112,7 @@ class Learner:
         self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
 
     def diagnostics(self) -> dict[str, float]:
-        """Means since the last call of what was measured (``time/*`` in CPU seconds a call), and the counters now."""
+        """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         imagined = {} if self.imagination is None else {"imagined_transitions": float(self.imagination.memory.added)}
         return {**self.meters.read(), "epsilon": self.epsilon, "real_transitions": float(self.real.added), **imagined}
 

@@ -21,10 +21,15 @@ class Meters:
 
     @contextmanager
     def cpu_time(self, name: str) -> Iterator[None]:
-        """Measure the process' CPU seconds of the block."""
+        """Add the CPU seconds of the block, uncounted: :meth:`count` says what they are a mean of."""
         start = time.process_time()
         yield
-        self.add(name, time.process_time() - start)
+        self.add(name, time.process_time() - start, 0.0)
+
+    def count(self, *names: str) -> None:
+        """Count one more of what ``names`` are means of, such as a real step for CPU seconds a step."""
+        for name in names:
+            self.add(name, 0.0)
 
     def read(self) -> dict[str, float]:
         """The means since the last call, of the names that were measured."""

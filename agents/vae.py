@@ -6,6 +6,7 @@ the noise that the caller passes in.
 
 from __future__ import annotations
 
+import abc
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -44,7 +45,7 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
     return -0.5 * (1.0 + log_variance - mu.square() - log_variance.exp()).sum(dim=1)  # [N]
 
 
-class Vae(nn.Module):
+class Vae(nn.Module, abc.ABC):
     """What the two architectures share.
 
     Attributes:
@@ -53,29 +54,29 @@ class Vae(nn.Module):
 
     latent_size: int
 
+    @abc.abstractmethod
     def target(self, pictures: Tensor) -> Tensor:
         """What :meth:`mean` should give back for ``pictures`` (N, C, H, W), in the network's own units."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log variance of the latents of ``pictures`` (N, C, H, W). Two tensors of shape (N, Z)."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def generate(self, latents: Tensor) -> Tensor:
         """Parameters of the pixels' distribution given ``latents`` (N, Z), as :meth:`log_loss` takes them."""
-        raise NotImplementedError
 
     def mean(self, latents: Tensor) -> Tensor:
         """The expected picture given ``latents`` (N, Z), in the units of :meth:`target`."""
         return self.generate(latents)
 
+    @abc.abstractmethod
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
         """-log p(target | latents) up to a constant, a SUM over pixels. Shape (N,)."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
         """The picture of ``latents`` (N, Z) as a person would see it. Shape (N, C, height, width), in [0, 1]."""
-        raise NotImplementedError
 
     def elbo(self, pictures: Tensor, noise: Tensor, beta: float) -> Elbo:
         """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of a batch.

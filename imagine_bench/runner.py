@@ -175,7 +175,6 @@ class _Run:
         from imagine_bench.recording import record_run  # noqa: PLC0415 - loading Rerun costs a second
 
         self._tell("recording", at_once=True)
-        partial = self.folder / "recording.partial.rrd"
         record_run(
             protocol.task,
             self.agent,
@@ -184,9 +183,8 @@ class _Run:
             execution=protocol.execution,
             appearance=protocol.appearance,
             episodes=protocol.recorded_episodes,
-            path=partial,
+            path=run_folder.recording_path(self.folder),
         )
-        partial.replace(run_folder.recording_path(self.folder))
 
     def _context(self) -> AgentContext:
         protocol = self.spec.protocol
