@@ -79,7 +79,9 @@ def _spec(*, hard: bool) -> TaskSpec:
         description=_PLAY.format(extra=", no arrow toward the agent" if hard else ""),
         env_id="imagine_bench/ArrowPuzzleHard-v0" if hard else "imagine_bench/ArrowPuzzle-v0",
         horizon=HORIZON,
-        action_names=tuple(f"turn the {cube} cube {way}" for cube in _CUBES for way in ("right", "left")),
+        action_names=tuple(
+            f"turn the {cube} cube {way}" for cube in _CUBES for way in ("clockwise", "counter-clockwise")
+        ),
         macrostate_names=(*(f"{cube} arrow" for cube in _CUBES), "pointed cube"),
         macrostate_values=(_DIRECTIONS,) * N_CUBES + (_CUBES,),
         preprocessing="gray_strips",

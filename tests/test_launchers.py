@@ -61,7 +61,9 @@ def busy_bench(tmp_path: Path) -> subprocess.Popen[str]:
     """The command line with a run that would take minutes, once its worker has begun to train."""
     words = "bench --task arrow_puzzle --preset smoke --agents table --budgets 100000 --execution kinematic --workers 1"
     command = [sys.executable, str(_HERE / "bench_fakes.py"), *words.split(), "--out", str(tmp_path)]
+    heed = signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background may ignore Ctrl-C
     bench = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    signal.signal(signal.SIGINT, heed)
     deadline_s = time.monotonic() + 60
     while not list(tmp_path.glob("*/*/table/seed_0/config.json")):
         assert time.monotonic() < deadline_s and bench.poll() is None
