@@ -27,7 +27,7 @@ BY_DEPTH = {
     for episode in (1, 2)
     for leaf in ("frame", "real_frame", "prediction/reward", "prediction/p_terminal", "uncertainty/epistemic")
 }
-VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_right"}
+VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 
 
 def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: str | int) -> Path:
