@@ -17,7 +17,6 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-import imagine_bench
 from imagine_bench import registry
 from imagine_bench.environment import describe_environment
 from imagine_bench.interfaces import APPEARANCES, SceneReader
@@ -126,7 +125,7 @@ def rss_mb():
     return int(fields["VmRSS"].split()[0]) / 1024
 env = gymnasium.make({registry.TASKS["arrow_puzzle"].env_id!r})
 env.reset(seed=0); env.step(0)
-for i in range(200): env.reset(seed=i)
+for i in range(1000): env.reset(seed=i)  # allocators settle
 before = rss_mb()
 for i in range(2000): env.reset(seed=i)
 print(json.dumps({{"rss": rss_mb(), "growth": rss_mb() - before}}))
@@ -167,7 +166,7 @@ def _kinematic() -> Iterator[Figure]:
 
 
 def _encoders() -> Iterator[Figure]:
-    folder = resources.files(imagine_bench) / "assets" / "encoders"
+    folder = resources.files("imagine_bench.assets") / "encoders"
     for appearance in APPEARANCES:
         card = json.loads((folder / f"arrow_puzzle-{appearance}.json").read_text())
         required = 0.98 if appearance == "strong" else 0.995
