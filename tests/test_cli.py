@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -88,19 +87,17 @@ def test_the_program_itself_exits_without_a_traceback() -> None:
     assert done.stderr.startswith("imagine-bench: No task 'pick'.") and len(done.stderr.splitlines()) == 1
 
 
-def test_help_is_quick_and_loads_nothing_heavy() -> None:
+def test_help_loads_nothing_heavy() -> None:
     probe = (
         "import sys, runpy; sys.argv = ['imagine-bench', '--help']\n"
         "try: runpy.run_module('imagine_bench', run_name='__main__')\n"
         "except SystemExit: pass\n"
-        "print([name for name in ('torch', 'mujoco', 'rerun', 'matplotlib', 'dm_control') if name in sys.modules])"
+        "heavy = ('torch', 'mujoco', 'rerun', 'matplotlib', 'dm_control', 'scipy', 'PIL')\n"
+        "print([name for name in heavy if name in sys.modules])"
     )
-    before = os.times()
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
     assert "bench" in done.stdout and "doctor" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]"
-    after = os.times()
-    assert after.children_user + after.children_system - before.children_user - before.children_system < 1.5
 
 
 def test_settings_are_json_where_they_can_be() -> None:
