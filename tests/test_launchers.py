@@ -85,17 +85,17 @@ def test_ctrl_c_ends_everything_and_says_how_to_go_on(busy_bench: subprocess.Pop
         os.killpg(busy_bench.pid, signal.SIGINT)
     else:
         busy_bench.send_signal(signal.SIGINT)
-    _, errors = busy_bench.communicate(timeout=20)
+    _, errors = busy_bench.communicate(timeout=60)
     assert busy_bench.returncode == 130
     assert "Traceback" not in errors
     assert errors.splitlines()[-1] == (
         "imagine-bench: interrupted; the same command goes on from the last checkpoints."
     )
-    assert psutil.wait_procs(children, timeout=10)[1] == []
+    assert psutil.wait_procs(children, timeout=30)[1] == []
 
 
 def test_kill_9_of_the_parent_leaves_no_orphan(busy_bench: subprocess.Popen[str]) -> None:
     children = family(busy_bench)
     busy_bench.kill()
-    busy_bench.communicate(timeout=20)
-    assert psutil.wait_procs(children, timeout=10)[1] == []
+    busy_bench.communicate(timeout=60)
+    assert psutil.wait_procs(children, timeout=30)[1] == []
