@@ -135,7 +135,6 @@ class ArrowWorld:
             self.data, cube=cube, clockwise=not counter_clockwise, capture_motion_hz=capture_motion_hz
         )
         self._executor.executor.rest(self.data)
-        self._point()  # a rollout forgets mocap bodies
         self._update()
         return replace(result, fault=result.fault or self._bystander_problem(cube, before))
 
