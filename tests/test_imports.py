@@ -54,7 +54,7 @@ def offences(path: Path, source: str) -> list[str]:
     for name in imports(tree, path):
         top, *rest = name.split(".")
         owner = _HEAVY.get(top)
-        recording = room == "imagine_bench" and path.stem.startswith("recording")
+        recording = path.is_relative_to(_TOP / "imagine_bench" / "recording")
         if owner is not None and (room != owner or (top == "rerun" and not recording)):
             found.append(f"{top} is imported outside of {owner}")
         if top in ("tasks", "agents"):

@@ -13,12 +13,12 @@ import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
 from rerun.chunk import RrdReader
 
-from imagine_bench import recording, registry
+from imagine_bench import registry
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
-from imagine_bench.recording import q_table, record_run, recording_file
-from imagine_bench.recording_scene import _rotate, entity_name, log_motion, log_shapes
+from imagine_bench.recording import episodes, q_table, record_run, recording_file
+from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
 
 REAL = {"/real/frame", "/real/story", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -96,7 +96,7 @@ def test_depths_are_those_of_the_rollout(imagined: Path) -> None:
         if chunk.entity_path == "/imagined/episode_1/frame"
         for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
     ]
-    assert depths == list(range(1 + recording.IMAGINED_DEPTH))
+    assert depths == list(range(1 + episodes.IMAGINED_DEPTH))
 
 
 def logged(path: Path) -> dict[tuple[str, str], list[str]]:

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from fake_results import bench_result, compared_rollout
 
-from imagine_bench import pictures, reference, report_data, report_words
+from imagine_bench import pictures, reference
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.protocol import Protocol
-from imagine_bench.report import summary_table, write_report
-from imagine_bench.report_words import percent, signed_percent
+from imagine_bench.report import summary_table, words, write_report
+from imagine_bench.report.data import collect
+from imagine_bench.report.words import percent, signed_percent
 from imagine_bench.results import BenchResult
 
 
@@ -151,7 +152,7 @@ def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
 def test_markdown_agrees_with_the_tables(result: BenchResult, folder: Path) -> None:
     markdown = (folder / "report.md").read_text(encoding="utf-8")
     table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in markdown.splitlines() if line.startswith("|")]
-    titles = {agent: report_words.agent_words(agent).title for agent in result.protocol.agents}
+    titles = {agent: words.agent_words(agent).title for agent in result.protocol.agents}
     seeds = {(row[0], row[1]): row[2:] for row in table if len(row) == 5 and row[1].isdigit()}
     for agent, title in titles.items():
         for index, seed in enumerate(result.protocol.seeds):
@@ -212,10 +213,10 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     result = bench_result(
         tmp_path, protocol=Protocol(task="arrow_puzzle", preset="smoke", seeds=(0,), budgets=(10, 20))
     )
-    data = report_data.collect(result)
+    data = collect(result)
     assert all(score.over == "episodes" for scores in data.scores.values() for score in scores.values())
     assert all(math.isnan(row.gain.low) for budgets in data.comparisons.values() for row in budgets.values())
-    assert "one seed says nothing about how much of that is luck" in " ".join(report_words.answers(data))
+    assert "one seed says nothing about how much of that is luck" in " ".join(words.answers(data))
     write_report(result)
 
 
@@ -248,7 +249,7 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 )
 def test_the_answer_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
     changed = shifted(shifted(result, "dqn", [100, 102, 104]), "imagination", successes)
-    answers = report_words.answers(report_data.collect(changed))
+    answers = words.answers(collect(changed))
     (verdict,) = (answer for answer in answers if answer.startswith("“imagination” "))
     assert sentence in verdict
     difference = signed_percent((sum(successes) / 3 - 102) / 200).lstrip("+\u2212")
@@ -268,10 +269,10 @@ def test_summary_table_for_the_terminal(result: BenchResult) -> None:
 
 
 def test_learning_cost_counts_every_step(result: BenchResult) -> None:
-    timing = report_data.collect(result).timing["imagination"]
+    timing = collect(result).timing["imagination"]
     assert timing.env_steps == 3 * 6000
     assert timing.learner_cpu_s == pytest.approx(0.022 * 3 * 6000)
-    assert math.isnan(report_data.collect(result).timing["random"].learner_cpu_s)
+    assert math.isnan(collect(result).timing["random"].learner_cpu_s)
 
 
 def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) -> None:

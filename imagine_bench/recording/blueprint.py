@@ -6,7 +6,7 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from imagine_bench.recording_scene import ROOT
+from imagine_bench.recording.scene import ROOT
 
 _EYE_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
 """Beside the human's hand, across the table from the arm: neither hides the objects."""

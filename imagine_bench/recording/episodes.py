@@ -26,8 +26,8 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.files import make_folder
 from imagine_bench.interfaces import Agent, Frame, Imaginer, Motion, Observation, SceneReader, TaskSpec, ValueReader
 from imagine_bench.pictures import png, rollout_strip
-from imagine_bench.recording_blueprint import blueprint
-from imagine_bench.recording_scene import entity_name, extent_m, log_motion, log_shapes
+from imagine_bench.recording.blueprint import blueprint
+from imagine_bench.recording.scene import entity_name, extent_m, log_motion, log_shapes
 from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed
 

@@ -11,12 +11,12 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from imagine_bench import report_plots, report_words
 from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.pictures import first_cut, png, rollout_strip
-from imagine_bench.report_data import ReportData, collect, results_csv, summary_csv
-from imagine_bench.report_encoder import encoder_view
-from imagine_bench.report_words import agent_words, percent, score_text
+from imagine_bench.report import plots, words
+from imagine_bench.report.data import ReportData, collect, results_csv, summary_csv
+from imagine_bench.report.encoder import encoder_view
+from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
 
 SHOWN_ROLLOUTS = 3
@@ -58,18 +58,18 @@ def write_report(result: BenchResult) -> Path:
     """
     folder = make_folder(result.folder / "report")
     data = collect(result)
-    plots = report_plots.all_plots(data)
+    drawn = plots.all_plots(data)
     strips = _strips(data)
     encoder = encoder_view(result)
     picture = encoder.picture.read_bytes() if encoder and encoder.picture else b""
     context = {
         **_words(data),
-        "plots": {plot.name: plot for plot in plots},
+        "plots": {plot.name: plot for plot in drawn},
         "strips": strips,
         "encoder": encoder,
         "encoder_picture": base64.b64encode(picture).decode(),
     }
-    files = {f"{plot.name}.png": plot.png for plot in plots} | {f"{strip.name}.png": strip.png for strip in strips}
+    files = {f"{plot.name}.png": plot.png for plot in drawn} | {f"{strip.name}.png": strip.png for strip in strips}
     if picture:
         files["encoder.png"] = picture
     files["results.csv"] = results_csv(result).encode()
@@ -100,7 +100,7 @@ def summary_table(result: BenchResult) -> str:
         f"{protocol.execution}, {protocol.appearance}, {len(protocol.seeds)} seed(s) x "
         f"{protocol.evaluation_episodes} test episodes"
     )
-    return "\n".join([title, "", *_aligned(rows), "", *report_words.answers(data)])
+    return "\n".join([title, "", *_aligned(rows), "", *words.answers(data)])
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
@@ -127,8 +127,8 @@ def _words(data: ReportData) -> dict[str, Any]:
     return {
         "data": data,
         "protocol": protocol,
-        "question": report_words.question(data),
-        "answers": report_words.answers(data),
+        "question": words.question(data),
+        "answers": words.answers(data),
         "interval_words": _interval_words(data),
         "thesis_only": _thesis_only(data),
         "seed_index": {seed: index for index, seed in enumerate(protocol.seeds)},
@@ -218,19 +218,19 @@ def _relative(path: Path, folder: Path) -> str:
 
 def _render(template: str, context: dict[str, Any]) -> str:
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("imagine_bench"),
+        loader=jinja2.PackageLoader("imagine_bench.report"),
         autoescape=template.endswith(".html.j2"),
         trim_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
     environment.globals.update(
         percent=percent,
-        signed=report_words.signed_percent,
-        estimate=report_words.estimate_text,
+        signed=words.signed_percent,
+        estimate=words.estimate_text,
         score_text=score_text,
         thesis_text=_thesis_text,
         seconds=_seconds,
         words=agent_words,
-        color=report_plots.color,
+        color=plots.color,
     )
     return environment.get_template(template).render(context)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from imagine_bench.report_data import BASE_AGENT, Comparison, ReportData, Score
+from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.statistics import Estimate
 
 FEW_SEEDS = 5

@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from imagine_bench.report_data import ReportData
-from imagine_bench.report_words import agent_words
+from imagine_bench.report.data import ReportData
+from imagine_bench.report.words import agent_words
 
 _INK = "#2b2b2f"  # in the SVG this becomes the page's own text colour
 _COLORS = {  # Okabe and Ito's palette
