@@ -180,14 +180,14 @@ def test_unknown_names_are_named(tmp_path: Path) -> None:
 
 def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ArtefactError, match=r"No recording .*none\.rrd"):
-        recording.open_in_viewer(tmp_path / "none.rrd")
+        episodes.open_in_viewer(tmp_path / "none.rrd")
     there = tmp_path / "there.rrd"
     there.write_bytes(b"")
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(SetupError, match=r"No display here .* run 'rerun there.rrd'"):
-        recording.open_in_viewer(there)
+        episodes.open_in_viewer(there)
 
 
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
