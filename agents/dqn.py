@@ -6,11 +6,11 @@ from imagine_bench.interfaces import AgentContext
 
 from .learner import Learner
 from .perception import load_perception, prepare_torch
-from .presets import resolve
+from .presets import settings_of
 
 
 def make(context: AgentContext) -> Learner:
     """The ``dqn`` agent."""
-    settings = resolve(context.preset, context.overrides)
+    settings = settings_of(context)
     device = prepare_torch(context.device)
     return Learner(load_perception(context), context.n_actions, settings, context.seeds, device)

@@ -65,7 +65,7 @@ def imagine_step(
     """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
     samples = model.predict(z, action, weights)  # [T, N, ...]
     next_z = mdn.sample(mdn.average(samples), temperature, generator)
-    reward, p_terminated = model.assess(next_z)
+    reward, p_terminated = model.assess(z, action, next_z)
     return Imagined(next_z, reward, p_terminated, samples)
 
 

@@ -15,7 +15,7 @@ from imagine_bench.interfaces import AgentContext, Frame, ImaginedRollout
 from .imagination import TERMINAL, Imagination, Imagined, imagine_step
 from .learner import Learner
 from .perception import load_perception, prepare_torch
-from .presets import resolve
+from .presets import settings_of
 from .uncertainty import decompose
 
 
@@ -83,7 +83,7 @@ class ImaginingLearner(Learner):
 
 
 def _make(context: AgentContext, *, filtered: bool) -> ImaginingLearner:
-    settings = resolve(context.preset, context.overrides)
+    settings = settings_of(context)
     device, perception = prepare_torch(context.device), load_perception(context)
     imagination = Imagination(
         perception.latent_size,

@@ -1,6 +1,7 @@
-"""Named presets of the learners' settings, and single settings replaced by dotted name.
+"""Families of settings, their named presets, and single settings replaced by dotted name.
 
-A preset is nothing but its deviations from the thesis, each with its reason; the report prints them.
+A family is the settings of one chapter of the thesis; a task names the one that it is measured with. A preset is
+nothing but its deviations from the family's thesis values, each with its reason.
 """
 
 from __future__ import annotations
@@ -11,57 +12,17 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.interfaces import AgentContext
 
+from .assessment import INPUTS
+from .chapter_3 import CHAPTER_3
+from .chapter_5 import CHAPTER_5
+from .family import Family
 from .settings import Settings
 from .uncertainty import reduction
 
-
-@dataclass(frozen=True, slots=True)
-class Deviation:
-    """A value that is not the thesis', and why."""
-
-    value: Any
-    reason: str
-
-
-_QUICK: dict[str, Deviation] = {
-    "model.dynamics_hidden": Deviation(
-        (512,), "shallow and wide generalises: 80 % of unseen transitions right after 500 episodes, 2 x 256: 52 %"
-    ),
-    "model.components": Deviation(2, "the rules are deterministic; two components cost less than five"),
-    "model.reward_hidden": Deviation((256, 256), "CPU time: 3 x 512 is most of the arithmetic of the thesis' model"),
-    "model.termination_hidden": Deviation((128, 128), "CPU time: a third of the arithmetic of 2 x 256"),
-    "model.dropout": Deviation(0.25, "at 50 % the dynamics are right on 42 % of transitions, at 25 % on 64 %"),
-    "model.learning_rate": Deviation(
-        2e-3, "fewer updates a step want larger ones (measured with the whole model, not alone)"
-    ),
-    "model.updates_per_step": Deviation(3, "CPU time: with the batch, 21 times fewer rows a real step"),
-    "model.batch_size": Deviation(128, "CPU time; see updates_per_step"),
-    "model.predict_change": Deviation(True, "a macro-action moves one cube: 64 % of transitions right, 43 % without"),
-    "model.sigma_floor": Deviation(0.2, "narrower components stop learning of the transitions they miss"),
-    "model.gradient_clip": Deviation(10.0, "the likelihood of narrow components has steep walls"),
-    "controller.epsilon_decay": Deviation(
-        0.003, "0.03 ends exploration after 100 episodes; 64 % against 58 % after 1000, but 28 % against 37 % after 750"
-    ),
-    "imagination.start_episode": Deviation(300, "the quick model is right early; 1000 would leave nothing to compare"),
-    "imagination.temperature": Deviation(0.0, "sampled latents leave the manifold that the networks know"),
-    "imagination.exploration": Deviation(0.2, "a greedy rollout repeats the real actions"),
-    "imagination.weight_samples": Deviation(10, "CPU time; the filter needs a rank, not a precise variance"),
-    "imagination.reduction": Deviation("max", "0.3 on the sum of 24 latents keeps one in ten, on the mean everything"),
-}
-
-_SMOKE: dict[str, Deviation] = {
-    **_QUICK,
-    "model.updates_per_step": Deviation(1, "shows that every part works, within a minute"),
-    "imagination.start_episode": Deviation(10, "imagination must happen within a few dozen episodes"),
-}
-
-PRESETS: dict[str, dict[str, Deviation]] = {
-    "smoke": _SMOKE,
-    "quick": _QUICK,
-    "thesis": {},
-    "full": {},
-}
+FAMILIES: dict[str, Family] = {"chapter_3": CHAPTER_3, "chapter_5": CHAPTER_5}
+"""What a TaskSpec may name as its settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,26 +70,39 @@ def flatten(settings: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def resolve(preset: str, overrides: Mapping[str, Any]) -> Settings:
+def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> Settings:
     """The settings of a preset, with single ones replaced.
 
     Args:
-        preset: A name of :data:`PRESETS`.
+        preset: A preset of the family.
         overrides: Values by dotted name, such as ``{"controller.discount": 0.9}``.
+        family: A name of :data:`FAMILIES`.
 
     Raises:
-        UnknownNameError: No such preset or setting; the message lists what exists.
+        UnknownNameError: No such family, preset or setting; the message lists what exists.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    deviations = PRESETS[require_known("preset", preset, PRESETS)]
+    chosen = FAMILIES[require_known("settings family", family, FAMILIES)]
+    deviations = chosen.presets[require_known("preset", preset, chosen.presets)]
     values = {name: deviation.value for name, deviation in deviations.items()}
-    settings = _with_values(Settings(), {**values, **overrides})
+    settings = _with_values(chosen.thesis, {**values, **overrides})
     _require_ranges(settings)
     return settings
 
 
+def settings_of(context: AgentContext) -> Settings:
+    """The settings that an agent is to be built with.
+
+    Raises:
+        UnknownNameError: The context names a family, preset or setting that does not exist.
+        InvalidValueError: A value of the wrong type or out of its range.
+    """
+    return resolve(context.preset, context.overrides, context.settings)
+
+
 def _require_ranges(settings: Settings) -> None:
     reduction(settings.imagination.reduction)
+    require_known("assessment input", settings.model.assessment_input, INPUTS)
     for name, value in flatten(settings).items():
         allowed = _RANGES.get(name, _COUNT)
         numbers = value if isinstance(value, tuple) else (value,)

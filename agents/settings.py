@@ -1,6 +1,7 @@
-"""Every hyperparameter of the learners, with its unit and its source. The defaults are the thesis' values.
+"""Every hyperparameter of the learners, with its unit and its source. The defaults are the thesis' values of chapter 5.
 
-A preset is a list of deviations from them, each beside its reason; ``thesis`` and ``full`` deviate in nothing.
+Another chapter's values are a family of settings (:mod:`.chapter_3`). A preset is a list of deviations from a family's
+values, each beside its reason; ``thesis`` and ``full`` deviate in nothing.
 """
 
 from __future__ import annotations
@@ -17,23 +18,27 @@ class WorldModelSettings:
         components: Gaussians in its mixture, K.
         reward_hidden: Units a hidden layer of the reward network.
         termination_hidden: Units a hidden layer of the termination network.
-        dropout: Probability of dropping a hidden unit, the same in the three networks; [0, 1).
+        shared_hidden: Units a hidden layer of one network with both outputs, instead of the two (thesis 3.2.2).
+        assessment_input: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
+        dropout: Probability of dropping a hidden unit, the same in every network; [0, 1).
         learning_rate: Of Adam (thesis 3.2.2: 1e-3).
-        max_norm: Largest norm of the incoming weights of a unit.
+        max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
         updates_per_step: Model updates a real step, N_E.
         batch_size: Transitions an update.
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
-        gradient_clip: Largest gradient norm of each of the three networks; None clips nothing.
+        gradient_clip: Largest gradient norm of each network; None clips nothing.
     """
 
     dynamics_hidden: tuple[int, ...] = (256, 256, 256)
     components: int = 5
     reward_hidden: tuple[int, ...] = (512, 512, 512)
     termination_hidden: tuple[int, ...] = (256, 256)
+    shared_hidden: tuple[int, ...] = ()
+    assessment_input: str = "next_state"
     dropout: float = 0.5
     learning_rate: float = 1e-3
-    max_norm: float = 3.0
+    max_norm: float | None = 3.0
     updates_per_step: int = 16
     batch_size: int = 512
     predict_change: bool = False

@@ -1,7 +1,8 @@
 """The environment model: a mixture density network for the dynamics, and what the next state means (thesis 5.2.3).
 
-``p(z' | z, a)`` says where a macro-action leads, ``r(z')`` what it earns and ``d(z')`` whether the episode ends there.
-The three networks share no weights; one backward pass through the sum of their losses trains them as three would.
+``p(z' | z, a)`` says where a macro-action leads; :mod:`.assessment` what it earns and whether the episode ends there.
+Networks share no weights (but reward and termination, where they have one trunk); one backward pass through the sum of
+the losses trains them all.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch.nn import functional
 from imagine_bench.errors import DivergedError
 
 from . import mixture as mdn
+from .assessment import Assessment
 from .flat_adam import FlatAdam
 from .layers import Masks, MemberMLP, clip_unit_norms
 from .memory import Batch
@@ -55,15 +57,11 @@ class WorldModel(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
-
-        def network(n_in: int, hidden: tuple[int, ...], n_out: int) -> MemberMLP:
-            return MemberMLP((n_in, *hidden, n_out), members=_MEMBERS, dropout=settings.dropout, generator=generator)
-
         outputs = mdn.output_size(settings.components, latent_size)
-        self.dynamics = network(latent_size + n_actions, settings.dynamics_hidden, outputs)
-        self.reward = network(latent_size, settings.reward_hidden, 1)
-        self.termination = network(latent_size, settings.termination_hidden, 1)
-        self.networks = (self.dynamics, self.reward, self.termination)
+        sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
+        self.dynamics = MemberMLP(sizes, members=_MEMBERS, dropout=settings.dropout, generator=generator)
+        self.assessment = Assessment(latent_size, n_actions, settings, generator)
+        self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)  # type: ignore[assignment]
         self.optimiser = FlatAdam(
             self.networks, learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
         )
@@ -78,12 +76,11 @@ class WorldModel(nn.Module):
         return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
 
     def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean losses of the three networks on one batch, under fresh dropout masks."""
+        """Mean losses of dynamics, reward and termination on one batch, under fresh dropout masks."""
         rows = len(batch.action)
-        next_z = batch.next_z.unsqueeze(0)  # [E, N, Z]
         mixture = self._mixture(batch.z, batch.action, self.dynamics.draw_masks(rows, dropout))
-        reward = self.reward(next_z, self.reward.draw_masks(rows, dropout)).view(-1)
-        logit = self.termination(next_z, self.termination.draw_masks(rows, dropout)).view(-1)
+        masks = self.assessment.draw_masks(rows, dropout)
+        reward, logit = self.assessment(batch.z, batch.action, batch.next_z, masks)
         return (
             -mdn.log_likelihood(mixture, batch.next_z).mean(),
             log_cosh(reward - batch.reward).mean(),
@@ -91,7 +88,7 @@ class WorldModel(nn.Module):
         )
 
     def update(self, batch: Batch, dropout: torch.Generator) -> ModelLosses:
-        """One step of Adam on the three networks, then the max-norm constraint.
+        """One step of Adam on all networks, then the max-norm constraint.
 
         Raises:
             DivergedError: A loss is NaN or infinite; the weights are left as they were.
@@ -101,8 +98,9 @@ class WorldModel(nn.Module):
         if not all(map(math.isfinite, (losses.dynamics, losses.reward, losses.termination))):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
         self.optimiser.step(torch.stack(terms).sum())
-        for network in self.networks:
-            clip_unit_norms(network, self.settings.max_norm)
+        if self.settings.max_norm is not None:
+            for network in self.networks:
+                clip_unit_norms(network, self.settings.max_norm)
         return losses
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
@@ -133,7 +131,7 @@ class WorldModel(nn.Module):
         )
 
     @torch.no_grad()
-    def assess(self, next_z: Tensor) -> tuple[Tensor, Tensor]:
-        """Predicted rewards and termination probabilities of next states (N, Z), without dropout: two of shape (N,)."""
-        states = next_z.unsqueeze(0)
-        return self.reward(states).view(-1), self.termination(states).view(-1).sigmoid()
+    def assess(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:
+        """Predicted rewards and termination probabilities of N transitions, without dropout: two of shape (N,)."""
+        reward, logit = self.assessment(z, action, next_z)
+        return reward, logit.sigmoid()

@@ -37,7 +37,7 @@ def plan(task: str, preset: str, *, encoder: str | None = None, **changes: objec
         SetupError: The device does not exist here.
     """
     wanted = protocol(task, preset, **changes)
-    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides))
+    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides), wanted.settings)
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
     if encoder is None and not any(registry.agent_entry(agent).needs_encoder for agent in wanted.agents):

@@ -145,6 +145,8 @@ class TaskSpec:
         facts: What the rules say, as a function (enumerating costs a moment).
         render_macrostates: Frames of macrostates, kinematic mode.
         reference: Name of the thesis' table in :mod:`imagine_bench.reference`, or None.
+        settings: Family of settings that learners take: the thesis' chapter that the task is from.
+        presets: What each protocol preset changes for this task: fields of the protocol by preset.
     """
 
     id: str
@@ -161,6 +163,8 @@ class TaskSpec:
     facts: Callable[[], RuleFacts]
     render_macrostates: RenderMacrostates
     reference: str | None = None
+    settings: str = "chapter_5"
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def n_actions(self) -> int:
@@ -177,7 +181,8 @@ class AgentContext:
         preprocessing: Name of the task's declared observation preprocessing.
         encoder: The encoder artefact (``.safetensors``), or None for agents that need none.
         seeds: The agent's node of the seed tree.
-        preset: Name of the settings preset (``"smoke"``, ``"quick"``, ``"thesis"``, ``"full"``).
+        settings: Name of the settings family, as the task names it.
+        preset: Name of the family's preset (``"smoke"``, ``"quick"``, ``"thesis"``, ``"full"``).
         overrides: Single settings that replace the preset's, by dotted name.
         device: A torch device name, ``"cpu"`` or ``"cuda"``.
         optimal_action: The rules' optimal action, only for agents registered as privileged; None for every other.
@@ -187,6 +192,7 @@ class AgentContext:
     preprocessing: str
     encoder: Path | None
     seeds: SeedTree
+    settings: str = "chapter_5"
     preset: str = "quick"
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"

@@ -11,7 +11,7 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
-from imagine_bench.registry import agent_entry, task_entry
+from imagine_bench.registry import agent_entry, task, task_entry
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -25,6 +25,7 @@ class Protocol:
     Attributes:
         task: Registered task.
         preset: Name of this protocol and of the agents' settings preset.
+        settings: Family of settings that the preset belongs to, as the task names it.
         agents: Registered agents, in the order of the report.
         seeds: One training run a seed and agent; each in [0, 2**24).
         budgets: Real training episodes at which the agent is evaluated, ascending.
@@ -40,6 +41,7 @@ class Protocol:
 
     task: str
     preset: str
+    settings: str = "chapter_5"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
     budgets: tuple[int, ...] = (100, 250, 500, 1000)
@@ -100,19 +102,22 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
 }
-"""What each preset changes: ``smoke`` shows that everything works, ``quick`` is the default, ``thesis`` is tables
-5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the thesis' own spreads)."""
+"""What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
+default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
+thesis' own spreads)."""
 
 
-def protocol(task: str, preset: str = "quick", **changes: Any) -> Protocol:
-    """The protocol of a preset, with ``changes`` to single fields.
+def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
+    """The protocol of a preset as the task has it, with ``changes`` to single fields.
 
     Raises:
         UnknownNameError: Unknown task, preset, agent, appearance or execution.
         InvalidValueError: A value out of range.
     """
     require_known("preset", preset, PRESETS)
-    return Protocol(task=task, preset=preset, **{**PRESETS[preset], **changes})
+    spec = task(task_name)
+    values = {"settings": spec.settings, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    return Protocol(task=task_name, preset=preset, **values)
 
 
 def _require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:

@@ -193,6 +193,7 @@ class _Run:
             preprocessing=self.task.preprocessing,
             encoder=self.spec.encoder if self.entry.needs_encoder else None,
             seeds=self.seeds.child("agent"),  # the same for every agent: runs of one seed are pairs
+            settings=protocol.settings,
             preset=protocol.preset,
             overrides=dict(protocol.overrides),
             device=protocol.device,

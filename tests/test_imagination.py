@@ -37,7 +37,7 @@ class CountingModel:
         means[..., 0] += spread
         return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
 
-    def assess(self, next_z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def assess(self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return 10.0 * next_z[:, 1], (next_z[:, 1] == self.end_at).float()
 
 

@@ -6,10 +6,17 @@ import dataclasses
 from typing import Any
 
 import pytest
-from imagine_bench.agents.presets import PRESETS, flatten, resolve
+from imagine_bench.agents.presets import FAMILIES, flatten
+from imagine_bench.agents.presets import resolve as resolve_in
 from imagine_bench.agents.settings import Settings
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+
+PRESETS = [(family, preset) for family in FAMILIES for preset in FAMILIES[family].presets]
+
+
+def resolve(preset: str, overrides: dict[str, Any]) -> Settings:
+    return resolve_in(preset, overrides, "chapter_5")
 
 
 def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None:
@@ -41,13 +48,41 @@ def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None
     assert {name: flat[name] for name in printed} == printed
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_deviation_is_applied_and_has_a_reason(preset: str) -> None:
-    flat, thesis = flatten(resolve(preset, {})), flatten(Settings())
-    for name, deviation in PRESETS[preset].items():
+def test_chapter_3_has_the_numbers_of_section_3_2_2() -> None:
+    assert resolve_in("thesis", {}, "chapter_3") == resolve_in("full", {}, "chapter_3")
+    flat = flatten(resolve_in("thesis", {}, "chapter_3"))
+    printed = {
+        "model.dynamics_hidden": (256, 256, 256),
+        "model.components": 24,
+        "model.shared_hidden": (512, 256),
+        "model.assessment_input": "next_state",
+        "model.learning_rate": 1e-3,
+        "model.updates_per_step": 4,
+        "model.batch_size": 64,
+        "controller.hidden": (512, 256),
+        "controller.learning_rate": 2.5e-4,
+        "controller.batch_size": 64,
+        "controller.updates_per_step": 1,
+        "controller.epsilon_min": 0.001,
+        "controller.epsilon_max": 0.8,
+        "controller.epsilon_decay": 0.03,
+        "imagination.temperature": 1.0,
+    }
+    assert {name: flat[name] for name in printed} == printed
+
+
+@pytest.mark.parametrize(("family", "preset"), PRESETS)
+def test_every_deviation_is_applied_and_has_a_reason(family: str, preset: str) -> None:
+    flat, thesis = flatten(resolve_in(preset, {}, family)), flatten(FAMILIES[family].thesis)
+    for name, deviation in FAMILIES[family].presets[preset].items():
         assert flat[name] == deviation.value != thesis[name]
         assert len(deviation.reason) > 20
-    assert {name for name in flat if flat[name] != thesis[name]} == set(PRESETS[preset])
+    assert {name for name in flat if flat[name] != thesis[name]} == set(FAMILIES[family].presets[preset])
+
+
+def test_an_unknown_family_lists_what_exists() -> None:
+    with pytest.raises(UnknownNameError, match=r"No settings family 'chapter_4'.* Known: chapter_3, chapter_5"):
+        resolve_in("quick", {}, "chapter_4")
 
 
 def test_an_override_replaces_one_value_of_the_preset() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.protocol import PRESETS, Protocol, protocol
-from imagine_bench.registry import TASKS
+from imagine_bench.registry import TASKS, task
 from imagine_bench.results import BenchResult, Checkpoint, RunResult
 
 
@@ -23,7 +23,8 @@ def test_every_preset_survives_json_with_its_hash(task, preset):
 def test_any_change_changes_the_hash():
     base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
     changes = {
-        "task": "arrow_puzzle_hard", "preset": "smoke", "agents": ("dqn",), "seeds": (5,), "budgets": (7,),
+        "task": "arrow_puzzle_hard", "preset": "smoke", "settings": "chapter_3", "agents": ("dqn",),
+        "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "device": "cuda",
@@ -31,6 +32,15 @@ def test_any_change_changes_the_hash():
     assert set(changes) >= {field.name for field in dataclasses.fields(Protocol)}
     hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
     assert len(hashes | {base.hash}) == len(changes) + 1
+
+
+def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_word(monkeypatch):
+    own = {"quick": {"seeds": (7, 8), "budgets": (5,)}}
+    spec = dataclasses.replace(task("arrow_puzzle"), settings="chapter_3", presets=own)
+    monkeypatch.setattr("imagine_bench.protocol.task", lambda name: spec)
+    wanted = protocol("arrow_puzzle", "quick", budgets=(6,))
+    assert (wanted.settings, wanted.seeds, wanted.budgets) == ("chapter_3", (7, 8), (6,))
+    assert protocol("arrow_puzzle", "smoke").seeds == PRESETS["smoke"]["seeds"]
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_it_learns_a_small_deterministic_chain(predict_change: bool) -> None:
         model.update(chain_batch(64, draws), dropout)
     test = chain_batch(100, torch.Generator().manual_seed(3))
     predicted = mdn.mean(mdn.average(model.predict(test.z, test.action, None)))
-    reward, p_terminated = model.assess(test.next_z)
+    reward, p_terminated = model.assess(test.z, test.action, test.next_z)
     assert (predicted - test.next_z).abs().max() < 0.25  # states are 0.67 apart and more
     assert (reward - test.reward).abs().max() < 0.15
     assert ((p_terminated > 0.5).float() == test.terminated).all()
@@ -62,9 +62,40 @@ def test_one_backward_pass_trains_three_independent_networks() -> None:
     batch = chain_batch(16, torch.Generator().manual_seed(1))
     one.update(batch, torch.Generator().manual_seed(2))
     other.update(dataclasses.replace(batch, reward=batch.reward * -7.0), torch.Generator().manual_seed(2))
-    for name, same in (("dynamics", True), ("termination", True), ("reward", False)):
-        first, second = (getattr(model, name).weights[0] for model in (one, other))
+    for index, (name, same) in enumerate((("dynamics", True), ("reward", False), ("termination", True))):
+        first, second = (model.networks[index].weights[0] for model in (one, other))
         assert torch.equal(first, second) is same, name
+
+
+def test_a_shared_trunk_is_one_network_that_both_losses_train() -> None:
+    one, other = make(shared_hidden=(16, 8)), make(shared_hidden=(16, 8))
+    assert [network.sizes for network in one.networks[1:]] == [(Z, 16, 8, 2)]
+    batch = chain_batch(16, torch.Generator().manual_seed(1))
+    one.update(batch, torch.Generator().manual_seed(2))
+    other.update(dataclasses.replace(batch, reward=batch.reward * -7.0), torch.Generator().manual_seed(2))
+    assert torch.equal(one.dynamics.weights[0], other.dynamics.weights[0])
+    assert not torch.equal(one.networks[1].weights[0], other.networks[1].weights[0])
+
+
+def aliased_batch(count: int, generator: torch.Generator) -> Batch:
+    """Both actions lead to state 0; action 1 earns 1 and ends, action 0 neither: the next state cannot tell them."""
+    action = torch.randint(A, (count,), generator=generator)
+    state = torch.randint(1, N_STATES, (count,), generator=generator)
+    return Batch(CODES[state], action, action.float(), CODES[torch.zeros_like(state)], action.float())
+
+
+@pytest.mark.parametrize(("shared", "told_apart"), [((), True), ((32,), True), ((32,), False)])
+def test_only_a_transition_tells_apart_what_one_next_state_hides(shared: tuple[int, ...], told_apart: bool) -> None:
+    read = "transition" if told_apart else "next_state"
+    model = make(dropout=0.0, shared_hidden=shared, assessment_input=read, learning_rate=5e-3)
+    draws, dropout = torch.Generator().manual_seed(1), torch.Generator().manual_seed(2)
+    for _ in range(200):
+        model.update(aliased_batch(64, draws), dropout)
+    test = aliased_batch(100, torch.Generator().manual_seed(3))
+    reward, p_terminated = model.assess(test.z, test.action, test.next_z)
+    right = (p_terminated > 0.5).float() == test.terminated
+    assert bool(right.all()) is told_apart
+    assert bool(((reward - test.reward).abs() < 0.1).all()) is told_apart
 
 
 def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
@@ -86,7 +117,7 @@ def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
     model = make()
     z, action = CODES[:4], torch.zeros(4, dtype=torch.int64)
     assert torch.equal(model.predict(z, action, None).means, model.predict(z, action, None).means)
-    assert torch.equal(model.assess(z)[0], model.assess(z)[0])
+    assert torch.equal(model.assess(z, action, z)[0], model.assess(z, action, z)[0])
     batch, generator = chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2)
     first, second = model.losses(batch, generator), model.losses(batch, generator)
     assert all(not torch.equal(a, b) for a, b in zip(first, second, strict=True))
@@ -98,6 +129,12 @@ def test_max_norm_holds_after_an_update() -> None:
     for network in model.networks:
         for weight in network.weights:
             assert weight.norm(dim=1).max() <= 0.5 + 1e-6
+
+
+def test_without_a_max_norm_weights_grow_as_they_like() -> None:
+    model = make(max_norm=None, learning_rate=1.0)
+    model.update(chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
+    assert all(network.weights[0].norm(dim=1).max() > 0.5 for network in model.networks)
 
 
 def test_a_loss_that_is_no_number_stops_the_run() -> None:

@@ -1,0 +1,64 @@
+"""What a transition earns and whether it ends the episode: the r- and d-networks (thesis 3.1.2, 5.2.3).
+
+The thesis reads both from the next state alone, ``r(z')`` and ``d(z')``. Where a right and a wrong macro-action lead to
+pictures that are alike, that cannot tell the two apart; reading the whole transition can.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from imagine_bench.errors import require_known
+
+from .layers import Masks, MemberMLP
+from .settings import WorldModelSettings
+
+INPUTS = ("next_state", "transition")
+"""What reward and termination may be read from: z', or z, one-hot a and z'."""
+_MEMBERS = 1
+
+
+class Assessment(nn.Module):
+    """Reward and termination networks, or one network with both outputs.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes, and what is read.
+        generator: Draws the initial weights; its device is the networks'.
+
+    Raises:
+        UnknownNameError: Inputs that are none of :data:`INPUTS`.
+    """
+
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self._transition = require_known("assessment input", settings.assessment_input, INPUTS) == "transition"
+        n_in = 2 * latent_size + n_actions if self._transition else latent_size
+        outputs = (settings.reward_hidden, 1), (settings.termination_hidden, 1)
+        if settings.shared_hidden:
+            outputs = ((settings.shared_hidden, 2),)
+        self.networks = nn.ModuleList(
+            MemberMLP((n_in, *hidden, n_out), members=_MEMBERS, dropout=settings.dropout, generator=generator)
+            for hidden, n_out in outputs
+        )
+        self._one_hot = torch.eye(n_actions, device=generator.device)
+
+    def draw_masks(self, rows: int, dropout: torch.Generator) -> list[Masks | None]:
+        """Fresh dropout masks for ``rows`` transitions, one entry a network."""
+        return [network.draw_masks(rows, dropout) for network in self.networks]
+
+    def forward(
+        self, z: Tensor, action: Tensor, next_z: Tensor, masks: list[Masks | None] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Rewards and termination logits of N transitions, without ``masks`` deterministic. Two of shape (N,)."""
+        read = torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._transition else next_z
+        drawn = [None] * len(self.networks) if masks is None else masks
+        outputs = [
+            network(read.unsqueeze(0), mask).squeeze(0) for network, mask in zip(self.networks, drawn, strict=True)
+        ]
+        reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [N, 2] to [N] and [N]
+        return reward, logit
