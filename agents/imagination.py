@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,6 +26,8 @@ from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
+_CALIBRATION = 64
+"""Real transitions whose epistemic variance a moving threshold is read from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,7 @@ class Imagined:
         next_z: Shape (N, Z).
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
-        samples: What each weight sample predicted, with leading axes (T, N).
+        samples: What each weight sample of each member predicted, with leading axes (E T, N).
     """
 
     next_z: Tensor
@@ -63,8 +66,8 @@ def imagine_step(
     generator: torch.Generator,
 ) -> Imagined:
     """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
-    samples = model.predict(z, action, weights)  # [T, N, ...]
-    next_z = mdn.sample(mdn.average(samples), temperature, generator)
+    samples = model.predict(z, action, weights)  # [E T, N, ...]
+    next_z = mdn.sample(mdn.average(samples, model.members), temperature, generator)
     reward, p_terminated = model.assess(z, action, next_z)
     return Imagined(next_z, reward, p_terminated, samples)
 
@@ -99,6 +102,7 @@ class Imagination:
         self.model = WorldModel(latent_size, n_actions, settings.model, self._generators["weights"])
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
         self._reduce = reduction(self.settings.reduction)
+        self.threshold = self.settings.threshold
 
     def learn(self, real: RealMemory) -> list[ModelLosses]:
         """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
@@ -115,21 +119,23 @@ class Imagination:
         """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
         if not self.filtered:
             return torch.ones_like(step.reward, dtype=torch.bool)
-        return self.score(decompose(step.samples).epistemic) <= self.settings.threshold
+        return self.score(decompose(step.samples).epistemic) <= self.threshold
 
-    def rollouts(self, controller: Controller, z: Tensor, epsilon: float) -> Counts:
-        """Imagine ``I_B`` rollouts from one state and store what the filter keeps.
+    def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
+        """Imagine ``I_B`` rollouts and store what the filter keeps.
 
         A rollout ends where the model says that the episode does, or with its first discarded transition.
 
         Args:
             controller: Chooses the actions, epsilon-greedily.
-            z: The state to start from. Shape (Z,).
+            current: The state the robot just acted in. Shape (Z,).
+            real: What really happened so far.
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
         settings, generator = self.settings, self._generators["rollouts"]
         weights = self.model.draw_weights(settings.weight_samples, self._generators["dropout"])
-        z, predicted, accepted = z.expand(settings.breadth, -1), 0, 0
+        self._move_threshold(real, weights)
+        z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):
             action = self._act(controller, z, max(epsilon, settings.exploration))
             step = imagine_step(self.model, z, action, weights, temperature=settings.temperature, generator=generator)
@@ -144,6 +150,20 @@ class Imagination:
             if len(z) == 0:
                 break
         return Counts(settings.breadth, predicted, accepted)
+
+    def _starts(self, current: Tensor, real: RealMemory) -> Tensor:
+        """Where this step's rollouts begin. Shape (I_B, Z)."""
+        if self.settings.start_states == "current":
+            return current.expand(self.settings.breadth, -1)
+        return real.sample(self.settings.breadth, self._generators["replay"]).z
+
+    def _move_threshold(self, real: RealMemory, weights: Masks | None) -> None:
+        """Let the threshold follow the model's doubt about what really happened, where the settings want that."""
+        quantile = self.settings.threshold_quantile
+        if self.filtered and quantile is not None:
+            known = real.sample(_CALIBRATION, self._generators["replay"])
+            doubts = self.score(decompose(self.model.predict(known.z, known.action, weights)).epistemic)
+            self.threshold = float(doubts.quantile(quantile))
 
     def _act(self, controller: Controller, z: Tensor, epsilon: float) -> Tensor:
         """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
@@ -160,11 +180,13 @@ class Imagination:
             **snapshot.prefixed("model", self.model.optimiser.arrays()),
             **snapshot.prefixed("memory", self.memory.arrays()),
             **snapshot.prefixed("generator", generators),
+            "threshold": np.array(self.threshold),
         }
 
     def load(self, arrays: snapshot.Arrays, added: int) -> None:
         """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
         self.model.optimiser.load(snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)
+        self.threshold = float(arrays["threshold"])
         for name, generator in self._generators.items():
             snapshot.load_generator(generator, arrays[f"generator/{name}"])

@@ -107,7 +107,7 @@ class Learner:
 
     def _imagine(self, imagination: Imagination, z: torch.Tensor) -> None:
         with self.meters.cpu_time("time/imagination_s"):
-            counts = imagination.rollouts(self.controller, z, self.epsilon)
+            counts = imagination.rollouts(self.controller, z, self.real, self.epsilon)
         self.meters.add("imagination/acceptance_rate", counts.accepted, counts.predicted)
         self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
 

@@ -89,10 +89,23 @@ def sample(mixture: Mixture, temperature: float, generator: torch.Generator) -> 
     return means + temperature * mixture.log_sigmas.gather(1, index).squeeze(1).exp() * noise
 
 
-def average(mixtures: Mixture) -> Mixture:
-    """Average coefficients, means and variances over the leading axis of weight samples (thesis 4.4)."""
-    return Mixture(
-        mixtures.log_weights.exp().mean(dim=0).log(),
-        mixtures.means.mean(dim=0),
-        0.5 * torch.exp(2.0 * mixtures.log_sigmas).mean(dim=0).log(),
-    )
+def average(mixtures: Mixture, members: int = 1) -> Mixture:
+    """Average coefficients, means and variances over weight samples (thesis 4.4), for each member of an ensemble.
+
+    Weight samples of one network describe the same components and are averaged one by one; those of different networks
+    do not, so an ensemble's prediction is all their components side by side, each member with the same share.
+
+    Args:
+        mixtures: With a leading axis of E T samples, member by member.
+        members: E.
+
+    Returns:
+        Mixtures without that axis, of E K components.
+    """
+
+    def mean_by_member(values: Tensor) -> tuple[Tensor, ...]:
+        return values.unflatten(0, (members, -1)).mean(dim=1).unbind(0)
+
+    weights = torch.cat(mean_by_member(mixtures.log_weights.exp()), dim=-1) / members  # [..., E K]
+    variances = torch.cat(mean_by_member(torch.exp(2.0 * mixtures.log_sigmas)), dim=-2)  # [..., E K, Z]
+    return Mixture(weights.log(), torch.cat(mean_by_member(mixtures.means), dim=-2), 0.5 * variances.log())

@@ -18,8 +18,8 @@ from .assessment import INPUTS
 from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
-from .settings import Settings
-from .uncertainty import reduction
+from .settings import START_STATES, Settings
+from .uncertainty import REDUCTIONS
 
 FAMILIES: dict[str, Family] = {"chapter_3": CHAPTER_3, "chapter_5": CHAPTER_5}
 """What a TaskSpec may name as its settings."""
@@ -56,8 +56,16 @@ _RANGES = {
     "imagination.temperature": _NOT_NEGATIVE,
     "imagination.exploration": _PROBABILITY,
     "imagination.threshold": _NOT_NEGATIVE,
+    "imagination.threshold_quantile": _PROBABILITY,
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
+
+_WORDS = {
+    "model.assessment_input": ("assessment input", INPUTS),
+    "imagination.start_states": ("start of imagined rollouts", START_STATES),
+    "imagination.reduction": ("uncertainty reduction", tuple(REDUCTIONS)),
+}
+"""What settings that are words are called and may be."""
 
 
 def flatten(settings: Any, prefix: str = "") -> dict[str, Any]:
@@ -101,9 +109,10 @@ def settings_of(context: AgentContext) -> Settings:
 
 
 def _require_ranges(settings: Settings) -> None:
-    reduction(settings.imagination.reduction)
-    require_known("assessment input", settings.model.assessment_input, INPUTS)
-    for name, value in flatten(settings).items():
+    flat = flatten(settings)
+    for name, (kind, known) in _WORDS.items():
+        require_known(kind, flat[name], known)
+    for name, value in flat.items():
         allowed = _RANGES.get(name, _COUNT)
         numbers = value if isinstance(value, tuple) else (value,)
         if any(type(number) in (int, float) and not allowed.holds(number) for number in numbers):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+START_STATES = ("current", "remembered")
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelSettings:
@@ -16,6 +18,8 @@ class WorldModelSettings:
     Attributes:
         dynamics_hidden: Units a hidden layer of the dynamics network.
         components: Gaussians in its mixture, K.
+        members: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble
+            (Lakshminarayanan et al. 2017); the thesis has one.
         reward_hidden: Units a hidden layer of the reward network.
         termination_hidden: Units a hidden layer of the termination network.
         shared_hidden: Units a hidden layer of one network with both outputs, instead of the two (thesis 3.2.2).
@@ -32,6 +36,7 @@ class WorldModelSettings:
 
     dynamics_hidden: tuple[int, ...] = (256, 256, 256)
     components: int = 5
+    members: int = 1
     reward_hidden: tuple[int, ...] = (512, 512, 512)
     termination_hidden: tuple[int, ...] = (256, 256)
     shared_hidden: tuple[int, ...] = ()
@@ -77,7 +82,9 @@ class ImaginationSettings:
 
     Attributes:
         start_episode: First training episode that imagines, I_start.
-        breadth: Rollouts from the current state a real step, I_B.
+        start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"remembered"``,
+            states drawn from the real memory.
+        breadth: Rollouts a real step, I_B.
         depth: Longest rollout in macro-actions, I_D.
         updates_per_step: Controller updates on imagined transitions a real step, N_I.
         temperature: Scale of the component's standard deviation when z' is drawn: 1 the thesis, 0 its mean.
@@ -85,9 +92,12 @@ class ImaginationSettings:
         weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
         reduction: How the epistemic variances of the latent dimensions become one: sum, mean or max.
         threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
+        threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
+            epistemic variance of transitions that really happened, a batch of them a real step.
     """
 
     start_episode: int = 1000
+    start_states: str = "current"
     breadth: int = 3
     depth: int = 10
     updates_per_step: int = 1
@@ -96,6 +106,7 @@ class ImaginationSettings:
     weight_samples: int = 50
     reduction: str = "sum"
     threshold: float = 0.3
+    threshold_quantile: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 ``p(z' | z, a)`` says where a macro-action leads; :mod:`.assessment` what it earns and whether the episode ends there.
 Networks share no weights (but reward and termination, where they have one trunk); one backward pass through the sum of
-the losses trains them all.
+the losses trains them all. The dynamics may be an ensemble of E networks, which a leading member axis trains as one.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from .layers import Masks, MemberMLP, clip_unit_norms
 from .memory import Batch
 from .mixture import Mixture
 from .settings import WorldModelSettings
-
-_MEMBERS = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +55,10 @@ class WorldModel(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
+        self.members = settings.members
         outputs = mdn.output_size(settings.components, latent_size)
         sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
-        self.dynamics = MemberMLP(sizes, members=_MEMBERS, dropout=settings.dropout, generator=generator)
+        self.dynamics = MemberMLP(sizes, members=self.members, dropout=settings.dropout, generator=generator)
         self.assessment = Assessment(latent_size, n_actions, settings, generator)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)  # type: ignore[assignment]
         self.optimiser = FlatAdam(
@@ -68,21 +67,21 @@ class WorldModel(nn.Module):
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
     def _mixture(self, z: Tensor, action: Tensor, masks: Masks | None) -> Mixture:
-        """``p(z' | z, a)`` of every row, (E N) of them."""
+        """``p(z' | z, a)`` of every row by every member of the ensemble, with leading axes (E, N)."""
         settings = self.settings
-        inputs = torch.cat([z, self._one_hot[action]], dim=-1).unsqueeze(0)  # [E, N, Z + A]
-        outputs = self.dynamics(inputs, masks).squeeze(0)  # [N, K (1 + 2 Z)]
+        inputs = torch.cat([z, self._one_hot[action]], dim=-1).expand(settings.members, -1, -1)  # [E, N, Z + A]
+        outputs = self.dynamics(inputs, masks)  # [E, N, K (1 + 2 Z)]
         mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
         return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
 
     def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean losses of dynamics, reward and termination on one batch, under fresh dropout masks."""
+        """Mean losses of dynamics (summed over members), reward and termination, under fresh dropout masks."""
         rows = len(batch.action)
         mixture = self._mixture(batch.z, batch.action, self.dynamics.draw_masks(rows, dropout))
         masks = self.assessment.draw_masks(rows, dropout)
         reward, logit = self.assessment(batch.z, batch.action, batch.next_z, masks)
         return (
-            -mdn.log_likelihood(mixture, batch.next_z).mean(),
+            -mdn.log_likelihood(mixture, batch.next_z).mean(dim=1).sum(),  # each member descends as if it were alone
             log_cosh(reward - batch.reward).mean(),
             functional.binary_cross_entropy_with_logits(logit, batch.terminated),
         )
@@ -104,12 +103,12 @@ class WorldModel(nn.Module):
         return losses
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
-        """Draw T weight samples of the dynamics: masks (E, T, H) that every state of a prediction shares."""
+        """Draw T weight samples of each member: masks (E, T, H) that every state of a prediction shares."""
         return self.dynamics.draw_masks(count, dropout)
 
     @torch.no_grad()
     def predict(self, z: Tensor, action: Tensor, weights: Masks | None) -> Mixture:
-        """``p(z' | z, a)`` under every weight sample, in one batched pass.
+        """``p(z' | z, a)`` under every weight sample of every member, in one batched pass.
 
         Args:
             z: Shape (N, Z).
@@ -117,15 +116,15 @@ class WorldModel(nn.Module):
             weights: From :meth:`draw_weights`; None drops nothing, as one sample.
 
         Returns:
-            Mixtures with leading axes (T, N).
+            Mixtures with leading axes (E T, N).
         """
         rows = len(z)
         samples = 1 if weights is None else weights[0].shape[1]
         masks = None if weights is None else tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
-        mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [T N, ...]
+        mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [E, T N, ...]
         return Mixture(
             *(
-                values.view(samples, rows, *values.shape[1:])
+                values.reshape(-1, rows, *values.shape[2:])
                 for values in (mixture.log_weights, mixture.means, mixture.log_sigmas)
             )
         )

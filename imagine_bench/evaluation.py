@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from imagine_bench.interfaces import Agent, Observation, Transition
-from imagine_bench.seeding import episode_seed
+from imagine_bench.seeding import Purpose, episode_seed
 
 Info = dict[str, Any]
 
@@ -78,10 +78,12 @@ class Tally:
     cpu_s: float = 0.0
     diagnostics: dict[str, float] = field(default_factory=dict)
 
-    def add_episode(self, env: gymnasium.Env[Any, Any], agent: Agent, *, privileged: bool) -> None:
-        """Play the next test episode greedily and count it; how many were played says which start it has."""
+    def add_episode(
+        self, env: gymnasium.Env[Any, Any], agent: Agent, *, privileged: bool, purpose: Purpose = "evaluation"
+    ) -> None:
+        """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
         start_s = time.process_time()
-        seed, success = episode_seed("evaluation", 0, self.episodes), False
+        seed, success = episode_seed(purpose, 0, self.episodes), False
         for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
             self.env_steps += 1
             self.return_sum += transition.reward

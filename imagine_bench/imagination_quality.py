@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.interfaces import ImaginedRollout, Imaginer, Rules, TaskSpec
 from imagine_bench.results import ComparedRollout, OpenLoop
-from imagine_bench.seeding import SeedTree
+from imagine_bench.seeding import Purpose, SeedTree
 
 EXAMPLES = 5
 """Greedy imagined rollouts kept with each run, with their real counterparts."""
@@ -40,7 +40,9 @@ class Question:
     rewards: NDArray[np.float64]
 
 
-def ask(spec: TaskSpec, *, starts: int, depth: int, appearance: str) -> tuple[Question, ...]:
+def ask(
+    spec: TaskSpec, *, starts: int, depth: int, appearance: str, purpose: Purpose = "evaluation"
+) -> tuple[Question, ...]:
     """The questions of the open-loop comparison: the same for every agent and seed.
 
     Args:
@@ -48,8 +50,9 @@ def ask(spec: TaskSpec, *, starts: int, depth: int, appearance: str) -> tuple[Qu
         starts: How many.
         depth: Imagined steps D of each.
         appearance: Appearance level of the start frames (kinematic mode).
+        purpose: What the answers are for; tuning has questions of its own.
     """
-    rng = SeedTree(0).child("evaluation", "open_loop", spec.id).generator()
+    rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
     alive = _alive(spec)
     candidates: list[State] = []
     while depth and not candidates:  # rules that cannot be kept alive as long are asked for less

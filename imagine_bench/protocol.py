@@ -12,6 +12,7 @@ from typing import Any
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.registry import agent_entry, task, task_entry
+from imagine_bench.seeding import TUNING_SEEDS, tunes
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -27,7 +28,8 @@ class Protocol:
         preset: Name of this protocol and of the agents' settings preset.
         settings: Family of settings that the preset belongs to, as the task names it.
         agents: Registered agents, in the order of the report.
-        seeds: One training run a seed and agent; each in [0, 2**24).
+        seeds: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing
+            settings and are tested on starts that no reported run meets; the two kinds never mix.
         budgets: Real training episodes at which the agent is evaluated, ascending.
         evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
         execution: ``"physics"`` or ``"kinematic"``.
@@ -63,6 +65,11 @@ class Protocol:
         require_known("device", self.device, DEVICES)
         _require_ascending("budgets", self.budgets, at_least=1)
         _require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
+        if len({tunes(seed) for seed in self.seeds}) > 1:
+            raise InvalidValueError(
+                f"seeds {self.seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
+                "reported ones; give them to separate benches."
+            )
         if not self.agents or len(set(self.agents)) != len(self.agents):
             raise InvalidValueError(f"agents {self.agents} must be at least one name, none of them twice.")
         if self.evaluation_episodes < 1:

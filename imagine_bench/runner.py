@@ -25,7 +25,7 @@ from imagine_bench.imagination_quality import Question, ask, examples, open_loop
 from imagine_bench.interfaces import AgentContext, Imaginer
 from imagine_bench.results import Checkpoint, ComparedRollout, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
-from imagine_bench.seeding import SeedTree, episode_seed
+from imagine_bench.seeding import SeedTree, episode_seed, exam
 
 IMAGINED_DEPTH = 10
 """Steps of the open-loop comparison, the thesis' I_D."""
@@ -124,7 +124,9 @@ class _Run:
         if counters.test is None:
             counters.test = Tally(diagnostics=self.agent.diagnostics())
         while counters.test.episodes < self.spec.protocol.evaluation_episodes:
-            counters.test.add_episode(self.env, self.agent, privileged=self.entry.privileged)
+            counters.test.add_episode(
+                self.env, self.agent, privileged=self.entry.privileged, purpose=exam(self.spec.seed)
+            )
             self._tell("testing")
             self._save_now_and_then()
         self._add_row(self._row(budget, counters.test))
@@ -158,7 +160,13 @@ class _Run:
     @functools.cached_property
     def _questions(self) -> tuple[Question, ...]:
         protocol = self.spec.protocol
-        return ask(self.task, starts=protocol.open_loop_starts, depth=IMAGINED_DEPTH, appearance=protocol.appearance)
+        return ask(
+            self.task,
+            starts=protocol.open_loop_starts,
+            depth=IMAGINED_DEPTH,
+            appearance=protocol.appearance,
+            purpose=exam(self.spec.seed),
+        )
 
     def _examples(self) -> tuple[ComparedRollout, ...]:
         if not isinstance(self.agent, Imaginer):

@@ -13,9 +13,11 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, require_known
 
-Purpose = Literal["training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording"]
+Purpose = Literal["training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning"]
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
 _SEED_BITS, _EPISODE_BITS = 24, 32
+TUNING_SEEDS = 1000
+"""Runs with a seed from here on are for choosing settings; reported runs have smaller ones."""
 
 
 def _key(name: str | int) -> int:
@@ -54,6 +56,16 @@ class SeedTree:
     def integer(self) -> int:
         """A seed in [0, 2**63) for libraries that take one integer, such as ``torch.Generator.manual_seed``."""
         return int(self.sequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def tunes(seed: int) -> bool:
+    """Whether a run of this seed is for choosing settings."""
+    return seed >= TUNING_SEEDS
+
+
+def exam(seed: int) -> Purpose:
+    """What a run of this seed is tested on: a run that tunes never meets an evaluation seed, and the reverse."""
+    return "tuning" if tunes(seed) else "evaluation"
 
 
 def episode_seed(purpose: Purpose, seed: int, episode: int) -> int:

@@ -8,12 +8,14 @@ import pytest
 import torch
 from imagine_bench.agents.controller import Controller
 from imagine_bench.agents.imagination import Imagination
+from imagine_bench.agents.memory import RealMemory
 from imagine_bench.agents.mixture import Mixture
 from imagine_bench.agents.settings import ImaginationSettings, Settings
 
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
+NOTHING_REAL = RealMemory(1, 2, CPU)
 T = 4
 
 
@@ -22,6 +24,8 @@ class CountingModel:
 
     The first latent dimension tells the rollouts apart by the action taken first.
     """
+
+    members = 1
 
     def __init__(self, *, doubt_at: int = -1, end_at: int = -1) -> None:
         self.doubt_at, self.end_at = doubt_at, end_at
@@ -56,7 +60,7 @@ def stored_counts(imagination: Imagination) -> list[float]:
 
 def test_rollouts_run_to_their_full_depth_in_closed_loop() -> None:
     imagination, controller = make(filtered=True, model=CountingModel())
-    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert dataclasses.astuple(counts) == (3, 30, 30)
     assert stored_counts(imagination) == sorted(3 * [float(c) for c in range(1, 11)])
     rows = imagination.memory.arrays()
@@ -66,7 +70,7 @@ def test_rollouts_run_to_their_full_depth_in_closed_loop() -> None:
 
 def test_a_predicted_end_is_stored_and_ends_the_rollout() -> None:
     imagination, controller = make(filtered=True, model=CountingModel(end_at=4))
-    imagination.rollouts(controller, torch.zeros(2), 0.5)
+    imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     rows = imagination.memory.arrays()
     assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
     assert (rows["terminated"] == (rows["next_z"][:, 1] == 4.0)).all()
@@ -74,14 +78,14 @@ def test_a_predicted_end_is_stored_and_ends_the_rollout() -> None:
 
 def test_the_filter_discards_the_doubtful_transition_and_the_rest_of_its_rollout() -> None:
     imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5))
-    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
     assert dataclasses.astuple(counts) == (3, 15, 12)
 
 
 def test_without_the_filter_doubt_is_kept() -> None:
     imagination, controller = make(filtered=False, model=CountingModel(doubt_at=5))
-    counts = imagination.rollouts(controller, torch.zeros(2), 0.5)
+    counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert counts.accepted == counts.predicted == 30
 
 
@@ -89,20 +93,56 @@ def test_without_the_filter_doubt_is_kept() -> None:
 def test_the_threshold_is_compared_with_the_named_reduction(reduction: str, accepted: int) -> None:
     # The epistemic variance at the doubtful step is (5, 0): 5 at most, 2.5 on average.
     imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5), reduction=reduction, threshold=4.0)
-    assert imagination.rollouts(controller, torch.zeros(2), 0.5).accepted == accepted
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == accepted
 
 
 def test_everything_doubtful_stores_nothing() -> None:
     imagination, controller = make(filtered=True, model=CountingModel(doubt_at=1))
-    assert imagination.rollouts(controller, torch.zeros(2), 0.5).accepted == 0
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 0
     assert len(imagination.memory) == 0
 
 
 def test_exploration_inside_rollouts_is_at_least_that_of_the_settings() -> None:
     greedy, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1)
-    greedy.rollouts(controller, torch.zeros(2), 0.0)
+    greedy.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.0)
     assert len(set(greedy.memory.arrays()["action"].tolist())) == 1
     exploring, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1, exploration=0.5)
-    exploring.rollouts(controller, torch.zeros(2), 0.0)
+    exploring.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.0)
     share = (exploring.memory.arrays()["action"] != greedy.memory.arrays()["action"][0]).mean()
     assert 0.1 < share < 0.4  # half of the random half
+
+
+def remembering(count: int) -> RealMemory:
+    """Real states (i, 5) for i below ``count``, known exactly."""
+    real = RealMemory(count, 2, CPU)
+    for index in range(count):
+        z, sigma = torch.tensor([float(index), 5.0]), torch.zeros(2)
+        real.add((z, sigma), 0, 0.0, (z, sigma), False)
+    return real
+
+
+def test_rollouts_start_from_the_current_state_or_from_remembered_ones() -> None:
+    for start, seen in (("current", {(0.0, 0.0)}), ("remembered", {(float(index), 5.0) for index in range(4)})):
+        imagination, controller = make(filtered=False, model=CountingModel(), breadth=60, depth=1, start_states=start)
+        imagination.rollouts(controller, torch.zeros(2), remembering(4), 0.5)
+        assert {tuple(row) for row in imagination.memory.arrays()["z"].tolist()} == seen
+
+
+def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happened() -> None:
+    class Graded(CountingModel):
+        """Doubts a transition out of (i, c) the more, the larger i: its variance is i squared."""
+
+        def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+            spread = torch.tensor([-1.0, 1.0])[:, None] * z[:, 0]  # [2, N]
+            means = torch.stack([spread, torch.zeros_like(spread)], dim=-1).unsqueeze(2)  # [2, N, 1, Z]
+            return Mixture(torch.zeros(2, len(z), 1), means, torch.full_like(means, -9.0))
+
+    imagination, controller = make(
+        filtered=True, model=Graded(), depth=1, reduction="max", threshold_quantile=1.0, threshold=99.0
+    )
+    accepted = [
+        imagination.rollouts(controller, torch.tensor([doubt, 0.0]), remembering(8), 0.5).accepted
+        for doubt in (6.9, 7.1)
+    ]
+    assert imagination.threshold == 49.0
+    assert accepted == [3, 0]

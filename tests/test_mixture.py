@@ -94,3 +94,13 @@ def test_average_over_weight_samples_averages_coefficients_means_and_variances()
 @pytest.mark.parametrize(("components", "dimensions", "size"), [(5, 8, 85), (1, 1, 3)])
 def test_output_size(components: int, dimensions: int, size: int) -> None:
     assert mdn.output_size(components, dimensions) == size
+
+
+def test_an_ensemble_predicts_with_all_its_members_components() -> None:
+    """Two members that swap the order of their components: averaging them one by one would invent a third place."""
+    means = torch.tensor([[0.0, 10.0], [10.0, 0.0]]).view(2, 1, 2, 1)  # [E, N, K, Z]
+    members = mdn.Mixture(torch.full((2, 1, 2), 0.5).log(), means, torch.full((2, 1, 2, 1), -3.0))
+    pooled = mdn.average(members, members=2)
+    assert sorted(pooled.means.flatten().tolist()) == [0.0, 0.0, 10.0, 10.0]
+    torch.testing.assert_close(pooled.log_weights.exp(), torch.full((1, 4), 0.25))
+    assert mdn.average(members).means.flatten().tolist() == [5.0, 5.0]

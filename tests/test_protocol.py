@@ -54,6 +54,7 @@ def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_wo
         ({"execution": "real"}, UnknownNameError, "Known: physics, kinematic"),
         ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
         ({"seeds": (1, 1)}, InvalidValueError, "seeds"),
+        ({"seeds": (999, 1000)}, InvalidValueError, "mix tuning seeds .from 1000 on"),
         ({"evaluation_episodes": 0}, InvalidValueError, "evaluation_episodes is 0"),
     ],
 )

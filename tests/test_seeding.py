@@ -33,7 +33,7 @@ def test_seeds_are_equal_in_another_process():
 
 
 def test_episode_seeds_never_meet():
-    purposes = ("training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording")
+    purposes = ("training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning")
     edges = (0, 1, 2**24 - 1), (0, 1, 9_999, 2**32 - 1)
     seeds = [episode_seed(p, s, e) for p, s, e in itertools.product(purposes, *edges)]
     assert len(set(seeds)) == len(purposes) * 12

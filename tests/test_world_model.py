@@ -11,6 +11,7 @@ import torch
 from imagine_bench.agents import mixture as mdn
 from imagine_bench.agents.memory import Batch
 from imagine_bench.agents.settings import WorldModelSettings
+from imagine_bench.agents.uncertainty import decompose
 from imagine_bench.agents.world_model import WorldModel, log_cosh
 
 from imagine_bench.errors import DivergedError
@@ -141,3 +142,49 @@ def test_a_loss_that_is_no_number_stops_the_run() -> None:
     model, batch = make(), chain_batch(4, torch.Generator().manual_seed(1))
     with pytest.raises(DivergedError, match="world model's losses are no longer finite"):
         model.update(dataclasses.replace(batch, z=batch.z * float("inf")), torch.Generator())
+
+
+def test_an_ensemble_trains_each_member_as_if_it_were_alone() -> None:
+    """Two members that begin alike stay alike, and are what one network alone becomes."""
+    alone, both = make(dropout=0.0), make(dropout=0.0, members=2)
+    with torch.no_grad():
+        for name in ("weights", "biases"):
+            for one, two in zip(getattr(alone.dynamics, name), getattr(both.dynamics, name), strict=True):
+                two.copy_(one.expand_as(two))
+    draws = torch.Generator().manual_seed(1)
+    for batch in (chain_batch(32, draws) for _ in range(3)):
+        alone.update(batch, torch.Generator())
+        both.update(batch, torch.Generator())
+    for one, two in zip(alone.dynamics.weights, both.dynamics.weights, strict=True):
+        torch.testing.assert_close(two, one.expand_as(two), rtol=1e-4, atol=1e-5)
+
+
+def test_members_disagree_where_they_were_not_taught() -> None:
+    model = make(dropout=0.0, members=5, components=1, sigma_floor=0.1, learning_rate=5e-3)
+    draws = torch.Generator().manual_seed(1)
+    for _ in range(300):
+        model.update(chain_batch(64, draws), torch.Generator())
+    known = chain_batch(50, torch.Generator().manual_seed(3))
+    doubt = [
+        decompose(model.predict(z, known.action, None)).epistemic.sum(dim=-1).mean() for z in (known.z, 4.0 + known.z)
+    ]
+    assert doubt[1] > 20.0 * doubt[0]
+
+
+def test_the_reward_may_depend_on_where_the_action_began() -> None:
+    """A reward for having come from state 0, which z' alone does not tell."""
+    errors = []
+    for inputs in ("next_state", "transition"):
+        model = make(dropout=0.0, assessment_input=inputs, learning_rate=5e-3)
+        draws = torch.Generator().manual_seed(1)
+
+        def batch(generator: torch.Generator) -> Batch:
+            given = chain_batch(64, generator)
+            first = (given.z == CODES[0]).all(dim=-1).float()
+            return dataclasses.replace(given, reward=first, next_z=CODES[1].expand_as(given.z))
+
+        for _ in range(300):
+            model.update(batch(draws), torch.Generator())
+        test = batch(torch.Generator().manual_seed(3))
+        errors.append((model.assess(test.z, test.action, test.next_z)[0] - test.reward).abs().max().item())
+    assert errors[0] > 0.4 and errors[1] < 0.1
