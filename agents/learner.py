@@ -119,7 +119,7 @@ class Learner:
     def state(self) -> AgentState:
         """A snapshot: weights, moments, memories, generators, counters, measurements."""
         arrays = {
-            **snapshot.prefixed("controller", self.controller.optimiser.arrays()),
+            **snapshot.prefixed("controller", self.controller.arrays()),
             **snapshot.prefixed("real", self.real.arrays()),
             "generator/replay": snapshot.generator_array(self._replay),
         }
@@ -144,7 +144,7 @@ class Learner:
         """
         snapshot.require_fit(state, self.state())
         arrays, values = state.arrays, state.values
-        self.controller.optimiser.load(snapshot.below("controller", arrays))
+        self.controller.load(snapshot.below("controller", arrays))
         snapshot.load_generator(self._replay, arrays["generator/replay"])
         self.real.load(snapshot.below("real", arrays), values["real_added"])
         self.meters.restore(values["meters"])

@@ -36,6 +36,7 @@ class _Range:
 _PROBABILITY = _Range(lambda value: 0.0 <= value <= 1.0, "must lie in [0, 1]")
 _SHARE = _Range(lambda value: 0.0 <= value < 1.0, "must lie in [0, 1)")
 _POSITIVE = _Range(lambda value: value > 0.0, "must be above 0")
+_RATE = _Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
 _NOT_NEGATIVE = _Range(lambda value: value >= 0.0, "must be at least 0")
 _COUNT = _Range(lambda value: value >= 1, "must be at least 1")
 _RANGES = {
@@ -48,6 +49,8 @@ _RANGES = {
     "controller.learning_rate": _POSITIVE,
     "controller.discount": _PROBABILITY,
     "controller.updates_per_step": _NOT_NEGATIVE,
+    "controller.target_rate": _RATE,
+    "controller.gradient_clip": _POSITIVE,
     "controller.epsilon_min": _PROBABILITY,
     "controller.epsilon_max": _PROBABILITY,
     "controller.epsilon_decay": _NOT_NEGATIVE,

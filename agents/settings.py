@@ -61,6 +61,9 @@ class ControllerSettings:
         batch_size: Transitions an update, real or imagined.
         updates_per_step: Updates on real transitions a real step, N_R.
         discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/deviations.md.
+        target_rate: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no
+            target network (thesis).
+        gradient_clip: Largest gradient norm; None clips nothing.
         epsilon_min: Exploration probability in the limit.
         epsilon_max: Exploration probability at step 0.
         epsilon_decay: Decay rate lambda, a real step.
@@ -71,6 +74,8 @@ class ControllerSettings:
     batch_size: int = 64
     updates_per_step: int = 1
     discount: float = 0.95
+    target_rate: float = 1.0
+    gradient_clip: float | None = None
     epsilon_min: float = 0.001
     epsilon_max: float = 0.8
     epsilon_decay: float = 0.03

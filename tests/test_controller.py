@@ -65,3 +65,20 @@ def test_a_loss_that_is_no_number_stops_the_run_and_leaves_the_weights() -> None
     with pytest.raises(DivergedError, match=r"controller's loss is nan. Lower controller.learning_rate"):
         controller.update(batch(reward=float("nan")))
     assert (controller.optimiser.arrays()["value"] == before).all()
+
+
+def test_a_target_network_follows_at_its_rate_and_gives_the_targets() -> None:
+    settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
+    controller = Controller(3, 2, settings, torch.Generator().manual_seed(0))
+    before = controller.arrays()["value"]
+    assert (controller.arrays()["target"] == before).all()
+    controller.update(batch())
+    after = controller.arrays()
+    expected = before + 0.25 * (after["value"] - before)
+    assert after["target"] == pytest.approx(expected, abs=1e-7) and (after["value"] != before).any()
+    plain = make()
+    plain.load({name: array for name, array in after.items() if name != "target"})
+    assert controller.loss(batch()) != plain.loss(batch()), "the loss must use the target network's values"
+    again = Controller(3, 2, settings, torch.Generator().manual_seed(5))
+    again.load(after)
+    assert controller.loss(batch()) == again.loss(batch())
