@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 from . import mixture as mdn
@@ -82,6 +83,9 @@ class Imagination:
         filtered: Whether epistemic variance above the threshold discards a transition and the rest of its rollout.
         seeds: This imagination's node of the seed tree.
         device: Where networks and memory lie.
+
+    Raises:
+        InvalidValueError: A filter is asked for, but no weight sample would differ from another.
     """
 
     def __init__(
@@ -94,6 +98,11 @@ class Imagination:
         seeds: SeedTree,
         device: torch.device,
     ) -> None:
+        if filtered and settings.model.dropout == 0.0 and settings.model.members == 1:
+            raise InvalidValueError(
+                "The filter compares what several networks say, and with model.dropout 0 and model.members 1 there is "
+                "one. Set model.dropout above 0 or model.members above 1, or choose the agent without the filter."
+            )
         self.settings, self.filtered = settings.imagination, filtered
         self._generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
@@ -134,10 +143,10 @@ class Imagination:
         """
         settings, generator = self.settings, self._generators["rollouts"]
         weights = self.model.draw_weights(settings.weight_samples, self._generators["dropout"])
-        self._move_threshold(real, weights)
+        self.move_threshold(real, weights, self._generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):
-            action = self._act(controller, z, max(epsilon, settings.exploration))
+            action = self.act(controller, z, max(epsilon, settings.exploration), generator)
             step = imagine_step(self.model, z, action, weights, temperature=settings.temperature, generator=generator)
             terminated = step.p_terminated > TERMINAL
             keep = self.keeps(step)
@@ -157,18 +166,19 @@ class Imagination:
             return current.expand(self.settings.breadth, -1)
         return real.sample(self.settings.breadth, self._generators["replay"]).z
 
-    def _move_threshold(self, real: RealMemory, weights: Masks | None) -> None:
+    def move_threshold(self, real: RealMemory, weights: Masks | None, generator: torch.Generator) -> None:
         """Let the threshold follow the model's doubt about what really happened, where the settings want that."""
         quantile = self.settings.threshold_quantile
         if self.filtered and quantile is not None:
-            known = real.sample(_CALIBRATION, self._generators["replay"])
+            known = real.sample(_CALIBRATION, generator)
             doubts = self.score(decompose(self.model.predict(known.z, known.action, weights)).epistemic)
             self.threshold = float(doubts.quantile(quantile))
 
-    def _act(self, controller: Controller, z: Tensor, epsilon: float) -> Tensor:
+    @staticmethod
+    def act(controller: Controller, z: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
         """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
         greedy = controller.values(z).argmax(dim=-1)
-        size, generator = greedy.shape, self._generators["rollouts"]
+        size = greedy.shape
         random = torch.randint(controller.n_actions, size, generator=generator, device=generator.device)
         explores = torch.rand(size, generator=generator, device=generator.device) < epsilon
         return torch.where(explores, random, greedy)

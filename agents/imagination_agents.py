@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +18,8 @@ from .learner import Learner
 from .perception import load_perception, prepare_torch
 from .presets import settings_of
 from .uncertainty import decompose
+
+_Kind = TypeVar("_Kind", bound="ImaginingLearner")
 
 
 class ImaginingLearner(Learner):
@@ -49,7 +52,7 @@ class ImaginingLearner(Learner):
         model, settings = self.imagination.model, self.imagination.settings
         weights = model.draw_weights(settings.weight_samples, generator)
         for index in range(depth if planned is None else len(planned)):
-            values = self.controller.values(z)  # [1, A]
+            values = self.tested.values(z)  # [1, A]
             action = values.argmax(dim=-1) if planned is None else torch.tensor([planned[index]], device=z.device)
             step = imagine_step(model, z, action, weights, temperature=settings.temperature, generator=generator)
             yield values, action, step
@@ -82,7 +85,8 @@ class ImaginingLearner(Learner):
         )
 
 
-def _make(context: AgentContext, *, filtered: bool) -> ImaginingLearner:
+def build(kind: type[_Kind], context: AgentContext, *, filtered: bool) -> _Kind:
+    """An imagining learner of a kind, with or without the filter."""
     settings = settings_of(context)
     device, perception = prepare_torch(context.device), load_perception(context)
     imagination = Imagination(
@@ -93,14 +97,14 @@ def _make(context: AgentContext, *, filtered: bool) -> ImaginingLearner:
         seeds=context.seeds.child("imagination"),
         device=device,
     )
-    return ImaginingLearner(perception, context.n_actions, settings, context.seeds, device, imagination)
+    return kind(perception, context.n_actions, settings, context.seeds, device, imagination)
 
 
 def make(context: AgentContext) -> ImaginingLearner:
     """The ``imagination`` agent: algorithm 1 without the filter."""
-    return _make(context, filtered=False)
+    return build(ImaginingLearner, context, filtered=False)
 
 
 def make_uncertainty(context: AgentContext) -> ImaginingLearner:
     """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
-    return _make(context, filtered=True)
+    return build(ImaginingLearner, context, filtered=True)

@@ -63,17 +63,25 @@ class Learner:
         """Probability that the next exploring action is random."""
         return epsilon(self.steps, self.settings.controller)
 
+    @property
+    def tested(self) -> Controller:
+        """The controller that acts greedily: here the one that explores too."""
+        return self.controller
+
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Values of every macro-action at the mean latents. Shape (A,)."""
+        return self._values(self.tested, observation)
+
+    def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
         mu, _ = self.perception.posterior(observation.frame)
-        values: NDArray[np.float32] = self.controller.values(mu.unsqueeze(0))[0].cpu().numpy()
+        values: NDArray[np.float32] = controller.values(mu.unsqueeze(0))[0].cpu().numpy()
         return values
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act epsilon-greedily on the mean latents; greedily, and changing nothing, without ``explore``."""
         if explore and self.rng.random() < self.epsilon:
             return int(self.rng.integers(self.n_actions))
-        return int(self.q_values(observation).argmax())
+        return int(self._values(self.controller if explore else self.tested, observation).argmax())
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Algorithm 1 after the action: store, N_E model updates, N_R updates on real batches; imagine, N_I updates.
@@ -87,11 +95,15 @@ class Learner:
         if self.imagination is not None:
             self._learn_model(self.imagination)
         self._learn_values(self.real, self.settings.controller.updates_per_step)
-        if self.imagination is not None and episode >= self.settings.imagination.start_episode:
+        if self.imagination is not None and self._practises_in(episode):
             self._imagine(self.imagination, now[0])
             self._learn_values(self.imagination.memory, self.settings.imagination.updates_per_step)
         self.meters.count(*_TIMES[: 1 if self.imagination is None else None])
         self.steps += 1
+
+    def _practises_in(self, episode: int) -> bool:
+        """Whether the controller learns from imagination in real episode ``episode``."""
+        return episode >= self.settings.imagination.start_episode
 
     def _learn_model(self, imagination: Imagination) -> None:
         with self.meters.cpu_time("time/model_s"):

@@ -117,6 +117,33 @@ class RealMemory(_Ring):
         )
 
 
+class StartMemory(_Ring):
+    """Posteriors of the latents that real episodes began with.
+
+    Args:
+        capacity: Largest number of starts.
+        latent_size: Z.
+        device: Where the rows lie.
+    """
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
+        super().__init__(
+            capacity, {name: torch.zeros(capacity, latent_size, device=device) for name in ("mu", "sigma")}
+        )
+
+    def add(self, posterior: tuple[Tensor, Tensor]) -> None:
+        """Store the posterior (mu, sigma) of one start, each of shape (Z,)."""
+        row = self.added % self.capacity
+        self._columns["mu"][row], self._columns["sigma"][row] = posterior
+        self.added += 1
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw starts with replacement, and latents from their posteriors. Shape (count, Z)."""
+        rows = self._draw(count, generator)
+        noise = torch.empty(rows["mu"].shape, device=generator.device).normal_(generator=generator)
+        return torch.addcmul(rows["mu"], rows["sigma"], noise)
+
+
 class ImaginedMemory(_Ring):
     """Transitions that were imagined.
 

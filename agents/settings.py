@@ -89,6 +89,7 @@ class ImaginationSettings:
         start_episode: First training episode that imagines, I_start.
         start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"remembered"``,
             states drawn from the real memory.
+        rehearsal_episodes: Imagined episodes of a controller that is trained in imagination alone (thesis 3.2.2).
         breadth: Rollouts a real step, I_B.
         depth: Longest rollout in macro-actions, I_D.
         updates_per_step: Controller updates on imagined transitions a real step, N_I.
@@ -103,6 +104,7 @@ class ImaginationSettings:
 
     start_episode: int = 1000
     start_states: str = "current"
+    rehearsal_episodes: int = 1000
     breadth: int = 3
     depth: int = 10
     updates_per_step: int = 1
@@ -121,10 +123,12 @@ class MemorySettings:
     Attributes:
         real: Transitions of the real memory.
         imagined: Transitions of the imagined memory.
+        starts: Starts of real episodes, for those who imagine whole episodes.
     """
 
     real: int = 50_000
     imagined: int = 3_000
+    starts: int = 1_000
 
 
 @dataclass(frozen=True, kw_only=True)

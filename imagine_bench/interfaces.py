@@ -279,6 +279,21 @@ class ValueReader(Protocol):
 
 
 @runtime_checkable
+class Rehearser(Protocol):
+    """An agent that practises by itself, without the world, before it is tested."""
+
+    def rehearse(self) -> bool:
+        """Practise a little on what has been learned so far, or say that there is nothing left to practise.
+
+        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that an
+        interrupted rehearsal goes on bit for bit.
+
+        Returns:
+            Whether anything was done; False changes nothing.
+        """
+
+
+@runtime_checkable
 class Imaginer(Protocol):
     """An agent that can show what it imagines; it changes nothing in the agent."""
 

@@ -68,6 +68,8 @@ AGENTS: dict[str, AgentEntry] = {
     "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
     "imagination": AgentEntry(make="imagine_bench.agents.imagination_agents:make"),
     "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_agents:make_uncertainty"),
+    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
+    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),
 }
 
 

@@ -22,7 +22,7 @@ from imagine_bench.errors import DivergedError
 from imagine_bench.evaluation import Tally, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.imagination_quality import Question, ask, examples, open_loop
-from imagine_bench.interfaces import AgentContext, Imaginer
+from imagine_bench.interfaces import AgentContext, Imaginer, Rehearser
 from imagine_bench.results import Checkpoint, ComparedRollout, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam
@@ -122,6 +122,7 @@ class _Run:
             self._add_row(dataclasses.replace(counters.rows[0], episodes=budget))
             return
         if counters.test is None:
+            self._rehearse()
             counters.test = Tally(diagnostics=self.agent.diagnostics())
         while counters.test.episodes < self.spec.protocol.evaluation_episodes:
             counters.test.add_episode(
@@ -130,6 +131,18 @@ class _Run:
             self._tell("testing")
             self._save_now_and_then()
         self._add_row(self._row(budget, counters.test))
+
+    def _rehearse(self) -> None:
+        """Let an agent that practises without the world do so; its time counts as training."""
+        if not isinstance(self.agent, Rehearser):
+            return
+        more = True
+        while more:
+            start_s = time.process_time()
+            more = self.agent.rehearse()
+            self.counters.train_cpu_s += time.process_time() - start_s
+            self._tell("rehearsing")
+            self._save_now_and_then()
 
     def _row(self, budget: int, test: Tally) -> Checkpoint:
         start_s = time.process_time()

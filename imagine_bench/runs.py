@@ -18,7 +18,7 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import Checkpoint
 
-Phase = Literal["training", "testing", "imagining", "recording", "done"]
+Phase = Literal["training", "rehearsing", "testing", "imagining", "recording", "done"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fake_latents import ACTIONS, CODES, context, frame, live, transition
-from imagine_bench.agents import dqn, imagination_agents
+from imagine_bench.agents import dqn, imagination_agents, imagination_only
 from imagine_bench.agents.learner import Learner
 
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError
@@ -21,6 +21,8 @@ MAKERS: dict[str, Callable[..., Learner]] = {
     "dqn": dqn.make,
     "imagination": imagination_agents.make,
     "imagination_uncertainty": imagination_agents.make_uncertainty,
+    "imagination_only": imagination_only.make,
+    "imagination_only_uncertainty": imagination_only.make_uncertainty,
 }
 everyone = pytest.mark.parametrize("kind", MAKERS)
 imaginers = pytest.mark.parametrize("kind", ["imagination", "imagination_uncertainty"])

@@ -20,7 +20,7 @@ class _KilledError(Exception):
 
 
 def do(folder: Path, agent: str, every_s: float) -> RunResult:
-    overrides = (("imagination.start_episode", 3),)
+    overrides = (("imagination.rehearsal_episodes", 5), ("imagination.start_episode", 3))
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=overrides)
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
@@ -37,7 +37,7 @@ def measured(result: RunResult) -> list[dict[str, Any]]:
     return rows
 
 
-@pytest.mark.parametrize("agent", ["dqn", "imagination_uncertainty"])
+@pytest.mark.parametrize("agent", ["dqn", "imagination_uncertainty", "imagination_only"])
 def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str) -> None:
     whole = do(tmp_path / "whole", agent, 1e9)
     real, saves = runner.save_snapshot, []

@@ -1,0 +1,148 @@
+"""Training in imagination alone: what is tested has never met the world, and a rehearsal goes on bit for bit."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_latents import CODES, context, frame, live, transition
+from imagine_bench.agents import dqn, imagination_agents, imagination_only
+from imagine_bench.agents.imagination_only import ImaginationOnly
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Observation, Rehearser
+
+GOAL = 10
+STATES = 6
+
+
+def make(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> ImaginationOnly:
+    overrides = {"imagination.rehearsal_episodes": 8, **changes}
+    return imagination_only.make(context(monkeypatch, overrides))
+
+
+def rehearse(agent: ImaginationOnly, at_most: int = 10_000) -> int:
+    """Rehearse until nothing is left, or so often; how many episodes it were."""
+    return next((done for done in range(at_most) if not agent.rehearse()), at_most)
+
+
+def learn_the_task(agent: Any, episodes: int) -> None:
+    """One action in three is right; it earns 1, the others cost 1, and all of them end the episode."""
+    rng = np.random.default_rng(0)
+    for episode in range(episodes):
+        state = int(rng.integers(STATES))
+        action = agent.act(Observation(frame=frame(state)), explore=True)
+        right = action == state % 3
+        after = GOAL if right else GOAL + 1
+        agent.observe(transition(state, action, 1.0 if right else -1.0, after, terminated=True), episode=episode)
+
+
+def solved(agent: Any) -> float:
+    return float(np.mean([agent.act(Observation(frame=frame(s)), explore=False) == s % 3 for s in range(STATES)]))
+
+
+def test_a_controller_that_never_met_the_world_beats_chance_after_rehearsing(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"controller.hidden": (64, 64), "controller.batch_size": 32, "controller.epsilon_decay": 0.003}
+    model = {"model.dynamics_hidden": (32,), "model.dropout": 0.0, "model.batch_size": 32, "model.learning_rate": 5e-3}
+    agent = make(monkeypatch, **sizes, **model, **{"imagination.rehearsal_episodes": 400, "memory.imagined": 400})
+    learn_the_task(agent, 250)
+    unrehearsed = solved(agent)
+    assert rehearse(agent) == 400
+    assert solved(agent) >= 5 / 6 > unrehearsed  # chance 1 / 3; five of six by luck: 1 in 56
+
+
+def test_what_is_tested_is_untouched_by_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch)
+    live(agent, range(4), np.random.default_rng(0))
+    before = agent.tested.optimiser.arrays()["value"]
+    live(agent, range(4, 12), np.random.default_rng(1))
+    assert np.array_equal(agent.tested.optimiser.arrays()["value"], before)
+    assert rehearse(agent) == 8
+    assert not np.array_equal(agent.tested.optimiser.arrays()["value"], before)
+
+
+def test_the_explorer_acts_and_learns_like_the_dqn_whether_rehearsed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, agent = dqn.make(context(monkeypatch)), make(monkeypatch)
+    first, second = np.random.default_rng(0), np.random.default_rng(0)
+    for episodes in (range(6), range(6, 14)):
+        assert live(plain, episodes, first) == live(agent, episodes, second)
+        rehearse(agent)
+    assert np.array_equal(plain.state().arrays["controller/value"], agent.state().arrays["controller/value"])
+
+
+def test_a_rehearsal_is_asked_for_by_new_experience_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch)
+    assert isinstance(agent, Rehearser)
+    assert not isinstance(imagination_agents.make(context(monkeypatch)), Rehearser)
+    assert not agent.rehearse(), "nothing was learned yet"
+    live(agent, range(3), np.random.default_rng(0))
+    assert rehearse(agent) == 8
+    before = agent.state()
+    assert not agent.rehearse()
+    assert np.array_equal(before.arrays["rehearsal/generator"], agent.state().arrays["rehearsal/generator"])
+    live(agent, range(3, 4), np.random.default_rng(0))
+    assert rehearse(agent) == 8
+
+
+def test_rehearsing_twice_from_the_same_experience_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An earlier rehearsal, at another budget, leaves no trace in a later one."""
+    often, once = make(monkeypatch), make(monkeypatch)
+    for agent in (often, once):
+        rng = np.random.default_rng(0)
+        live(agent, range(5), rng)
+        if agent is often:
+            rehearse(agent)
+        live(agent, range(5, 9), rng)
+        rehearse(agent)
+    first, second = often.state().arrays, once.state().arrays
+    assert all(np.array_equal(first[name], second[name]) for name in first if name.startswith("rehearsal/"))
+
+
+def test_an_interrupted_rehearsal_goes_on_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch)
+    live(agent, range(5), np.random.default_rng(0))
+    assert rehearse(agent, 3) == 3
+    saved = copy.deepcopy(agent.state())
+    assert rehearse(agent) == 5
+    resumed = make(monkeypatch)
+    resumed.restore(saved)
+    assert rehearse(resumed) == 5
+    one, other = agent.state().arrays, resumed.state().arrays
+    assert one.keys() == other.keys()
+    assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_imagined_episodes_begin_where_real_ones_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch, **{"imagination.depth": 1})
+    for episode in range(3):
+        agent.observe(transition(episode, 0, 0.0, 4), episode=episode)
+        agent.observe(transition(4, 0, 0.0, 5), episode=episode)
+    assert np.array_equal(agent.state().arrays["starts/mu"], CODES[:3].numpy())
+    rehearse(agent)
+    begun = agent.state().arrays["rehearsal/memory/z"]
+    distance = np.linalg.norm(begun[:, None] - CODES[:3].numpy()[None], axis=-1).min(axis=1)
+    assert len(begun) == 8
+    assert distance.max() < 0.5, "drawn from the posteriors of starts, whose sigma is 0.05"
+
+
+def test_the_filter_ends_an_imagined_episode_and_stores_nothing_that_it_discards(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overrides = {"imagination.rehearsal_episodes": 6, "imagination.threshold": 0.0}
+    strict = imagination_only.make_uncertainty(context(monkeypatch, overrides))
+    live(strict, range(4), np.random.default_rng(0))
+    strict.diagnostics()
+    assert rehearse(strict) == 6
+    assert len(strict.state().arrays["rehearsal/memory/z"]) == 0
+    assert strict.diagnostics()["imagination/acceptance_rate"] == 0.0
+
+
+def test_a_filter_without_dropout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for maker in (imagination_only.make_uncertainty, imagination_agents.make_uncertainty):
+        with pytest.raises(
+            InvalidValueError, match=r"model.dropout 0 and model.members 1 .* Set model.dropout above 0"
+        ):
+            maker(context(monkeypatch, {"model.dropout": 0.0}))
+        assert maker(context(monkeypatch, {"model.dropout": 0.0, "model.members": 2})).imagination.filtered
