@@ -24,6 +24,8 @@ _COLORS = {  # Okabe and Ito's palette
     "dqn": "#0072b2",
     "imagination": "#d55e00",
     "imagination_uncertainty": "#009e73",
+    "imagination_only": "#cc79a7",
+    "imagination_only_uncertainty": "#56b4e9",
 }
 _SPARE_COLORS = ("#cc79a7", "#56b4e9", "#e69f00")
 _STYLE: dict[Any, Any] = {

@@ -41,6 +41,15 @@ _AGENTS = {
         "imagination + uncertainty",
         "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
     ),
+    "imagination_only": AgentWords(
+        "imagination only",
+        "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world is "
+        "trained in that model alone, and is what is tested.",
+    ),
+    "imagination_only_uncertainty": AgentWords(
+        "imagination only + uncertainty",
+        "The same, but an imagined episode ends where the model is unsure.",
+    ),
 }
 
 
