@@ -58,6 +58,12 @@ TASKS: dict[str, TaskEntry] = {
         env="imagine_bench.tasks.arrow_puzzle:make_hard_env",
         horizon=10,
     ),
+    "pick_place": TaskEntry(
+        spec="imagine_bench.tasks.pick_place:SPEC",
+        env_id="imagine_bench/PickPlace-v0",
+        env="imagine_bench.tasks.pick_place:make_env",
+        horizon=50,
+    ),
 }
 
 AGENTS: dict[str, AgentEntry] = {

@@ -37,6 +37,29 @@ class RuleTables:
     success: NDArray[np.float64]
 
 
+def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Check rows of macrostates.
+
+    Args:
+        rules: The machine.
+        macrostates: Shape (N, M).
+
+    Returns:
+        The same as an array.
+
+    Raises:
+        InvalidValueError: Another shape or type, or a row that is no macrostate of the machine.
+    """
+    macrostates, known = np.asarray(macrostates), set(rules.states)
+    width = len(rules.states[0])
+    if macrostates.ndim != 2 or macrostates.shape[1] != width or not np.issubdtype(macrostates.dtype, np.integer):
+        raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {macrostates.shape}.")
+    for row in macrostates.tolist():
+        if tuple(row) not in known:
+            raise InvalidValueError(f"No macrostate {tuple(row)}; give one of {len(known)}, such as {rules.states[0]}.")
+    return macrostates
+
+
 def tabulate(rules: Rules) -> RuleTables:
     """Write the machine out as arrays.
 

@@ -16,6 +16,8 @@ import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 
+SHADE = 16
+"""Grey levels of 256: a ball that was turned a little is shaded differently all over."""
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
 
 
@@ -121,12 +123,12 @@ def test_both_executions_walk_the_same_macrostates(task):
     for seed in range(3):
         starts = [env.reset(seed=seed)[1]["macrostate"].tolist() for env in (physics, kinematic)]
         assert starts[0] == starts[1]
-        for action in generator.integers(6, size=5):
+        for action in generator.integers(registry.task(task).n_actions, size=5):
             one, other = physics.step(int(action)), kinematic.step(int(action))
             assert one[1:4] == other[1:4]
             assert not one[4]["fault"]
             assert one[4]["macrostate"].tolist() == other[4]["macrostate"].tolist()
-            assert np.abs(one[0].astype(int) - other[0]).max(axis=2).astype(bool).mean() < 0.03
+            assert (np.abs(one[0].astype(int) - other[0]).max(axis=2) > SHADE).mean() < 0.03
     physics.close()
     kinematic.close()
 

@@ -68,6 +68,13 @@ def check_info(info, spec, *, after_step):
     assert after_step or info["sim_time_s"] == info["ik_error_m"] == 0.0
 
 
+def reached(spec, before, action, info):
+    """The rules' outcome that the environment reports; what the human does next may be one of several."""
+    after = tuple(info["macrostate"].tolist())
+    (outcome,) = [each for each in spec.rules.outcomes(before, action) if each.macrostate == after]
+    return outcome
+
+
 def test_an_episode_keeps_the_contract(env):
     task = next(name for name, entry in registry.TASKS.items() if entry.env_id == env.spec.id)
     spec, physics = registry.task(task), env.spec.kwargs["execution"] == "physics"
@@ -80,9 +87,8 @@ def test_an_episode_keeps_the_contract(env):
         before = tuple(info["macrostate"].tolist())
         new_frame, reward, terminated, truncated, new_info = env.step(np.int64(action))
         check_info(new_info, spec, after_step=True)
-        (expected,) = spec.rules.outcomes(before, action)
+        expected = reached(spec, before, action, new_info)
         assert not new_info["fault"]
-        assert tuple(new_info["macrostate"].tolist()) == expected.macrostate
         assert (reward, terminated, truncated) == (expected.reward, expected.terminated, False)
         assert type(reward) is float
         assert new_info["success"] == expected.success
@@ -96,12 +102,14 @@ def test_an_episode_keeps_the_contract(env):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_horizon_truncates_and_does_not_terminate(task):
-    env, horizon = make(task, **KINEMATIC), registry.TASKS[task].horizon
-    env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
-    walk = [env.step((3, 2)[step % 2]) for step in range(horizon)]  # out of the legal pair and back: no end by rule
-    legal = [(reward, terminated, truncated) for _, reward, terminated, truncated, _ in walk]
+    """Ends by rule are ignored, so that the walk is long enough: the two never depend on each other."""
+    env, horizon, rules = make(task, **KINEMATIC), registry.TASKS[task].horizon, registry.task(task).rules
+    _, info = env.reset(seed=0)
+    for step in range(horizon):
+        *_, terminated, truncated, info = env.step(step % rules.n_actions)
+        assert truncated == (step == horizon - 1)
+        assert terminated == rules.is_terminal(tuple(info["macrostate"].tolist()))
     env.close()
-    assert [truncated for *_, truncated in legal] == [False] * (horizon - 1) + [True]
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -115,10 +123,8 @@ def test_every_macrostate_can_be_the_start_and_the_rules_go_on_from_it(task):
         assert info["success"] is False
         action = int(generator.integers(spec.n_actions))
         _, reward, terminated, _, info = env.step(action)
-        (expected,) = spec.rules.outcomes(state, action)
-        assert (tuple(info["macrostate"].tolist()), reward, terminated) == (
-            expected.macrostate, expected.reward, expected.terminated,
-        )  # fmt: skip
+        expected = reached(spec, state, action, info)
+        assert (reward, terminated) == (expected.reward, expected.terminated)
         assert info["legal"] == (expected.success or not expected.terminated)
     env.close()
 

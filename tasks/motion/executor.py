@@ -69,26 +69,33 @@ class MacroExecutor:
         self._states = np.empty((0, mujoco.mj_stateSize(model, self._state)))
         self._control = np.empty((0, mujoco.mj_stateSize(model, _INPUTS)))
 
-    def rest(self, data: mujoco.MjData) -> None:
+    def rest(self, data: mujoco.MjData, *, squeeze_m: float | None = None) -> None:
         """Bring ``data`` to the canonical start: the arm at its observation pose, everything still.
 
-        Only the positions of loose objects and of mocap bodies survive; velocities, warm start, sleep states, time
-        and controls are as if new. Hence what follows depends on those positions alone.
+        Only the positions of loose objects and of mocap bodies survive, and those of fingers that hold something;
+        velocities, warm start, sleep states, time and controls are as if new. Hence what follows depends on those
+        positions and on ``squeeze_m`` alone.
+
+        Args:
+            data: Changed in place; derived quantities are not updated.
+            squeeze_m: Command to each finger that keeps an object held; None opens the fingers to where they rest.
         """
         qpos, mocap_pos, mocap_quat = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
         data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
-        data.qpos[self._finger_qpos] = REST_OPENING_M
+        if squeeze_m is None:
+            data.qpos[self._finger_qpos] = REST_OPENING_M
         data.ctrl[self._arm_ctrl] = OBSERVATION_QPOS_RAD
-        data.ctrl[self._finger_ctrl] = REST_OPENING_M
+        data.ctrl[self._finger_ctrl] = REST_OPENING_M if squeeze_m is None else squeeze_m
 
-    def run(self, data: mujoco.MjData, trajectory: Trajectory) -> Floats:
+    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory`` from the canonical start.
 
         Args:
             data: Changed in place; its derived quantities (such as ``xpos``) are those of the last step.
             trajectory: Planned at the model's timestep.
+            squeeze_m: As in :meth:`rest`, where something is held at the start.
 
         Returns:
             Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
@@ -97,7 +104,7 @@ class MacroExecutor:
         Raises:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
-        self.rest(data)
+        self.rest(data, squeeze_m=squeeze_m)
         states, control = self._buffers(len(trajectory.opening_m))
         mujoco.mj_getState(self.model, data, states[0], self._state)
         mujoco.mj_getState(self.model, data, control[0], _INPUTS)

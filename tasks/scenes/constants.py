@@ -1,4 +1,4 @@
-"""Numbers that more than one part of the arrow puzzle's scene needs, each with its unit.
+"""Numbers that more than one part of a scene, or more than one scene, needs, each with its unit.
 
 World frame: x away from the robot's base, y to the robot's left, z up, origin at the base. The human sits at the far
 side (+x) and appears at the top of the agent's frame; the frame's right is -y.
@@ -7,8 +7,8 @@ side (+x) and appears at the top of the agent's frame; the frame's right is -y.
 from __future__ import annotations
 
 TIMESTEP_S = 0.008
-"""Coarse, for speed: `make speed` measures that every turn still comes out right, with a yaw error under 1 degree.
-A finer step is more exact and costs in proportion; objects that are carried for long want at most 5 ms."""
+"""The arrow puzzle's. Coarse, for speed: `make speed` measures that every turn still comes out right, with a yaw error
+under 1 degree. A finer step is more exact and costs in proportion; objects that are carried want at most 5 ms."""
 
 TABLE_HEIGHT_M = -0.10
 """Height of the table's surface."""
@@ -31,8 +31,9 @@ OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
-SCENE_GROUP, ARM_GROUP, SETTING_GROUP = 0, 2, 3
-"""Geom groups: table top, cubes and hand; the arm; what only the human's view shows (floor, legs, person)."""
+SCENE_GROUP, ARM_GROUP, SETTING_GROUP, COLLISION_GROUP = 0, 2, 3, 5
+"""Geom groups: table top, loose objects and hands; the arm; what only the human's view shows (floor, legs, person);
+what only contact sees."""
 
 AGENT_CAMERA, HUMAN_CAMERA = "wrist", "human"
 

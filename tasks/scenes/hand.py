@@ -50,18 +50,36 @@ def add_hand(root: mjcf.RootElement) -> None:
     """Add the mocap body ``hand``, pointing at the middle slot."""
     x_m, y_m = c.SLOTS_XY_M[1]
     tip = c.FINGERTIP_IN_SLOT_M
-    body = root.worldbody.add(
-        "body", name="hand", mocap="true",
-        pos=(x_m + tip[0], y_m + tip[1], c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + tip[2]),
-    )  # fmt: skip
+    add_person_materials(root)
+    add_pointing_hand(root, (x_m + tip[0], y_m + tip[1], c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + tip[2]))
+
+
+def add_person_materials(root: mjcf.RootElement) -> None:
+    """What every part of the person is made of."""
     root.asset.add("material", name="skin", rgba=(0.91, 0.68, 0.55, 1.0), specular=0.15, shininess=0.2)
     root.asset.add("material", name="cloth", rgba=(0.20, 0.35, 0.55, 1.0), specular=0.05)
-    parts = (
-        ("hand", hand_mesh(), "skin", c.SCENE_GROUP),
-        ("wrist", wrist_mesh(), "skin", c.SETTING_GROUP),
-        ("sleeve", sleeve_mesh(), "cloth", c.SETTING_GROUP),
-    )
-    for name, mesh, material, group in parts:
-        root.asset.add("mesh", name=name, vertex=mesh.vertices.ravel(), face=mesh.faces.ravel(), inertia="shell")
-        body.add("geom", name=f"{name}_skin", type="mesh", mesh=name, material=material, mass=0.0, contype=0,
+
+
+def add_pointing_hand(root: mjcf.RootElement, fingertip_m: tuple[float, float, float]) -> None:
+    """Add the mocap body ``hand`` with its index fingertip at a place in the world."""
+    add_limb(root, "hand", fingertip_m, {"hand": hand_mesh(), "wrist": wrist_mesh(), "sleeve": sleeve_mesh()})
+
+
+def add_limb(
+    root: mjcf.RootElement, name: str, pos_m: tuple[float, float, float], parts: dict[str, Mesh]
+) -> mjcf.Element:
+    """Add a mocap body drawn by three meshes, which touch nothing.
+
+    Args:
+        root: The scene.
+        name: Of the body.
+        pos_m: Of its origin, in the world.
+        parts: The hand, the bare wrist and the sleeve, in this order; the agent's frame shows the hand alone.
+    """
+    body = root.worldbody.add("body", name=name, mocap="true", pos=pos_m)
+    looks = (("skin", c.SCENE_GROUP), ("skin", c.SETTING_GROUP), ("cloth", c.SETTING_GROUP))
+    for (part, mesh), (material, group) in zip(parts.items(), looks, strict=True):
+        root.asset.add("mesh", name=part, vertex=mesh.vertices.ravel(), face=mesh.faces.ravel(), inertia="shell")
+        body.add("geom", name=f"{part}_skin", type="mesh", mesh=part, material=material, mass=0.0, contype=0,
                  conaffinity=0, group=group)  # fmt: skip
+    return body

@@ -115,6 +115,52 @@ def prism(outline: ArrayLike, bottom_m: float, top_m: float) -> Mesh:
     return _rings_to_mesh(rings, np.array([*center, bottom_m]), np.array([*center, top_m]))
 
 
+def box(low: ArrayLike, high: ArrayLike, *, taper: float = 1.0) -> Mesh:
+    """A box between two corners, its top shrunk about its middle by ``taper``.
+
+    Args:
+        low: Metres. Shape (3,).
+        high: Metres. Shape (3,).
+        taper: Size of the top face relative to the bottom face, in (0, 1].
+    """
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    middle, half = (low + high) / 2, (high - low) / 2
+    corners = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    rings = np.stack([
+        np.concatenate([middle[:2] + scale * half[:2] * corners, np.full((4, 1), z)], axis=1)
+        for scale, z in ((1.0, low[2]), (taper, high[2]))
+    ])  # fmt: skip
+    return _rings_to_mesh(rings, np.array([*middle[:2], low[2]]), np.array([*middle[:2], high[2]]))
+
+
+def turned_profile(profile: Sequence[tuple[float, float]], *, sides: int = 12) -> Mesh:
+    """A solid of revolution about z, such as a cup.
+
+    Args:
+        profile: (radius, z) from the bottom to the top, metres; both ends are closed by discs.
+        sides: Corners of a cross-section.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rings = np.stack([np.insert(radius * circle, 2, z, axis=1) for radius, z in profile])
+    return _rings_to_mesh(rings, np.array([0.0, 0.0, profile[0][1]]), np.array([0.0, 0.0, profile[-1][1]]))
+
+
+def arch(center: ArrayLike, *, radius: float, thickness: float, corners: int = 6, sides: int = 5) -> Mesh:
+    """Half a ring in the x-z plane that bulges toward -x, such as a cup's handle.
+
+    Args:
+        center: Middle of the ring's chord, metres. Shape (3,).
+        radius: Of the ring's centre line.
+        thickness: Radius of the bent rod.
+        corners: Bones along the arch.
+        sides: Corners of a cross-section.
+    """
+    x, y, z = np.asarray(center, dtype=np.float64)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, corners + 1)
+    return limb([(x - radius * np.cos(a), y, z + radius * np.sin(a), thickness) for a in angle], sides=sides)
+
+
 def signed_volume_m3(mesh: Mesh) -> float:
     """Enclosed volume; positive if every part is closed and its faces look outward (overlaps count twice)."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))

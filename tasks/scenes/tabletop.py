@@ -15,10 +15,10 @@ _LEG_INSET_M = 0.05
 _HUMAN_EYE_M, _HUMAN_TARGET_M, _HUMAN_FOVY_DEG = (1.44, 1.14, 0.70), (0.46, 0.03, 0.215), 41.0
 
 
-def set_options(root: mjcf.RootElement) -> None:
-    """Solver settings that hold a cube by friction alone; `make speed` measures how well."""
+def set_options(root: mjcf.RootElement, timestep_s: float) -> None:
+    """Solver settings that hold an object by friction alone; `make speed` measures how well."""
     option = root.option
-    option.timestep = c.TIMESTEP_S
+    option.timestep = timestep_s
     option.integrator, option.solver = "implicitfast", "Newton"
     option.cone, option.impratio = "pyramidal", 1.0
     option.jacobian = "dense"
@@ -46,14 +46,14 @@ def add_lights(root: mjcf.RootElement) -> None:
     )  # fmt: skip
 
 
-def add_table(root: mjcf.RootElement) -> None:
-    """The table top, which carries the cubes, and its legs and the floor, which only the human's view shows."""
+def add_table(root: mjcf.RootElement, timestep_s: float) -> None:
+    """The table top, which carries the objects, and its legs and the floor, which only the human's view shows."""
     root.asset.add("material", name="table_top", rgba=(0.50, 0.44, 0.38, 1.0), specular=0.1, shininess=0.1)
     root.asset.add("material", name="table_leg", rgba=(0.30, 0.27, 0.25, 1.0), specular=0.1)
     table = root.worldbody.add("body", name="table", pos=(_TABLE_X_M, 0.0, c.TABLE_HEIGHT_M - _TABLE_HALF_M[2]))
     table.add(
         "geom", name="table_top", type="box", size=_TABLE_HALF_M, material="table_top", group=c.SCENE_GROUP,
-        friction=(0.8, 0.005, 0.0001), solref=(2 * c.TIMESTEP_S, 1.0),
+        friction=(0.8, 0.005, 0.0001), solref=(2 * timestep_s, 1.0),
     )  # fmt: skip
     leg_half_m = (c.TABLE_HEIGHT_M - 2 * _TABLE_HALF_M[2] - _FLOOR_Z_M) / 2
     for name, x_sign, y_sign in (
@@ -97,11 +97,16 @@ def add_human_camera(root: mjcf.RootElement) -> None:
     root.worldbody.add("camera", name=c.HUMAN_CAMERA, pos=eye, fovy=_HUMAN_FOVY_DEG, xyaxes=(*right, *up))
 
 
-def add_tabletop(root: mjcf.RootElement) -> None:
-    """Everything around the arm, the cubes and the hand."""
-    set_options(root)
+def add_tabletop(root: mjcf.RootElement, timestep_s: float = c.TIMESTEP_S) -> None:
+    """Everything around the arm, the loose objects and the person's hands.
+
+    Args:
+        root: The scene.
+        timestep_s: Of the simulation; contacts get a time constant of two of them.
+    """
+    set_options(root, timestep_s)
     set_quality(root)
     add_lights(root)
-    add_table(root)
+    add_table(root, timestep_s)
     add_floor(root)
     add_human_camera(root)

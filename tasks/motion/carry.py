@@ -1,0 +1,250 @@
+"""Macro-actions that carry: pick an object up, put it back, lay it into a palm, or reach out in vain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from ..scenes.arm import TCP_SITE
+from ..scenes.constants import OBSERVATION_QPOS_RAD
+from ..scenes.objects import THINGS, Thing, standing_m
+from .arm_model import ArmModel, Floats
+from .executor import REST_OPENING_M, MacroExecutor, MacroResult
+from .ik import ArmIK, UnreachableTargetError
+from .trajectory import Waypoint, plan
+
+_LIFT_M = 0.075
+"""The gripper comes from and goes to so far above where it grips or lets go."""
+_CLOSE_S, _OPEN_S, _SETTLE_S = 0.12, 0.08, 0.05
+_BLEND_S = 0.10
+"""Going down begins so long before the reach ends, and the return so long before the gripper is fully up."""
+_PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
+"""An object is let go so far above the table, or the palm."""
+
+_LOST_M = 0.003
+"""Fingers that close so much further than the object is wide have lost it."""
+_MAX_TILT_RAD = math.radians(12)
+_ARM_AT_REST_RAD = 0.02
+_HALF_TURN_RAD = math.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pose:
+    """An object as measured. Position (3,) in the world; yaw of its x axis and tilt of its z axis, rad."""
+
+    position_m: Floats
+    yaw_rad: float
+    tilt_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reach:
+    """Arm configurations at one place and above it."""
+
+    at_qpos_rad: Floats
+    above_qpos_rad: Floats
+    error_m: float
+
+
+class CarryExecutor:
+    """Carries objects by friction alone: mink plans, the servos move the arm, contact moves the object.
+
+    Every action starts and ends with the arm at its observation pose, an object that is held included: then the
+    outcome is a pure function of the positions of objects, hands and fingers, and of the arguments, bit for bit.
+
+    Args:
+        model: The compiled scene with arm and objects.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.executor = MacroExecutor(model)
+        self._arm = ArmModel()
+        self._ik = ArmIK(self._arm)
+        self._qpos = [int(model.joint(f"{thing.name}_joint").qposadr[0]) for thing in THINGS]
+        self._rest_tcp_m, _ = self._arm.tcp_in_base(np.array(OBSERVATION_QPOS_RAD))
+        self._tcp_site = model.site(TCP_SITE).id
+        self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(THINGS))]
+
+    def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
+        """Lift object ``index`` from where it stands and bring it to the observation pose."""
+        thing, pose = THINGS[index], self._measure(data, index)
+        if thing.upright and pose.tilt_rad > _MAX_TILT_RAD:
+            return self._refuse(data, None, f"the {thing.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
+        yaw_rad = _nearest_to_zero(pose.yaw_rad) if thing.upright else 0.0
+        try:
+            reach = self._solve(pose.position_m, yaw_rad, self._slots[index])
+        except UnreachableTargetError as error:
+            return self._refuse(data, None, f"the {thing.name} is out of reach: {error}")
+        grip_m = thing.squeeze_m
+        result, qpos = self._run(data, _waypoints(reach, REST_OPENING_M, grip_m), reach, None, capture_motion_hz)
+        return self._with_fault(result, qpos, self._missed(thing, qpos[-1]))
+
+    def place(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
+        """Put the held object ``index`` back on its nominal place, the right way round."""
+        return self._put(data, index, np.array(standing_m(index)) + _up(_PLACE_DROP_M), 0.0, capture_motion_hz)
+
+    def hand_over(
+        self, data: mujoco.MjData, *, index: int, palm_m: Floats, capture_motion_hz: float = 0.0
+    ) -> MacroResult:
+        """Lay the held object ``index`` into the palm whose middle is at ``palm_m``. Shape (3,)."""
+        target_m = palm_m + _up(THINGS[index].grip_height_m + _PALM_DROP_M)
+        return self._put(data, index, target_m, None, capture_motion_hz)
+
+    def visit(
+        self, data: mujoco.MjData, *, place_m: Floats, held: int | None, capture_motion_hz: float = 0.0
+    ) -> MacroResult:
+        """Reach out to above ``place_m`` (3,) and come back, holding object ``held`` or nothing."""
+        grip_m = None if held is None else THINGS[held].squeeze_m
+        try:
+            reach = self._solve(place_m, 0.0, self._slots[1])
+        except UnreachableTargetError as error:
+            return self._refuse(data, held, f"there is no reaching out: {error}")
+        opening_m = REST_OPENING_M if grip_m is None else grip_m
+        waypoints = [
+            Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=opening_m),
+            *_home(opening_m),
+        ]
+        result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
+        return self._with_fault(result, qpos, None if held is None else self._missed(THINGS[held], qpos[-1]))
+
+    def rest(self, data: mujoco.MjData, held: int | None) -> None:
+        """Bring ``data`` to the canonical start; object ``held`` goes with the gripper where the arm is corrected."""
+        if held is None:
+            self.executor.rest(data)
+            return
+        before_m, before_quat = self._tcp(data)
+        self.executor.rest(data, squeeze_m=THINGS[held].squeeze_m)
+        after_m, after_quat = self._tcp(data)
+        row = self._qpos[held]
+        turn, inverse = np.empty(4), np.empty(4)
+        mujoco.mju_negQuat(inverse, before_quat)
+        mujoco.mju_mulQuat(turn, after_quat, inverse)
+        offset_m, quat = np.empty(3), np.empty(4)
+        mujoco.mju_rotVecQuat(offset_m, data.qpos[row : row + 3] - before_m, turn)
+        mujoco.mju_mulQuat(quat, turn, data.qpos[row + 3 : row + 7])
+        data.qpos[row : row + 3], data.qpos[row + 3 : row + 7] = after_m + offset_m, quat / np.linalg.norm(quat)
+
+    # --- details -------------------------------------------------------------------------------------------------
+
+    def _put(
+        self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
+    ) -> MacroResult:
+        """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
+        thing, pose = THINGS[index], self._measure(data, index)
+        # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
+        turn_rad = 0.0 if yaw_rad is None or not thing.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
+        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+        held_m = pose.position_m - self._rest_tcp_m
+        turned_m = np.array([cos * held_m[0] - sin * held_m[1], sin * held_m[0] + cos * held_m[1], held_m[2]])
+        try:
+            reach = self._solve(target_m - turned_m, turn_rad, self._slots[index])
+        except UnreachableTargetError as error:
+            return self._refuse(data, index, f"the {thing.name} cannot be put there: {error}")
+        result, qpos = self._run(
+            data, _waypoints(reach, thing.squeeze_m, REST_OPENING_M), reach, index, capture_motion_hz
+        )
+        return self._with_fault(result, qpos, None)
+
+    def _measure(self, data: mujoco.MjData, index: int) -> _Pose:
+        """Read an object's pose from the simulation."""
+        start = self._qpos[index]
+        w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
+        return _Pose(
+            position_m=data.qpos[start : start + 3].copy(),
+            yaw_rad=math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+            tilt_rad=math.acos(max(-1.0, 1.0 - 2.0 * (x * x + y * y))),
+        )
+
+    def _solve(self, place_m: Floats, yaw_rad: float, warm_start: _Reach | None) -> _Reach:
+        """Configurations with the tool centre point at ``place_m`` (3,), and above it."""
+        at, above = (
+            self._ik.solve(position_in_base_m=place_m + _up(lift_m), yaw_rad=yaw_rad, start_qpos_rad=start)
+            for lift_m, start in (
+                (0.0, warm_start.at_qpos_rad if warm_start else np.array(OBSERVATION_QPOS_RAD)),
+                (_LIFT_M, warm_start.above_qpos_rad if warm_start else np.array(OBSERVATION_QPOS_RAD)),
+            )
+        )
+        error_m = max(at.position_error_m, above.position_error_m)
+        return _Reach(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)
+
+    def _run(
+        self,
+        data: mujoco.MjData,
+        waypoints: Sequence[Waypoint],
+        reach: _Reach,
+        held: int | None,
+        capture_motion_hz: float,
+    ) -> tuple[MacroResult, Floats]:
+        """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
+        grip_m = None if held is None else THINGS[held].squeeze_m
+        trajectory = plan(
+            self._arm,
+            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
+            start_opening_m=REST_OPENING_M if grip_m is None else grip_m,
+            waypoints=waypoints,
+            timestep_s=self.executor.model.opt.timestep,
+        )
+        qpos = self.executor.run(data, trajectory, squeeze_m=grip_m)
+        time_s, samples = self.executor.capture(qpos, capture_motion_hz)
+        sim_time_s = (len(qpos) - 1) * self.executor.model.opt.timestep
+        result = MacroResult(sim_time_s=sim_time_s, ik_error_m=reach.error_m, fault=None, time_s=time_s, qpos=samples)
+        return result, qpos
+
+    def _with_fault(self, result: MacroResult, qpos: Floats, lost: str | None) -> MacroResult:
+        """Add what went wrong as far as the robot itself can feel."""
+        off_rad = float(np.abs(self.executor.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
+        astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
+        return replace(result, fault=lost or astray)
+
+    def _missed(self, thing: Thing, qpos: Floats) -> str | None:
+        """Whether the fingers closed past what they should hold, in positions of the scene (nq,)."""
+        closed = self.executor.opening_m(qpos).max() < thing.grip_opening_m - _LOST_M
+        return f"the fingers closed and do not hold the {thing.name}" if closed else None
+
+    def _refuse(self, data: mujoco.MjData, held: int | None, reason: str) -> MacroResult:
+        """The arm stays where it is."""
+        self.rest(data, held)
+        return MacroResult(
+            sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.executor.model.nq))
+        )
+
+    def _tcp(self, data: mujoco.MjData) -> tuple[Floats, Floats]:
+        """Position (3,) and quaternion (4,) of the tool centre point in the world, updated."""
+        mujoco.mj_kinematics(self.executor.model, data)
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp_site])
+        return data.site_xpos[self._tcp_site].copy(), quat
+
+
+def _up(height_m: float) -> Floats:
+    return np.array([0.0, 0.0, height_m])
+
+
+def _nearest_to_zero(yaw_rad: float) -> float:
+    """The heading of the same two opposite sides within a quarter turn of 0: fingers grip both alike."""
+    return yaw_rad - round(yaw_rad / _HALF_TURN_RAD) * _HALF_TURN_RAD
+
+
+def _waypoints(reach: _Reach, before_m: float, after_m: float) -> list[Waypoint]:
+    """Down with one finger command, to another one there, and back with that."""
+    change_s = _CLOSE_S if after_m < before_m else _OPEN_S
+    return [
+        Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=before_m, blend_s=_BLEND_S),
+        Waypoint(name="down", qpos_rad=reach.at_qpos_rad, opening_m=before_m),
+        Waypoint(name="grip", qpos_rad=reach.at_qpos_rad, opening_m=after_m, min_duration_s=change_s),
+        Waypoint(name="up", qpos_rad=reach.above_qpos_rad, opening_m=after_m, blend_s=_BLEND_S),
+        *_home(after_m),
+    ]
+
+
+def _home(opening_m: float) -> list[Waypoint]:
+    """Back to the observation pose, and a moment of calm there."""
+    observe = np.array(OBSERVATION_QPOS_RAD)
+    return [
+        Waypoint(name="return", qpos_rad=observe, opening_m=opening_m),
+        Waypoint(name="settle", qpos_rad=observe, opening_m=opening_m, min_duration_s=_SETTLE_S),
+    ]

@@ -1,0 +1,156 @@
+"""Three things to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
+
+Every body's origin is the middle of its grip. What is drawn is one mesh a colour; what touches is a few primitives, and
+feet or wheels are spheres, which stand quietly on a table and in a palm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from . import constants as c
+from .composing import mjcf
+from .meshes import Mesh, arch, box, limb, merge, turned_profile
+
+SPACING_M = 0.10
+SLOTS_XY_M = ((c.ROW_X_M, SPACING_M), (c.ROW_X_M, 0.0), (c.ROW_X_M, -SPACING_M))
+"""Nominal places, left to right in the agent's frame."""
+
+TIP_RADIUS_M, TIP_OFFSET_M = 0.004, 0.010
+"""Of the gripper's rubber tips, two a pad: their radius, and their distance from the pad's middle along the pad."""
+
+_BALL_RADIUS_M = 0.028
+_CAR_HALF_M, _CAR_CLEARANCE_M, _WHEEL_M, _CAR_GRIP_Z_M = (0.034, 0.022, 0.012), 0.008, 0.010, 0.024
+_CUP_RADIUS_M, _CUP_HEIGHT_M, _CUP_FOOT_M, _CUP_GRIP_Z_M = 0.026, 0.062, 0.004, 0.038
+_MASS_KG, _SQUEEZE_M = 0.10, 0.004
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thing:
+    """One object as planning and reading see it.
+
+    Attributes:
+        name: Of its body; ``<name>_joint`` is its free joint.
+        grip_height_m: The body's origin above what it stands on.
+        grip_opening_m: Each finger's distance from the grip's middle when its tips touch the object.
+        upright: Whether it has a right way up and a heading; a ball has neither.
+    """
+
+    name: str
+    grip_height_m: float
+    grip_opening_m: float
+    upright: bool = True
+
+    @property
+    def squeeze_m(self) -> float:
+        """The command to each finger that holds the object: a little inside it, about 12 N."""
+        return self.grip_opening_m - _SQUEEZE_M
+
+
+def _round_opening_m(radius_m: float) -> float:
+    """Where a finger's two tips touch something round, in the finger's own coordinate."""
+    return math.sqrt((radius_m + TIP_RADIUS_M) ** 2 - TIP_OFFSET_M**2) - TIP_RADIUS_M
+
+
+BALL = Thing(name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False)
+CAR = Thing(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
+CUP = Thing(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
+THINGS = (BALL, CAR, CUP)
+"""Left to right in the agent's frame."""
+
+MATERIALS = ("ball", "car", "car_dark", "cup", "cup_inside")
+
+
+def standing_m(index: int) -> tuple[float, float, float]:
+    """Nominal position of object ``index`` on the table."""
+    return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + THINGS[index].grip_height_m)
+
+
+def _car_body() -> Mesh:
+    """Chassis and bonnet, its nose toward the human (+x)."""
+    x, y, z = _CAR_HALF_M
+    return merge([box((-x, -y, _CAR_CLEARANCE_M - _CAR_GRIP_Z_M), (x, y, _CAR_CLEARANCE_M + 2 * z - _CAR_GRIP_Z_M)),
+                  box((-0.024, -0.019, 0.006), (0.012, 0.019, 0.021), taper=0.82)])  # fmt: skip
+
+
+def _car_trim() -> Mesh:
+    """Windows and wheels."""
+    wheel_z = _WHEEL_M - _CAR_GRIP_Z_M
+    wheels = [
+        limb([(sx * 0.021, sy * 0.017, wheel_z, _WHEEL_M), (sx * 0.021, sy * 0.024, wheel_z, _WHEEL_M)], sides=8)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    windows = [
+        box((0.004, -0.016, 0.010), (0.0145, 0.016, 0.0195)),
+        box((-0.026, -0.016, 0.010), (-0.018, 0.016, 0.0195)),
+    ]
+    return merge([*wheels, *windows])
+
+
+def _cup_body() -> Mesh:
+    """A mug, its handle toward the robot."""
+    low, high = _CUP_FOOT_M - _CUP_GRIP_Z_M, _CUP_HEIGHT_M - _CUP_GRIP_Z_M
+    wall = turned_profile([(0.85 * _CUP_RADIUS_M, low), (_CUP_RADIUS_M, low + 0.01), (_CUP_RADIUS_M, high)], sides=14)
+    handle = arch((-_CUP_RADIUS_M + 0.002, 0.0, -0.004), radius=0.018, thickness=0.0045)
+    return merge([wall, handle])
+
+
+def _cup_inside() -> Mesh:
+    """The dark hole, a disc just above the rim's height."""
+    high = _CUP_HEIGHT_M - _CUP_GRIP_Z_M
+    return turned_profile([(0.74 * _CUP_RADIUS_M, high), (0.74 * _CUP_RADIUS_M, high + 0.0006)], sides=12)
+
+
+def add_objects(root: mjcf.RootElement) -> None:
+    """Add bodies ``ball``, ``car`` and ``cup`` on their places, with free joints ``<name>_joint``."""
+    for name, rgba in (
+        ("ball", (0.10, 0.28, 0.95, 1.0)),
+        ("car", (0.93, 0.10, 0.09, 1.0)),
+        ("car_dark", (0.10, 0.10, 0.13, 1.0)),
+        ("cup", (0.10, 0.72, 0.22, 1.0)),
+        ("cup_inside", (0.02, 0.14, 0.06, 1.0)),
+    ):
+        root.asset.add("material", name=name, rgba=rgba, specular=0.2, shininess=0.3)
+    ball, car, cup = (_body(root, index) for index in range(len(THINGS)))
+    touch = {"group": c.COLLISION_GROUP, "friction": (0.8, 0.005, 0.0001), "condim": 3}
+
+    ball.add(
+        "geom", name="ball_skin", type="sphere", size=(_BALL_RADIUS_M,), mass=_MASS_KG, material="ball",
+        **{**touch, "group": c.SCENE_GROUP, "condim": 6, "friction": (0.8, 0.005, 0.002)},
+    )  # fmt: skip
+
+    body_z = _CAR_CLEARANCE_M + _CAR_HALF_M[2] - _CAR_GRIP_Z_M
+    car.add("geom", name="car_box", type="box", size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG, **touch)
+    for number, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+        at = (sx * 0.021, sy * 0.014, _WHEEL_M - _CAR_GRIP_Z_M)
+        car.add("geom", name=f"car_wheel_{number}", type="sphere", size=(_WHEEL_M,), pos=at, mass=0.05 * _MASS_KG,
+                **touch)  # fmt: skip
+    _skin(root, car, "car_skin", _car_body(), "car")
+    _skin(root, car, "car_trim", _car_trim(), "car_dark")
+
+    half_m = (_CUP_HEIGHT_M - _CUP_FOOT_M) / 2
+    middle_z = _CUP_FOOT_M + half_m - _CUP_GRIP_Z_M
+    cup.add("geom", name="cup_wall", type="cylinder", size=(_CUP_RADIUS_M, half_m), pos=(0, 0, middle_z),
+            mass=0.8 * _MASS_KG, **touch)  # fmt: skip
+    for number, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+        at = (sx * 0.014, sy * 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M)
+        cup.add("geom", name=f"cup_foot_{number}", type="sphere", size=(_CUP_FOOT_M,), pos=at, mass=0.05 * _MASS_KG,
+                **touch)  # fmt: skip
+    _skin(root, cup, "cup_skin", _cup_body(), "cup")
+    _skin(root, cup, "cup_hole", _cup_inside(), "cup_inside")
+
+
+def _body(root: mjcf.RootElement, index: int) -> mjcf.Element:
+    body = root.worldbody.add("body", name=THINGS[index].name, pos=standing_m(index))
+    body.add("freejoint", name=f"{THINGS[index].name}_joint")
+    return body
+
+
+def _skin(root: mjcf.RootElement, body: mjcf.Element, name: str, mesh: Mesh, material: str) -> None:
+    """What is drawn and weighs and touches nothing."""
+    root.asset.add("mesh", name=name, vertex=mesh.vertices.ravel(), face=mesh.faces.ravel(), inertia="shell")
+    # MuJoCo moves a mesh into its own inertial frame and the geom back: positions stay as given.
+    body.add("geom", name=name, type="mesh", mesh=name, material=material, mass=0.0, contype=0, conaffinity=0,
+             group=c.SCENE_GROUP)  # fmt: skip
