@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, Frame, ImaginedRollout
+from imagine_bench.interfaces import AgentContext, Follow, Frame, ImaginedRollout, SampledFutures
 
+from .futures import sample_futures
 from .imagination import TERMINAL, Imagination, Imagined, imagine_step
 from .learner import Learner
 from .perception import load_perception, prepare_torch
@@ -43,6 +44,22 @@ class ImaginingLearner(Learner):
         start, _ = self.perception.posterior(frame)
         steps = list(self._unroll(start.unsqueeze(0), planned, depth, rng))
         return self._picture(start.unsqueeze(0), steps)
+
+    def sample_futures(
+        self,
+        frames: Frame,
+        actions: NDArray[np.int64],
+        *,
+        follow: Follow,
+        samples: int,
+        depth: int,
+        rng: np.random.Generator,
+    ) -> SampledFutures:
+        """Imagine many futures of the same beginnings; see :class:`imagine_bench.interfaces.FutureSampler`."""
+        encoder = self.perception.encoder
+        return sample_futures(
+            self.imagination, encoder, frames, actions, follow=follow, samples=samples, depth=depth, rng=rng
+        )
 
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator

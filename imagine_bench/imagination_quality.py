@@ -114,7 +114,8 @@ def examples(agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTre
         seeds: Names the generators that imagination draws from.
     """
     rng = SeedTree(0).child("evaluation", "examples", spec.id).generator()
-    picks = rng.choice(len(spec.rules.start_states), size=EXAMPLES, replace=False)
+    known = len(spec.rules.start_states)
+    picks = rng.choice(known, size=EXAMPLES, replace=known < EXAMPLES)
     states = np.array([spec.rules.start_states[index] for index in picks], dtype=np.int64)
     frames = spec.render_macrostates(states, appearance, rng)
     return tuple(

@@ -311,6 +311,51 @@ class Imaginer(Protocol):
         """
 
 
+Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
+"""Macrostates (N, M) that a probe read from imagined latents to macro-actions (N,); a negative one ends there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampledFutures:
+    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held.
+
+    Attributes:
+        macrostates: What the evaluation-only probe reads. Shape (D, R, S, M).
+        rewards: Predicted rewards, 0 once a future has ended. Shape (D, R, S).
+        ended: Whether the model has said, here or before, that the episode is over. Shape (D, R, S).
+    """
+
+    macrostates: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    ended: NDArray[np.bool_]
+
+
+@runtime_checkable
+class FutureSampler(Protocol):
+    """An agent that can be asked for many futures of the same beginning; it changes nothing in the agent."""
+
+    def sample_futures(
+        self,
+        frames: Frame,
+        actions: NDArray[np.int64],
+        *,
+        follow: Follow,
+        samples: int,
+        depth: int,
+        rng: np.random.Generator,
+    ) -> SampledFutures:
+        """Imagine S = ``samples`` futures of D = ``depth`` macro-actions from each of R frames.
+
+        Args:
+            frames: Real camera images. Shape (R, 64, 64, 3).
+            actions: The first macro-action from each. Shape (R,).
+            follow: Chooses the later ones.
+            samples: Futures of each row.
+            depth: Macro-actions of each future.
+            rng: Draws components, noise and dropout masks.
+        """
+
+
 @dataclass(frozen=True, kw_only=True)
 class Shape3D:
     """One drawable part of a scene, fixed to a body.

@@ -36,6 +36,8 @@ class Protocol:
         appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
         overrides: Agent settings that replace the preset's, as sorted (dotted name, value) pairs.
         open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
+        sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
+            distribution at each budget; 0 asks for none.
         recorded_episodes: Real episodes in each recording; 0 records none.
         encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
         device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
@@ -52,6 +54,7 @@ class Protocol:
     appearance: str = "clean"
     overrides: tuple[tuple[str, Any], ...] = ()
     open_loop_starts: int = 100
+    sampled_futures: int = 16
     recorded_episodes: int = 5
     encoder: str | None = None
     device: str = "cpu"
@@ -98,6 +101,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "budgets": (10, 20),
         "evaluation_episodes": 20,
         "open_loop_starts": 20,
+        "sampled_futures": 4,
         "recorded_episodes": 2,
     },
     "quick": {},

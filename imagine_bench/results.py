@@ -45,6 +45,35 @@ class OpenLoop:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Futures:
+    """Sampled futures against the exact ones, from every macrostate of play and macro-action: P pairs, depths 1 to D.
+
+    Attributes:
+        macrostates: Where each begins. Shape (P, M).
+        actions: Its first macro-action. Shape (P,).
+        samples: Futures of each pair. Shape ().
+        total_variation: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
+        floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
+        missing: Possible outcomes that are not imagined. Shape (D, P).
+        invented: Imagined outcomes that are impossible. Shape (D, P).
+        reward_error: Absolute error of the expected reward of this macro-action. Shape (D, P).
+        termination_error: Absolute error of the probability that the episode is over. Shape (D, P).
+        going_on: Exact probability that the episode went on until this macro-action. Shape (D, P).
+    """
+
+    macrostates: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    total_variation: NDArray[np.float64]
+    floor: NDArray[np.float64]
+    missing: NDArray[np.float64]
+    invented: NDArray[np.float64]
+    reward_error: NDArray[np.float64]
+    termination_error: NDArray[np.float64]
+    going_on: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
 class ComparedRollout:
     """An imagined rollout beside what the real environment shows for the same start and actions.
 
@@ -81,6 +110,7 @@ class Checkpoint:
         eval_cpu_s: CPU seconds of this evaluation.
         diagnostics: The agent's own means since the previous checkpoint.
         open_loop: Imagination against the rules, for agents that imagine.
+        futures: Sampled futures against the rules, for agents that can be asked for many.
     """
 
     episodes: int
@@ -94,6 +124,7 @@ class Checkpoint:
     eval_cpu_s: float
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     open_loop: OpenLoop | None = None
+    futures: Futures | None = None
 
     @property
     def success_rate(self) -> float:

@@ -1,8 +1,8 @@
 """The files of one run: written once, when it is finished, and read back with every number the report needs.
 
-``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz`` and ``imagined.npz`` (of agents
-that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and last ``DONE``, with the digests
-of the results.
+``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz``, ``futures.npz`` and
+``imagined.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and last
+``DONE``, with the digests of the results.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import read_json, sha256, write_bytes, write_json
 from imagine_bench.interfaces import ImaginedRollout
-from imagine_bench.results import Checkpoint, ComparedRollout, OpenLoop, RunResult
+from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 FORMAT = "imagine_bench run 1"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
 _OPEN_LOOP, _IMAGINED, _TRAINING = "open_loop.npz", "imagined.npz", "training.npz"
+_FUTURES = "futures.npz"
 _DIAGNOSTIC = "diagnostics/"
 _INTEGERS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
 _NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
@@ -102,9 +103,10 @@ def finish(
     _write_arrays(folder / _TRAINING, training)
     loops = {str(row.episodes): row.open_loop for row in checkpoints if row.open_loop is not None}
     _write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
+    _write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
     examples = {f"{n}/{k}": v for n, one in enumerate(imagined) for k, v in _arrays(one).items()}
     _write_arrays(folder / _IMAGINED, examples)
-    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _IMAGINED]
+    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED]
     write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
 
 
@@ -129,7 +131,7 @@ def load_run(folder: Path) -> RunResult:
     return RunResult(
         agent=config["agent"],
         seed=config["seed"],
-        checkpoints=_read_metrics(folder),
+        checkpoints=with_futures(_read_metrics(folder), _read_arrays(folder / _FUTURES)),
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
@@ -140,11 +142,12 @@ def load_run(folder: Path) -> RunResult:
 
 
 def checkpoint_to_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A row as JSON-serialisable values, for snapshots."""
+    """A row as JSON-serialisable values, for snapshots, but for its futures: see :func:`futures_arrays`."""
     values = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
     loop = checkpoint.open_loop
     values["diagnostics"] = dict(checkpoint.diagnostics)
     values["open_loop"] = None if loop is None else {name: array.tolist() for name, array in _arrays(loop).items()}
+    values["futures"] = None
     return values
 
 
@@ -152,6 +155,18 @@ def checkpoint_from_json(values: Mapping[str, Any]) -> Checkpoint:
     """The inverse of :func:`checkpoint_to_json`."""
     loop = values["open_loop"]
     return Checkpoint(**{**values, "open_loop": None if loop is None else _open_loop(loop)})
+
+
+def futures_arrays(checkpoints: Sequence[Checkpoint]) -> dict[str, NDArray[Any]]:
+    """The futures of all rows, by budget and name."""
+    found = {str(row.episodes): row.futures for row in checkpoints if row.futures is not None}
+    return {f"{budget}/{name}": array for budget, each in found.items() for name, array in _arrays(each).items()}
+
+
+def with_futures(checkpoints: Sequence[Checkpoint], arrays: Mapping[str, NDArray[Any]]) -> tuple[Checkpoint, ...]:
+    """The rows with their futures, as :func:`futures_arrays` gave them."""
+    found = {budget: Futures(**parts) for budget, parts in _grouped(arrays).items()}
+    return tuple(dataclasses.replace(row, futures=found.get(str(row.episodes))) for row in checkpoints)
 
 
 def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:

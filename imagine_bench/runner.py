@@ -21,9 +21,10 @@ from imagine_bench.checkpointing import load_newest, save_snapshot
 from imagine_bench.errors import DivergedError
 from imagine_bench.evaluation import Tally, play
 from imagine_bench.files import lock, make_folder
+from imagine_bench.futures import imagined_futures
 from imagine_bench.imagination_quality import Question, ask, examples, open_loop
-from imagine_bench.interfaces import AgentContext, Imaginer, Rehearser
-from imagine_bench.results import Checkpoint, ComparedRollout, RunResult
+from imagine_bench.interfaces import AgentContext, FutureSampler, Imaginer, Rehearser
+from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam
 
@@ -150,6 +151,7 @@ class _Run:
         if isinstance(self.agent, Imaginer) and self._questions:
             self._tell("imagining", at_once=True)
             loop = open_loop(self.agent, self._questions, self.seeds.child("open_loop", budget))
+        futures = self._futures(budget)
         return Checkpoint(
             episodes=budget,
             env_steps=self.counters.env_steps,
@@ -162,6 +164,21 @@ class _Run:
             eval_cpu_s=test.cpu_s + time.process_time() - start_s,
             diagnostics=test.diagnostics,
             open_loop=loop,
+            futures=futures,
+        )
+
+    def _futures(self, budget: int) -> Futures | None:
+        protocol = self.spec.protocol
+        if not isinstance(self.agent, FutureSampler) or protocol.sampled_futures == 0:
+            return None
+        self._tell("imagining", at_once=True)
+        return imagined_futures(
+            self.agent,
+            self.task,
+            samples=protocol.sampled_futures,
+            appearance=protocol.appearance,
+            seeds=self.seeds.child("futures", budget),
+            purpose=exam(self.spec.seed),
         )
 
     def _add_row(self, row: Checkpoint) -> None:

@@ -18,6 +18,7 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import Checkpoint
 
+_FUTURES = "futures/"
 Phase = Literal["training", "rehearsing", "testing", "imagining", "recording", "done"]
 
 
@@ -109,17 +110,22 @@ class Counters:
             "rows": [run_folder.checkpoint_to_json(row) for row in self.rows],
             "test": None if self.test is None else dataclasses.asdict(self.test),
         }
-        return Snapshot(episode=self.episode, agent=agent, arrays=self.training(), values=values)
+        futures = {_FUTURES + name: array for name, array in run_folder.futures_arrays(self.rows).items()}
+        return Snapshot(episode=self.episode, agent=agent, arrays={**self.training(), **futures}, values=values)
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> Counters:
         """The inverse of :meth:`snapshot`."""
         values = snapshot.values
+        futures = {
+            name.removeprefix(_FUTURES): array for name, array in snapshot.arrays.items() if name.startswith(_FUTURES)
+        }
+        rows = [run_folder.checkpoint_from_json(row) for row in values["rows"]]
         return cls(
             episode=snapshot.episode,
             env_steps=values["env_steps"],
             train_cpu_s=values["train_cpu_s"],
-            rows=[run_folder.checkpoint_from_json(row) for row in values["rows"]],
+            rows=list(run_folder.with_futures(rows, futures)),
             success=snapshot.arrays["success"].tolist(),
             length=snapshot.arrays["length"].tolist(),
             test=None if values["test"] is None else Tally(**values["test"]),

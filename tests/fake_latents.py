@@ -37,6 +37,7 @@ class FakeEncoder:
     """What :class:`imagine_bench.agents.encoder.Encoder` offers."""
 
     latent_size = LATENTS
+    device = torch.device("cpu")
     card = SimpleNamespace(preprocessing="gray_strips")
 
     @classmethod

@@ -141,8 +141,6 @@ def test_the_filter_ends_an_imagined_episode_and_stores_nothing_that_it_discards
 
 def test_a_filter_without_dropout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for maker in (imagination_only.make_uncertainty, imagination_agents.make_uncertainty):
-        with pytest.raises(
-            InvalidValueError, match=r"model.members 1 .* Set model.dropout above 0"
-        ):
+        with pytest.raises(InvalidValueError, match=r"model.members 1 .* Set model.dropout above 0"):
             maker(context(monkeypatch, {"model.dropout": 0.0}))
         assert maker(context(monkeypatch, {"model.dropout": 0.0, "model.members": 2})).imagination.filtered

@@ -26,7 +26,7 @@ def test_any_change_changes_the_hash():
         "task": "arrow_puzzle_hard", "preset": "smoke", "settings": "chapter_3", "agents": ("dqn",),
         "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
-        "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "recorded_episodes": 1,
+        "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "device": "cuda",
     }  # fmt: skip
     assert set(changes) >= {field.name for field in dataclasses.fields(Protocol)}

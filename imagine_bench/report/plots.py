@@ -27,7 +27,7 @@ _COLORS = {  # Okabe and Ito's palette
     "imagination_only": "#cc79a7",
     "imagination_only_uncertainty": "#56b4e9",
 }
-_SPARE_COLORS = ("#cc79a7", "#56b4e9", "#e69f00")
+_SPARE_COLORS = ("#e69f00", "#882255", "#999933")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",

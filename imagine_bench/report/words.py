@@ -43,8 +43,8 @@ _AGENTS = {
     ),
     "imagination_only": AgentWords(
         "imagination only",
-        "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world is "
-        "trained in that model alone, and is what is tested.",
+        "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world "
+        "is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentWords(
         "imagination only + uncertainty",
