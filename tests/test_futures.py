@@ -12,6 +12,7 @@ from fake_latents import CODES, LATENTS, FakeEncoder, frame
 from imagine_bench.agents.futures import sample_futures
 from imagine_bench.agents.imagination import Imagination
 from imagine_bench.agents.memory import RealMemory
+from imagine_bench.agents.perception import prepare_torch
 from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
 from numpy.typing import NDArray
 
@@ -179,7 +180,7 @@ def learned(components: int) -> Imagination:
         batch_size=64,
     )
     settings = Settings(model=model, imagination=ImaginationSettings(weight_samples=1))
-    device = torch.device("cpu")
+    device = prepare_torch("cpu")
     imagination = Imagination(LATENTS, 2, settings, filtered=False, seeds=SeedTree(1), device=device)
     rng, real = np.random.default_rng(0), RealMemory(1000, LATENTS, device)
     for _ in range(1000):
