@@ -11,7 +11,6 @@ from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from imagine_bench.interfaces import FutureSampler, Rules, SampledFutures, TaskSpec
 from imagine_bench.results import Futures
@@ -121,6 +120,8 @@ def sampling_floor(exact: dict[State, float], count: int) -> float:
 
     Half the sum of the mean absolute deviations of binomial counts, by De Moivre's formula (Diaconis & Zabell 1991).
     """
+    from scipy import stats  # noqa: PLC0415 - loads slowly, and every command imports this module
+
     p = np.minimum(np.array(list(exact.values())), 1.0)
     m = np.floor(count * p)
     deviation = 2.0 * (m + 1.0) * (1.0 - p) * stats.binom.pmf(m + 1.0, count, p)  # E |X - count p|
