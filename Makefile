@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench view report encoder film doctor test test-slow lint speed clean
+.PHONY: help setup bench plan generalise view report encoder film doctor test test-slow lint speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -24,6 +24,12 @@ setup: $(READY)  ## Install everything into .venv and stop
 
 bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
 	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) $(ARGS)
+
+plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
+	@$(BIN)/imagine-bench plan --task $(TASK) $(ARGS)
+
+generalise: $(READY)  ## Ask the newest bench's models for transitions that no training can contain
+	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
 
 view: $(READY)  ## Open the newest recording in the Rerun viewer
 	@$(BIN)/imagine-bench view $(ARGS)

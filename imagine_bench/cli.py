@@ -90,6 +90,71 @@ class Report:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves pictures, a recording."""
+
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """A run's folder; by default the best imagining run of the newest bench of the task."""
+    task: str | None = None
+    """Task whose newest bench is taken; by default of any task."""
+    count: int = 100
+    """Plans."""
+    recorded: int = 5
+    """Plans that are recorded too; 0 for none."""
+    execution: str = EXECUTIONS[0]
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    max_epistemic: Annotated[
+        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the agent's own filter)")
+    ] = None
+    """A plan with an imagined step of more epistemic uncertainty is refused."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the run's, if bundled)")
+    ] = None
+    """The encoder the run saw through, where it is not bundled."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Find, plan, report."""
+        from imagine_bench.quality import plan_report  # noqa: PLC0415 - matplotlib's fonts and pillow load slowly
+
+        print(
+            plan_report(
+                self.run,
+                root=self.out,
+                task=self.task,
+                count=self.count,
+                recorded=self.recorded,
+                execution=self.execution,
+                max_epistemic=self.max_epistemic,
+                encoder=self.encoder,
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generalise:
+    """Ask the trained models for transitions that no training can contain: those out of terminal macrostates."""
+
+    folder: Annotated[Path | None, tyro.conf.Positional] = None
+    """A bench's folder; by default the newest."""
+    task: str | None = None
+    """Task whose newest bench is taken; by default of any task."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the runs', if bundled)")
+    ] = None
+    """The encoder the runs saw through, where it is not bundled."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Ask and report."""
+        from imagine_bench.quality import generalisation_report  # noqa: PLC0415 - as above
+
+        print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """Open a recording in the Rerun viewer."""
 
@@ -203,6 +268,8 @@ class Speed:
 Command = (
     Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Generalise, tyro.conf.subcommand("generalise")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Encoder, tyro.conf.subcommand("encoder")]
     | Annotated[Film, tyro.conf.subcommand("film")]

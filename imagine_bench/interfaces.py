@@ -87,7 +87,9 @@ class Rules(Protocol):
         """The macrostates an episode may start in, equally likely."""
 
     def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        """Every possible result of ``action`` in ``macrostate``."""
+        """Every possible result of ``action`` in ``macrostate``, also out of a terminal one: the scene goes on obeying
+        its dynamics there, though no episode does.
+        """
 
     def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
         """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""

@@ -30,10 +30,11 @@ def rollout_strip(
     Each column names the macro-action and shows the real frame, the decoded imagined one, and the predicted reward,
     P(end) and epistemic uncertainty, with the true reward in brackets. A vertical line marks where the uncertainty
     filter cut; what it threw away is paler. The frame around an imagined picture is blue where its macrostate is what
-    the rules say and orange where it is not; the words below say the same.
+    the rules say and orange where it is not; the words below say the same. Where nothing real is to
+    compare with (a plan that was not carried out that far), the upper row stays empty.
 
     Args:
-        compared: The rollout of depth D and its real counterpart.
+        compared: The rollout of depth D and its real counterpart, of depth D or less.
         action_names: Names of the task's macro-actions.
         columns: Macro-actions to make room for; None for exactly D. Deeper rollouts are shown up to there.
 
@@ -72,21 +73,24 @@ def _column(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, index: int, names: tuple[str, ...]
 ) -> None:
     rollout, column = compared.rollout, index + 1
-    kept = bool(rollout.accepted[index])
-    over = index > 0 and bool(compared.real_terminated[index - 1])
-    right = np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
+    kept, happened = bool(rollout.accepted[index]), index < len(compared.real_frames)
+    over = 0 < index <= len(compared.real_frames) and bool(compared.real_terminated[index - 1])
+    right = happened and np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
+    judged = happened and not over
     ink = _INK if kept else _FAINT
     lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
     draw.multiline_text((_left(column), 8), "\n".join(lines), font=_font(12, bold=True), fill=ink, spacing=3)
-    _picture(canvas, compared.real_frames[index], column=column, row=0, pale=over)
+    if happened:
+        _picture(canvas, compared.real_frames[index], column=column, row=0, pale=over)
     if over:
         _overlay_text(draw, column, "episode over")
     _picture(canvas, _gray(rollout.frames[index]), column=column, row=1, pale=not kept)
-    if not over:
+    if judged:
         _frame(draw, column, _RIGHT if right else _WRONG)
+    truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
     facts = [
-        "" if over else ("as the rules say" if right else "not what happens"),
-        f"reward {_signed(rollout.rewards[index])} ({_signed(compared.real_rewards[index])})",
+        ("as the rules say" if right else "not what happens") if judged else "",
+        f"reward {_signed(rollout.rewards[index])}{truth}",
         f"P(end) {rollout.p_terminated[index]:.2f}",
         f"epistemic {rollout.epistemic[index]:.2g}",
     ]

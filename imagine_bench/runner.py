@@ -23,7 +23,7 @@ from imagine_bench.evaluation import Tally, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
 from imagine_bench.imagination_quality import Question, ask, examples, open_loop
-from imagine_bench.interfaces import AgentContext, FutureSampler, Imaginer, Rehearser
+from imagine_bench.interfaces import FutureSampler, Imaginer, Rehearser
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam
@@ -71,7 +71,7 @@ class _Run:
         self.task = registry.task(spec.protocol.task)
         self.entry = registry.agent_entry(spec.agent)
         self.seeds = SeedTree(spec.seed)
-        self.agent = registry.make_agent(spec.agent, self._context())
+        self.agent = registry.make_agent(spec.agent, spec.context())
         self.counters = Counters()
         run_folder.check_config(folder, self._config())
         snapshot = load_newest(folder / "checkpoints")
@@ -222,20 +222,6 @@ class _Run:
             appearance=protocol.appearance,
             episodes=protocol.recorded_episodes,
             path=run_folder.recording_path(self.folder),
-        )
-
-    def _context(self) -> AgentContext:
-        protocol = self.spec.protocol
-        return AgentContext(
-            n_actions=self.task.n_actions,
-            preprocessing=self.task.preprocessing,
-            encoder=self.spec.encoder if self.entry.needs_encoder else None,
-            seeds=self.seeds.child("agent"),  # the same for every agent: runs of one seed are pairs
-            settings=protocol.settings,
-            preset=protocol.preset,
-            overrides=dict(protocol.overrides),
-            device=protocol.device,
-            optimal_action=self.task.rules.optimal_action if self.entry.privileged else None,
         )
 
     def _config(self) -> Mapping[str, Any]:

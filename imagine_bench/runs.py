@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from imagine_bench import registry, run_folder
 from imagine_bench.checkpointing import Snapshot
 from imagine_bench.evaluation import Tally
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import Checkpoint
+from imagine_bench.seeding import SeedTree
 
 _FUTURES = "futures/"
 Phase = Literal["training", "rehearsing", "testing", "imagining", "recording", "done"]
@@ -45,6 +46,22 @@ class RunSpec:
         """Episodes to play, for training and for tests."""
         tests, budgets = self.protocol.evaluation_episodes, self.protocol.budgets
         return budgets[-1] + len(budgets) * tests if registry.agent_entry(self.agent).learns else tests
+
+    def context(self) -> AgentContext:
+        """What the run's agent is built from."""
+        protocol, entry = self.protocol, registry.agent_entry(self.agent)
+        task = registry.task(protocol.task)
+        return AgentContext(
+            n_actions=task.n_actions,
+            preprocessing=task.preprocessing,
+            encoder=self.encoder if entry.needs_encoder else None,
+            seeds=SeedTree(self.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
+            settings=protocol.settings,
+            preset=protocol.preset,
+            overrides=dict(protocol.overrides),
+            device=protocol.device,
+            optimal_action=task.rules.optimal_action if entry.privileged else None,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -118,15 +118,18 @@ def load_bench(folder: Path) -> BenchResult:
     )
 
 
-def newest_bench(root: Path) -> Path:
-    """The bench folder below ``root`` that was worked on last.
+def newest_bench(root: Path, task: str | None = None) -> Path:
+    """The bench folder below ``root`` that was worked on last, of any task or of one.
 
     Raises:
         ArtefactError: There is none.
     """
-    found = sorted(root.glob(f"*/*/{_SITTINGS}"), key=lambda path: path.stat().st_mtime)
+    found = sorted(root.glob(f"{task or '*'}/*/{_SITTINGS}"), key=lambda path: path.stat().st_mtime)
     if not found:
-        raise ArtefactError(f"There is no bench below {root}; run one with 'imagine-bench bench --task arrow_puzzle'.")
+        where = f"{root / task if task else root}"
+        raise ArtefactError(
+            f"There is no bench below {where}; run one with 'imagine-bench bench --task {task or 'arrow_puzzle'}'."
+        )
     return found[-1].parent
 
 

@@ -12,15 +12,9 @@ _EYE_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
 """Beside the human's hand, across the table from the arm: neither hides the objects."""
 
 
-def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) -> rrb.Blueprint:
-    """The layout: the scene large, beside it what the agent sees, says and expects, below it what it imagines.
-
-    Args:
-        target_m: What the 3D view looks at. Shape (3,).
-        values: Whether the agent has Q-values.
-        imagines: Whether the agent imagines.
-    """
-    scene = rrb.Spatial3DView(
+def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
+    """The 3D scene, seen from beside the human's hand."""
+    return rrb.Spatial3DView(
         origin=ROOT,
         name="The scene: the arm turns cubes, a human points",
         eye_controls=rrb.EyeControls3D(
@@ -29,6 +23,17 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) ->
         background=[214, 222, 230],
         line_grid=False,
     )
+
+
+def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) -> rrb.Blueprint:
+    """The layout: the scene large, beside it what the agent sees, says and expects, below it what it imagines.
+
+    Args:
+        target_m: What the 3D view looks at. Shape (3,).
+        values: Whether the agent has Q-values.
+        imagines: Whether the agent imagines.
+    """
+    scene = scene_view(target_m)
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
     story = rrb.TextDocumentView(origin="/real/story", name="What happens")
     side: list[rrb.Container | rrb.View] = [rrb.Horizontal(story, frame)]

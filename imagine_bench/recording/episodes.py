@@ -24,10 +24,10 @@ from imagine_bench import registry
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.files import make_folder
-from imagine_bench.interfaces import Agent, Frame, Imaginer, Motion, Observation, SceneReader, TaskSpec, ValueReader
+from imagine_bench.interfaces import Agent, Frame, Imaginer, Observation, SceneReader, TaskSpec, ValueReader
 from imagine_bench.pictures import png, rollout_strip
 from imagine_bench.recording.blueprint import blueprint
-from imagine_bench.recording.scene import entity_name, extent_m, log_motion, log_shapes
+from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed
 
@@ -35,8 +35,6 @@ MOTION_HZ = 20.0
 IMAGINED_DEPTH = 6
 """Macro-actions imagined at each step; as many as a strip shows legibly."""
 _STILL_S = 1.5
-_SMALL_M = 0.07
-_KINEMATIC_STEP_S = 1.0
 _BAR_CELLS = 16
 _KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}
 
@@ -72,7 +70,7 @@ def record_run(
             scene.capture_motion_hz = MOTION_HZ
         env.reset(seed=episode_seed("recording", seed, 1))
         layout = blueprint(
-            target_m=_target_m(scene),
+            target_m=look_target_m(scene),
             values=isinstance(agent, ValueReader),
             imagines=isinstance(agent, Imaginer),
         )
@@ -179,7 +177,7 @@ class _Story:
             self._imagine(frame, macrostate, episode, step)
             frame, reward, terminated, truncated, info = env.step(np.int64(action))
             began_s = self._clock_s
-            self._clock_s += self._duration_s(env.unwrapped)
+            self._clock_s += macro_duration_s(env.unwrapped)
             self._arrive(episode, frame)
             self._move(env.unwrapped, episode, only_moved=True, began_s=began_s)
             self._recording.log("/real/reward", rr.Scalars(float(reward)), strict=True)
@@ -204,12 +202,6 @@ class _Story:
             if self._env_step == 0:
                 sequences["imagined_depth"] = 0
             log_motion(self._recording, scene.motion(), start_s=start_s, sequences=sequences, only_moved=only_moved)
-
-    def _duration_s(self, scene: Any) -> float:
-        """How long the latest macro-action took, in simulated seconds; a kinematic one takes none and is given one."""
-        motion: Motion | None = scene.motion() if isinstance(scene, SceneReader) else None
-        length_s = 0.0 if motion is None else float(motion.time_s[-1])
-        return length_s or _KINEMATIC_STEP_S
 
     def _say(self, markdown: str) -> None:
         document = rr.TextDocument(f"*{self._spec.description}*\n\n{markdown}", media_type=rr.MediaType.MARKDOWN)
@@ -283,15 +275,3 @@ class _Story:
             for word, values in predictions.items():
                 recording.log(f"{root}/prediction/{word}", rr.Scalars(float(values[depth - 1])), strict=True)
         recording.disable_timeline("imagined_depth")
-
-
-def _target_m(scene: Any) -> NDArray[np.float64]:
-    """What the 3D view looks at: the middle of the small bodies, which are the objects and the fingers."""
-    if not isinstance(scene, SceneReader):
-        return np.zeros(3)
-    motion = scene.motion()
-    large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
-    small = [index for index, body in enumerate(motion.body_names) if body not in large]
-    chosen = small or list(range(len(motion.body_names)))
-    places: NDArray[np.float64] = motion.poses_in_world[0, chosen, :3]
-    return places.mean(axis=0)

@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Motion, Shape3D
+from imagine_bench.interfaces import Motion, SceneReader, Shape3D
 
 ROOT = "/scene"
 _STILL_M = 1e-6
@@ -19,6 +19,8 @@ _STILL_M = 1e-6
 
 
 _BACKDROP_M = 2.0
+_SMALL_M = 0.07
+_KINEMATIC_STEP_S = 1.0
 
 
 def extent_m(shape: Shape3D) -> float:
@@ -68,6 +70,25 @@ def log_motion(
             continue
         columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:]))
         recording.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
+
+
+def macro_duration_s(scene: Any) -> float:
+    """How long the latest macro-action took, in simulated seconds; a kinematic one takes none and is given one."""
+    motion: Motion | None = scene.motion() if isinstance(scene, SceneReader) else None
+    length_s = 0.0 if motion is None else float(motion.time_s[-1])
+    return length_s or _KINEMATIC_STEP_S
+
+
+def look_target_m(scene: Any) -> NDArray[np.float64]:
+    """What the 3D view looks at: the middle of the small bodies, which are the objects and the fingers."""
+    if not isinstance(scene, SceneReader):
+        return np.zeros(3)
+    motion = scene.motion()
+    large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
+    small = [index for index, body in enumerate(motion.body_names) if body not in large]
+    chosen = small or list(range(len(motion.body_names)))
+    places: NDArray[np.float64] = motion.poses_in_world[0, chosen, :3]
+    return places.mean(axis=0)
 
 
 def _drawable(shape: Shape3D) -> rr.AsComponents:

@@ -1,0 +1,139 @@
+"""What trained agents can do beyond the bench's test: plans carried out blindly, and transitions nobody ever saw."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from imagine_bench import registry
+from imagine_bench.environment import describe_environment
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.generalisation import answer, probing, summarise
+from imagine_bench.interfaces import EXECUTIONS
+from imagine_bench.plans import make_plans
+from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
+from imagine_bench.report.plans import plan_table, write_plans
+from imagine_bench.seeding import SeedTree, exam
+from imagine_bench.store import load_bench, newest_bench
+from imagine_bench.trained import Trained, best_run, imagining, load_trained
+
+_STRIPS = 6
+"""Plans in the picture, of as many lengths as there are."""
+
+
+def plan_report(
+    run: Path | None,
+    *,
+    root: Path,
+    task: str | None,
+    count: int,
+    recorded: int,
+    execution: str,
+    max_epistemic: float | None,
+    encoder: str | None,
+) -> str:
+    """Plan, carry out, and leave a table, pictures and a recording in the run's folder, below ``plans``.
+
+    Args:
+        run: A run's folder; None for the best imagining run of the newest bench.
+        root: Folder of all benches.
+        task: Whose newest bench; None for that of any task.
+        count: Plans.
+        recorded: Plans that are recorded.
+        execution: ``"physics"`` or ``"kinematic"``.
+        max_epistemic: See :func:`imagine_bench.plans.make_plans`.
+        encoder: See :func:`imagine_bench.trained.load_trained`.
+
+    Returns:
+        What to print.
+
+    Raises:
+        ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
+    """
+    require_known("execution", execution, EXECUTIONS)
+    if recorded < 0 or count < 1:
+        raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
+    if run is None:
+        run = best_run(load_bench(newest_bench(root, _known(task)))).folder
+    trained = load_trained(run, encoder=encoder)
+    plans = list(
+        tqdm(
+            make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic),
+            total=count,
+            desc="plans",
+            leave=False,
+            disable=not sys.stderr.isatty(),
+        )
+    )
+    folder = run / "plans" / f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
+    facts = {**_facts(trained), "execution": execution, "max_epistemic": max_epistemic}
+    summary = write_plans(folder, plans, trained.task, facts, strips=_STRIPS)
+    said = [f"{_title(trained)}, {execution}", "", plan_table(summary, trained.task), ""]
+    said += [f"plan {plan.number} from {plan.start}: {plan.outcome}" for plan in plans if not plan.solved]
+    said += [f"Pictures:   {folder / 'plans.png'}"]
+    if recorded:
+        from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - loading Rerun costs a second
+
+        path = folder / "recording.rrd"
+        record_plans(trained, count=min(recorded, count), execution=execution, max_epistemic=max_epistemic, path=path)
+        said.append(f"Recording:  {path} (imagine-bench view opens it)")
+    return "\n".join(said)
+
+
+def generalisation_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+    """Ask every imagining run of a bench for every transition, and leave the answers in its folder.
+
+    Args:
+        folder: A bench's folder; None for the newest.
+        root: Folder of all benches.
+        task: Whose newest bench; None for that of any task.
+        encoder: See :func:`imagine_bench.trained.load_trained`.
+
+    Returns:
+        What to print.
+
+    Raises:
+        ImagineBenchError: No bench, or none that imagines.
+    """
+    result = load_bench(folder or newest_bench(root, _known(task)))
+    protocol = result.protocol
+    spec = registry.task(protocol.task)
+    probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
+    asked = []
+    for run in tqdm(imagining(result), desc="runs", leave=False, disable=not sys.stderr.isatty()):
+        trained = load_trained(run.folder, encoder=encoder)
+        answers = answer(trained.imaginer, probe, SeedTree(run.seed).child("generalisation"))
+        asked.append(Asked(agent=run.agent, seed=run.seed, answers=answers, summary=summarise(probe, answers)))
+    where = result.folder / "generalisation"
+    facts = {**_origin(protocol.hash), "episodes": protocol.budgets[-1], "appearance": protocol.appearance}
+    write_generalisation(where, asked, probe, spec, facts)
+    head = f"{spec.title}, {protocol.appearance}, after {protocol.budgets[-1]:,} real episodes"
+    return "\n".join([head, "", generalisation_table(asked, probe, spec), "", f"Answers:    {where}"])
+
+
+def _known(task: str | None) -> str | None:
+    if task is not None:
+        registry.task_entry(task)
+    return task
+
+
+def _title(trained: Trained) -> str:
+    spec = trained.spec
+    return (
+        f"{trained.task.title}: {spec.agent}, seed {spec.seed}, after {trained.episodes:,} real episodes, "
+        f"{spec.protocol.appearance}"
+    )
+
+
+def _facts(trained: Trained) -> dict[str, Any]:
+    spec = trained.spec
+    names = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
+    return {**_origin(spec.protocol.hash), **names, "appearance": spec.protocol.appearance}
+
+
+def _origin(protocol_hash: str) -> dict[str, Any]:
+    environment = describe_environment()
+    return {"protocol_hash": protocol_hash, **{name: environment.get(name) for name in ("commit", "command")}}

@@ -1,0 +1,170 @@
+"""The recording of plans: the arm carries out blindly what the agent imagined from one frame, both side by side.
+
+Timelines: ``sim_time`` (the arm moves), ``env_step`` (one a macro-action), ``plan``. Entities: ``/scene/...``,
+``/real/...``, ``/imagined/...``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from imagine_bench.files import make_folder
+from imagine_bench.interfaces import SceneReader
+from imagine_bench.pictures import png, rollout_strip
+from imagine_bench.plans import Plan, carry_out, make_env
+from imagine_bench.recording.blueprint import scene_view
+from imagine_bench.recording.episodes import MOTION_HZ, recording_file
+from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.results import ComparedRollout
+from imagine_bench.trained import Trained
+
+_LOOK_S = 2.0
+"""How long the scene stands still while the plan is shown, before and after the arm moves."""
+
+
+def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None, path: Path) -> Path:
+    """Record the first ``count`` plans of :func:`imagine_bench.plans.make_plans`, carried out once more.
+
+    Args:
+        trained: An agent that imagines.
+        count: Plans.
+        execution: ``"physics"`` or ``"kinematic"``.
+        max_epistemic: As for the plans themselves.
+        path: The file to write, ending in ``.rrd``.
+    """
+    make_folder(path.parent)
+    with closing(make_env(trained, execution)) as env:
+        scene = env.unwrapped
+        if isinstance(scene, SceneReader):
+            scene.capture_motion_hz = MOTION_HZ
+        env.reset(seed=0)
+        with recording_file(path, trained.task.id, _layout(scene, trained)) as recording:
+            if isinstance(scene, SceneReader):
+                log_shapes(recording, scene.shapes())
+            story = _PlanStory(recording, trained, env, count, max_epistemic)
+            for number in range(count):
+                story.tell(number)
+    return path
+
+
+class _PlanStory:
+    """Tells one plan after the other on a common clock."""
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        trained: Trained,
+        env: gymnasium.Env[Any, Any],
+        count: int,
+        max_epistemic: float | None,
+    ) -> None:
+        self._recording, self._trained, self._env = recording, trained, env
+        self._count, self._max_epistemic = count, max_epistemic
+        self._clock_s, self._env_step = 0.0, 0
+
+    def tell(self, number: int) -> None:
+        """One plan: the scene stands, the plan appears, the arm does it, and it is seen what came of it."""
+        recording, begins_s = self._recording, self._clock_s
+        recording.set_time("plan", sequence=number + 1)
+        moments: list[tuple[float, int]] = []
+
+        def on_plan(*_: object) -> None:
+            self._arrive(only_moved=False)
+            moments.append((self._clock_s, self._env_step))
+            self._clock_s += _LOOK_S
+
+        def on_step(_: int) -> None:
+            began_s = self._clock_s
+            self._clock_s += macro_duration_s(self._env.unwrapped)
+            self._env_step += 1
+            self._arrive(only_moved=True, began_s=began_s)
+            moments.append((self._clock_s, self._env_step))
+
+        plan = carry_out(
+            self._env, self._trained, number, max_epistemic=self._max_epistemic, on_step=on_step, on_plan=on_plan
+        )
+        for done, (clock_s, env_step) in enumerate(moments):
+            self._set_clocks(clock_s, env_step)
+            self._show(plan, done)
+        self._clock_s = max(self._clock_s, begins_s) + _LOOK_S
+        self._env_step += 1
+
+    def _set_clocks(self, clock_s: float, env_step: int) -> None:
+        self._recording.set_time("sim_time", duration=clock_s)
+        self._recording.set_time("env_step", sequence=env_step)
+
+    def _arrive(self, *, only_moved: bool, began_s: float | None = None) -> None:
+        scene: Any = self._env.unwrapped
+        self._set_clocks(self._clock_s, self._env_step)
+        if isinstance(scene, SceneReader):
+            start_s = self._clock_s if began_s is None else began_s
+            log_motion(
+                self._recording,
+                scene.motion(),
+                start_s=start_s,
+                sequences={"env_step": self._env_step},
+                only_moved=only_moved,
+            )
+
+    def _show(self, plan: Plan, done: int) -> None:
+        """What was imagined, and what is real so far."""
+        recording, compared, rollout = self._recording, plan.compared, plan.compared.rollout
+        real = compared.start_frame if done == 0 else compared.real_frames[done - 1]
+        imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
+        gray = (np.clip(imagined, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+        recording.log("/real/frame", rr.Image(real), strict=True)
+        recording.log("/imagined/frame", rr.Image(gray, color_model="L"), strict=True)
+        strip = rollout_strip(_so_far(compared, done), self._trained.task.action_names)
+        image = rr.EncodedImage(contents=png(strip), media_type="image/png")
+        recording.log("/imagined/strip", image, strict=True)
+        text = rr.TextDocument(self._words(plan, done), media_type=rr.MediaType.MARKDOWN)
+        recording.log("/real/story", text, strict=True)
+
+    def _words(self, plan: Plan, done: int) -> str:
+        names = self._trained.task.action_names
+        lines = [f"### Plan {plan.number + 1} of {self._count}, imagined from one frame", ""]
+        for step, action in enumerate(plan.compared.rollout.actions, start=1):
+            mark = "done" if step <= done else ("**now**" if step == done + 1 and not plan.refused else "")
+            lines.append(f"{step}. {names[int(action)]} {mark}")
+        last = done == plan.done
+        if plan.refused:
+            lines += ["", f"**Refused:** {plan.refused}."]
+        elif last:
+            lines += ["", f"**{plan.outcome[0].upper()}{plan.outcome[1:]}.** The shortest possible: {plan.shortest}."]
+        else:
+            lines += ["", "The arm does this without looking again."]
+        return "\n".join(lines)
+
+
+def _so_far(compared: ComparedRollout, done: int) -> ComparedRollout:
+    """The comparison when ``done`` macro-actions are carried out."""
+    names = ("real_frames", "real_macrostates", "real_rewards", "real_terminated")
+    return dataclasses.replace(compared, **{name: getattr(compared, name)[:done] for name in names})
+
+
+def _layout(scene: Any, trained: Trained) -> rrb.Blueprint:
+    frames = rrb.Horizontal(
+        rrb.Spatial2DView(origin="/real/frame", name="What the camera sees (the agent does not)"),
+        rrb.Spatial2DView(origin="/imagined/frame", name="What the agent imagined for this moment"),
+    )
+    story = rrb.TextDocumentView(origin="/real/story", name="The plan")
+    top = rrb.Horizontal(scene_view(look_target_m(scene)), rrb.Vertical(story, frames), column_shares=[1.1, 1.0])
+    strip = rrb.Spatial2DView(
+        origin="/imagined/strip",
+        name=f"{trained.task.title}: the plan, real above and imagined below",
+        background=[255, 255, 255],
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(top, strip, row_shares=[1.45, 1.0]),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"),
+    )

@@ -1,0 +1,120 @@
+"""A trained agent, taken up again from the last checkpoint of its run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import encoders, registry
+from imagine_bench.checkpointing import load_newest
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.files import read_json
+from imagine_bench.interfaces import Agent, Imaginer, TaskSpec
+from imagine_bench.protocol import Protocol
+from imagine_bench.results import BenchResult, RunResult
+from imagine_bench.runs import RunSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """An agent as its run left it.
+
+    Attributes:
+        agent: The agent itself.
+        spec: What its run was.
+        task: The task it was trained on.
+        episodes: Real training episodes it has had.
+        folder: Its run's folder.
+    """
+
+    agent: Agent
+    spec: RunSpec
+    task: TaskSpec
+    episodes: int
+    folder: Path
+
+    @property
+    def imaginer(self) -> Imaginer:
+        """The same agent, as one that imagines.
+
+        Raises:
+            InvalidValueError: It does not imagine.
+        """
+        if not isinstance(self.agent, Imaginer):
+            raise InvalidValueError(
+                f"The agent {self.spec.agent!r} of {self.folder} does not imagine; give the run of one that does."
+            )
+        return self.agent
+
+
+def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
+    """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
+
+    Args:
+        folder: A run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``.
+        encoder: Bundled name or path, where the run used an encoder that is not bundled.
+
+    Raises:
+        ArtefactError: No run, no checkpoint, another encoder, or a snapshot that does not fit this version.
+        UnknownNameError: No such encoder.
+    """
+    config = read_json(folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
+    protocol = Protocol.from_dict(config["protocol"])
+    settings = tuple(sorted(_flat(config["settings"]).items()))
+    spec = RunSpec(
+        protocol=dataclasses.replace(protocol, overrides=settings),  # as it ran, whatever the presets say by now
+        agent=config["agent"],
+        seed=config["seed"],
+        encoder=_encoder(protocol, config["agent"], encoder),
+    )
+    snapshot = load_newest(folder / "checkpoints")
+    if snapshot is None:
+        raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
+    agent = registry.make_agent(spec.agent, spec.context())
+    agent.restore(snapshot.agent)
+    return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
+
+
+def imagining(result: BenchResult) -> tuple[RunResult, ...]:
+    """The runs of a bench whose agents imagine.
+
+    Raises:
+        ArtefactError: There are none.
+    """
+    runs = tuple(run for run in result.runs if run.imagined)
+    if not runs:
+        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
+    return runs
+
+
+def best_run(result: BenchResult) -> RunResult:
+    """The imagining run of a bench that solves most of its last test; the first of equals.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    return max(imagining(result), key=lambda run: run.checkpoints[-1].success_rate)
+
+
+def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
+    if not registry.agent_entry(agent).needs_encoder or protocol.encoder is None:
+        return None
+    name = protocol.encoder.partition("@")[0]
+    path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given or name)
+    if encoders.identity(path) != protocol.encoder:
+        raise ArtefactError(
+            f"The run saw through encoder {protocol.encoder}, and {path} is {encoders.identity(path)}; give the right "
+            "file with --encoder."
+        )
+    return path
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value})
+    return flat
