@@ -41,6 +41,7 @@ _NOT_NEGATIVE = _Range(lambda value: value >= 0.0, "must be at least 0")
 _COUNT = _Range(lambda value: value >= 1, "must be at least 1")
 _RANGES = {
     "model.dropout": _SHARE,
+    "model.reward_scale": _POSITIVE,
     "model.learning_rate": _POSITIVE,
     "model.max_norm": _POSITIVE,
     "model.updates_per_step": _COUNT,

@@ -24,6 +24,8 @@ class WorldModelSettings:
         termination_hidden: Units a hidden layer of the termination network.
         shared_hidden: Units a hidden layer of one network with both outputs, instead of the two (thesis 3.2.2).
         assessment_input: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
+        reward_scale: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear
+            above, where a rare large reward is hardly heard; the thesis counts in plain units, 1.
         dropout: Probability of dropping a hidden unit, the same in every network; [0, 1).
         learning_rate: Of Adam (thesis 3.2.2: 1e-3).
         max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
@@ -41,6 +43,7 @@ class WorldModelSettings:
     termination_hidden: tuple[int, ...] = (256, 256)
     shared_hidden: tuple[int, ...] = ()
     assessment_input: str = "next_state"
+    reward_scale: float = 1.0
     dropout: float = 0.5
     learning_rate: float = 1e-3
     max_norm: float | None = 3.0

@@ -27,7 +27,7 @@ from .settings import WorldModelSettings
 
 @dataclass(frozen=True, slots=True)
 class ModelLosses:
-    """Means over a batch: negative log-likelihood (nats), log-cosh (reward units), cross-entropy (nats)."""
+    """Means over a batch: negative log-likelihood (nats), log-cosh (of reward units), cross-entropy (nats)."""
 
     dynamics: float
     reward: float
@@ -82,7 +82,7 @@ class WorldModel(nn.Module):
         reward, logit = self.assessment(batch.z, batch.action, batch.next_z, masks)
         return (
             -mdn.log_likelihood(mixture, batch.next_z).mean(dim=1).sum(),  # each member descends as if it were alone
-            log_cosh(reward - batch.reward).mean(),
+            log_cosh(reward - batch.reward / self.settings.reward_scale).mean(),
             functional.binary_cross_entropy_with_logits(logit, batch.terminated),
         )
 
@@ -133,4 +133,4 @@ class WorldModel(nn.Module):
     def assess(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:
         """Predicted rewards and termination probabilities of N transitions, without dropout: two of shape (N,)."""
         reward, logit = self.assessment(z, action, next_z)
-        return reward, logit.sigmoid()
+        return reward * self.settings.reward_scale, logit.sigmoid()
