@@ -145,7 +145,7 @@ class Encoder:
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.float32]:
-        """One grey picture of the whole view for every row of ``latents`` (N, Z). Shape (N, 64, 64), in [0, 1]."""
+        """One picture of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
         _, height, width = picture_shape(self.card.preprocessing)
         return view(self._vae.picture(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
 
@@ -218,10 +218,10 @@ def picture_shape(preprocessing: str) -> tuple[int, int, int]:
 
 
 def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
-    """One grey image of the whole view from preprocessed pictures: (N, C, H, W) to (N, H', W')."""
+    """One image of the whole view from preprocessed pictures: (N, C, H, W) to grey (N, H', W') or RGB (N, H, W, 3)."""
     if preprocessing == "gray_strips":
         return join_strips(pictures)
-    return np.asarray(pictures.mean(axis=1), dtype=np.float32)
+    return np.ascontiguousarray(np.moveaxis(pictures, 1, -1), dtype=np.float32)
 
 
 def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:

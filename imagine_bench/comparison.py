@@ -20,6 +20,7 @@ def compare_rollout(
 ) -> ComparedRollout:
     """Put the truth beside an imagined rollout: the rules give states and rewards, the kinematic mode gives frames.
 
+    Where the rules leave several outcomes to chance, the one that was imagined is taken if it is among them.
     Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
 
     Args:
@@ -33,10 +34,10 @@ def compare_rollout(
     state = tuple(int(value) for value in macrostate)
     over = spec.rules.is_terminal(state)
     states, rewards, ends = [], [], []
-    for action in rollout.actions:
+    for action, imagined in zip(rollout.actions, rollout.macrostates, strict=True):
         reward = 0.0
         if not over:
-            outcome = _draw(spec.rules.outcomes(state, int(action)), rng)
+            outcome = _choose(spec.rules.outcomes(state, int(action)), tuple(imagined.tolist()), rng)
             state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
         states.append(state)
         rewards.append(reward)
@@ -49,6 +50,7 @@ def compare_rollout(
     )
     return ComparedRollout(
         start_frame=frame.copy(),
+        start_macrostate=np.asarray(macrostate, dtype=np.int64),
         rollout=rollout,
         real_frames=real_frames,
         real_macrostates=real_macrostates,
@@ -57,6 +59,9 @@ def compare_rollout(
     )
 
 
-def _draw(outcomes: tuple[Outcome, ...], rng: np.random.Generator) -> Outcome:
-    """One of the possible outcomes, with its probability."""
+def _choose(outcomes: tuple[Outcome, ...], imagined: tuple[int, ...], rng: np.random.Generator) -> Outcome:
+    """The imagined outcome if it is possible, else one of the possible ones, with its probability."""
+    for outcome in outcomes:
+        if outcome.macrostate == imagined:
+            return outcome
     return outcomes[int(rng.choice(len(outcomes), p=[outcome.probability for outcome in outcomes]))]

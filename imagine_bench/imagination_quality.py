@@ -17,6 +17,9 @@ from imagine_bench.seeding import Purpose, SeedTree
 EXAMPLES = 5
 """Greedy imagined rollouts kept with each run, with their real counterparts."""
 
+COURSES, COURSE_DEPTH = 4, 5
+"""Imagined courses of one beginning kept with each run, and macro-actions of each."""
+
 State = tuple[int, ...]
 Alive = Callable[[frozenset[State], int], bool]
 Belief = dict[State, float]
@@ -128,6 +131,40 @@ def examples(agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTre
             rng=rng,
         )
         for index, (frame, state) in enumerate(zip(frames, states, strict=True))
+    )
+
+
+def is_random(rules: Rules) -> bool:
+    """Whether some macro-action may lead to one thing or another."""
+    return any(len(rules.outcomes(state, action)) > 1 for state in rules.states for action in range(rules.n_actions))
+
+
+def imagine_courses(
+    agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree
+) -> tuple[ComparedRollout, ...]:
+    """Imagine the same beginning several times, the agent's greedy controller choosing; none if nothing is random.
+
+    Args:
+        agent: It is not changed.
+        spec: The task; the beginning is the same for every agent and seed.
+        appearance: Appearance level of the real frame (kinematic mode).
+        seeds: Names the generators that imagination draws from.
+    """
+    if not is_random(spec.rules):
+        return ()
+    rng = SeedTree(0).child("evaluation", "courses", spec.id).generator()
+    start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
+    frame = spec.render_macrostates(start[None], appearance, rng)[0]
+    return tuple(
+        compare_rollout(
+            spec,
+            frame=frame,
+            macrostate=start,
+            rollout=agent.imagine(frame, actions=None, depth=COURSE_DEPTH, rng=seeds.child(index).generator()),
+            appearance=appearance,
+            rng=rng,
+        )
+        for index in range(COURSES)
     )
 
 

@@ -247,8 +247,8 @@ class ImaginedRollout:
 
     Attributes:
         actions: Macro-actions imagined. Shape (D,), int64.
-        frames: Decoded latents as pictures in [0, 1], one grey image of the whole view each. Shape (D, H', W').
-        start_frame: The decoded encoding of the real frame it started from. Shape (H', W').
+        frames: Decoded latents as pictures of the whole view in [0, 1], grey (D, H', W') or RGB (D, H', W', 3).
+        start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
         rewards: Predicted rewards. Shape (D,).
         p_terminated: Predicted probability that the episode ended there. Shape (D,).
         q_values: The controller's values in the state *before* each action. Shape (D, A).

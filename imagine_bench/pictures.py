@@ -18,8 +18,8 @@ _GAP = 12
 _LABELS = 108  # width of the column that names the rows
 _HEADER, _FOOTER = 62, 92
 _ROW = _CELL + _GAP
-_INK, _FAINT, _PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
-_RIGHT, _WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: colour-blind safe
+INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
+RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: colour-blind safe
 
 
 def rollout_strip(
@@ -44,12 +44,12 @@ def rollout_strip(
     depth = len(compared.rollout.actions)
     room = depth if columns is None else columns
     width = _LABELS + (room + 1) * _ROW
-    canvas = Image.new("RGB", (width, _HEADER + 2 * _ROW + _FOOTER), _PAPER)
+    canvas = Image.new("RGB", (width, _HEADER + 2 * _ROW + _FOOTER), PAPER)
     draw = ImageDraw.Draw(canvas)
     _row_labels(draw)
     _picture(canvas, compared.start_frame, column=0, row=0)
-    _picture(canvas, _gray(compared.rollout.start_frame), column=0, row=1)
-    draw.text((_left(0), _HEADER - 20), "start", font=_font(13, bold=True), fill=_INK)
+    _picture(canvas, rgb(compared.rollout.start_frame), column=0, row=1)
+    draw.text((_left(0), _HEADER - 20), "start", font=font(13, bold=True), fill=INK)
     for index in range(min(depth, room)):
         _column(canvas, draw, compared, index, action_names)
     _cut_mark(draw, compared, room)
@@ -61,6 +61,12 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG")
     return buffer.getvalue()
+
+
+def rgb(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A picture in [0, 1], grey (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
+    pixels = (np.clip(picture, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
 
 
 def first_cut(compared: ComparedRollout) -> int | None:
@@ -77,16 +83,16 @@ def _column(
     over = 0 < index <= len(compared.real_frames) and bool(compared.real_terminated[index - 1])
     right = happened and np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
     judged = happened and not over
-    ink = _INK if kept else _FAINT
+    ink = INK if kept else FAINT
     lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
-    draw.multiline_text((_left(column), 8), "\n".join(lines), font=_font(12, bold=True), fill=ink, spacing=3)
+    draw.multiline_text((_left(column), 8), "\n".join(lines), font=font(12, bold=True), fill=ink, spacing=3)
     if happened:
         _picture(canvas, compared.real_frames[index], column=column, row=0, pale=over)
     if over:
         _overlay_text(draw, column, "episode over")
-    _picture(canvas, _gray(rollout.frames[index]), column=column, row=1, pale=not kept)
+    _picture(canvas, rgb(rollout.frames[index]), column=column, row=1, pale=not kept)
     if judged:
-        _frame(draw, column, _RIGHT if right else _WRONG)
+        _frame(draw, column, RIGHT if right else WRONG)
     truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
     facts = [
         ("as the rules say" if right else "not what happens") if judged else "",
@@ -95,8 +101,8 @@ def _column(
         f"epistemic {rollout.epistemic[index]:.2g}",
     ]
     for line, text in enumerate(facts):
-        color = (_RIGHT if right else _WRONG) if line == 0 else ink
-        draw.text((_left(column), _HEADER + 2 * _ROW + line * 19), text, font=_font(12, bold=line == 0), fill=color)
+        color = (RIGHT if right else WRONG) if line == 0 else ink
+        draw.text((_left(column), _HEADER + 2 * _ROW + line * 19), text, font=font(12, bold=line == 0), fill=color)
 
 
 def _cut_mark(draw: ImageDraw.ImageDraw, compared: ComparedRollout, room: int) -> None:
@@ -106,22 +112,22 @@ def _cut_mark(draw: ImageDraw.ImageDraw, compared: ComparedRollout, room: int) -
     x = _left(cut + 1) - _GAP // 2 - 1
     draw.line([(x, 4), (x, _HEADER + 2 * _ROW + _FOOTER - 20)], fill=_CUT, width=3)
     text = "filter cuts here"
-    length = int(draw.textlength(text, font=_font(11, bold=True)))
+    length = int(draw.textlength(text, font=font(11, bold=True)))
     bottom = _HEADER + 2 * _ROW + _FOOTER - 16
-    draw.text((max(2, x - length // 2), bottom), text, font=_font(11, bold=True), fill=_CUT)
+    draw.text((max(2, x - length // 2), bottom), text, font=font(11, bold=True), fill=_CUT)
 
 
 def _row_labels(draw: ImageDraw.ImageDraw) -> None:
     bottom = _HEADER + 2 * _ROW
     for y, text in ((_HEADER + 54, "real"), (_HEADER + _ROW + 54, "imagined")):
-        draw.text((8, y), text, font=_font(15, bold=True), fill=_INK)
-    draw.multiline_text((8, bottom + 19), "predicted\n(true)", font=_font(12), fill=_FAINT, spacing=4)
+        draw.text((8, y), text, font=font(15, bold=True), fill=INK)
+    draw.multiline_text((8, bottom + 19), "predicted\n(true)", font=font(12), fill=FAINT, spacing=4)
 
 
 def _overlay_text(draw: ImageDraw.ImageDraw, column: int, text: str) -> None:
-    length = draw.textlength(text, font=_font(13, bold=True))
+    length = draw.textlength(text, font=font(13, bold=True))
     x, y = _left(column) + (_CELL - length) / 2, _HEADER + _CELL / 2 - 8
-    draw.text((x, y), text, font=_font(13, bold=True), fill=_INK)
+    draw.text((x, y), text, font=font(13, bold=True), fill=INK)
 
 
 def _frame(draw: ImageDraw.ImageDraw, column: int, color: tuple[int, int, int]) -> None:
@@ -132,13 +138,8 @@ def _frame(draw: ImageDraw.ImageDraw, column: int, color: tuple[int, int, int]) 
 def _picture(canvas: Image.Image, pixels: NDArray[np.uint8], *, column: int, row: int, pale: bool = False) -> None:
     image = Image.fromarray(pixels).resize((_CELL, _CELL), Image.Resampling.NEAREST)
     if pale:
-        image = Image.blend(image, Image.new("RGB", image.size, _PAPER), 0.65)
+        image = Image.blend(image, Image.new("RGB", image.size, PAPER), 0.65)
     canvas.paste(image, (_left(column), _HEADER + row * _ROW))
-
-
-def _gray(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A grey picture in [0, 1] as RGB bytes: (H, W) to (H, W, 3)."""
-    return np.repeat((np.clip(picture, 0.0, 1.0) * 255.0).round().astype(np.uint8)[:, :, None], 3, axis=2)
 
 
 def _left(column: int) -> int:
@@ -150,7 +151,7 @@ def _signed(value: float) -> str:
 
 
 @functools.lru_cache
-def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which travels with matplotlib."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     data = resources.files("matplotlib").joinpath("mpl-data", "fonts", "ttf", name).read_bytes()

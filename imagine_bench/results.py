@@ -79,6 +79,7 @@ class ComparedRollout:
 
     Attributes:
         start_frame: The real frame it starts from. Shape (64, 64, 3), uint8.
+        start_macrostate: What that frame shows. Shape (M,).
         rollout: What the agent imagined.
         real_frames: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
         real_macrostates: What the rules say. Shape (D, M).
@@ -87,6 +88,7 @@ class ComparedRollout:
     """
 
     start_frame: NDArray[np.uint8]
+    start_macrostate: NDArray[np.int64]
     rollout: ImaginedRollout
     real_frames: NDArray[np.uint8]
     real_macrostates: NDArray[np.int64]
@@ -144,6 +146,7 @@ class RunResult:
         training_success: Whether each training episode succeeded. Shape (episodes,).
         training_length: Macro-actions of each training episode. Shape (episodes,).
         imagined: Example rollouts at the last budget, for agents that imagine.
+        courses: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
         folder: Where the run's files lie.
         recording: Its Rerun recording, or None.
     """
@@ -157,6 +160,7 @@ class RunResult:
     imagined: tuple[ComparedRollout, ...]
     folder: Path
     recording: Path | None
+    courses: tuple[ComparedRollout, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
 """The files of one run: written once, when it is finished, and read back with every number the report needs.
 
-``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz``, ``futures.npz`` and
-``imagined.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and last
-``DONE``, with the digests of the results.
+``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz``, ``futures.npz``, ``imagined.npz``
+and ``courses.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and
+last ``DONE``, with the digests of the results.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop
 FORMAT = "imagine_bench run 1"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
 _OPEN_LOOP, _IMAGINED, _TRAINING = "open_loop.npz", "imagined.npz", "training.npz"
-_FUTURES = "futures.npz"
+_FUTURES, _COURSES = "futures.npz", "courses.npz"
 _DIAGNOSTIC = "diagnostics/"
 _INTEGERS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
 _NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
@@ -87,6 +87,7 @@ def finish(
     checkpoints: Sequence[Checkpoint],
     training: Mapping[str, NDArray[Any]],
     imagined: Sequence[ComparedRollout],
+    courses: Sequence[ComparedRollout],
 ) -> None:
     """Write the results of a run and mark it as done.
 
@@ -95,6 +96,7 @@ def finish(
         checkpoints: One a budget.
         training: ``success`` and ``length`` of each training episode.
         imagined: Example rollouts.
+        courses: Several rollouts from one beginning.
 
     Raises:
         SetupError: Something cannot be written; the run is then not marked.
@@ -104,9 +106,9 @@ def finish(
     loops = {str(row.episodes): row.open_loop for row in checkpoints if row.open_loop is not None}
     _write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
     _write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
-    examples = {f"{n}/{k}": v for n, one in enumerate(imagined) for k, v in _arrays(one).items()}
-    _write_arrays(folder / _IMAGINED, examples)
-    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED]
+    _write_rollouts(folder / _IMAGINED, imagined)
+    _write_rollouts(folder / _COURSES, courses)
+    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED, _COURSES]
     write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
 
 
@@ -135,7 +137,8 @@ def load_run(folder: Path) -> RunResult:
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
-        imagined=_read_imagined(folder),
+        imagined=_read_rollouts(folder / _IMAGINED),
+        courses=_read_rollouts(folder / _COURSES),
         folder=folder,
         recording=recording if recording.is_file() else None,
     )
@@ -193,9 +196,13 @@ def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
     )
 
 
-def _read_imagined(folder: Path) -> tuple[ComparedRollout, ...]:
+def _write_rollouts(path: Path, rollouts: Sequence[ComparedRollout]) -> None:
+    _write_arrays(path, {f"{n}/{k}": v for n, one in enumerate(rollouts) for k, v in _arrays(one).items()})
+
+
+def _read_rollouts(path: Path) -> tuple[ComparedRollout, ...]:
     examples = []
-    for _, arrays in sorted(_grouped(_read_arrays(folder / _IMAGINED)).items()):
+    for _, arrays in sorted(_grouped(_read_arrays(path)).items()):
         rollout = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith("rollout/")}
         rest = {name: array for name, array in arrays.items() if "/" not in name}
         examples.append(ComparedRollout(rollout=ImaginedRollout(**rollout), **rest))

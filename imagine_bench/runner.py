@@ -22,7 +22,7 @@ from imagine_bench.errors import DivergedError
 from imagine_bench.evaluation import Tally, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
-from imagine_bench.imagination_quality import Question, ask, examples, open_loop
+from imagine_bench.imagination_quality import Question, ask, examples, imagine_courses, open_loop
 from imagine_bench.interfaces import FutureSampler, Imaginer, Rehearser
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
@@ -90,10 +90,14 @@ class _Run:
         except DivergedError as error:
             where = save_snapshot(self.folder / "diverged", self.counters.snapshot(self.agent.state()))
             raise DivergedError(f"{error} The agent's state lies in {where}.") from error
-        imagined = self._examples()
+        imagined, courses = self._examples()
         self._record()
         run_folder.finish(
-            self.folder, checkpoints=self.counters.rows, training=self.counters.training(), imagined=imagined
+            self.folder,
+            checkpoints=self.counters.rows,
+            training=self.counters.training(),
+            imagined=imagined,
+            courses=courses,
         )
         self._tell("done", at_once=True)
 
@@ -198,12 +202,16 @@ class _Run:
             purpose=exam(self.spec.seed),
         )
 
-    def _examples(self) -> tuple[ComparedRollout, ...]:
+    def _examples(self) -> tuple[tuple[ComparedRollout, ...], tuple[ComparedRollout, ...]]:
+        """Rollouts from several beginnings, and several from one."""
         if not isinstance(self.agent, Imaginer):
-            return ()
+            return (), ()
         self._tell("imagining", at_once=True)
-        seeds = self.seeds.child("examples")
-        return examples(self.agent, self.task, appearance=self.spec.protocol.appearance, seeds=seeds)
+        appearance = self.spec.protocol.appearance
+        return (
+            examples(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("examples")),
+            imagine_courses(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("courses")),
+        )
 
     def _record(self) -> None:
         """Record some test episodes beside the results; the file appears whole or not at all."""

@@ -118,6 +118,7 @@ def compared_rollout(rng: np.random.Generator, depth: int = 5, cut: int | None =
     )
     return ComparedRollout(
         start_frame=rng.integers(0, 255, (64, 64, 3), dtype=np.uint8),
+        start_macrostate=np.array([0, 1, 2, 0]),
         rollout=rollout,
         real_frames=rng.integers(0, 255, (depth, 64, 64, 3), dtype=np.uint8),
         real_macrostates=macrostates,

@@ -334,10 +334,10 @@ def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:
     assert (tmp_path / "e.json").read_text() == "mine" and not (tmp_path / "e.safetensors").exists()
 
 
-def test_view_joins_strips_and_greys_colours() -> None:
+def test_view_joins_strips_and_keeps_colours() -> None:
     frames, _ = draw_frames(arrow_spec(), "mild", 2, np.random.default_rng(0))
     assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
-    assert view(np.full((2, 3, 64, 64), 0.25, dtype=np.float32), "whole_rgb").shape == (2, 64, 64)
+    assert view(np.full((2, 3, 64, 64), 0.25, dtype=np.float32), "whole_rgb").shape == (2, 64, 64, 3)
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

@@ -289,7 +289,7 @@ def test_strip_marks_cut_error_and_end() -> None:
     assert cut.shape == whole.shape
     assert (cut == pictures._CUT).all(axis=2).sum() > 500  # the line
     assert not (whole == pictures._CUT).all(axis=2).any()
-    for color in (pictures._RIGHT, pictures._WRONG):
+    for color in (pictures.RIGHT, pictures.WRONG):
         assert (whole == color).all(axis=2).sum() > 500  # frames in both colours
     narrow = pictures.rollout_strip(compared_rollout(np.random.default_rng(0)), names, columns=2)
     assert narrow.shape[1] < whole.shape[1]

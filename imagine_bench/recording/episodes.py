@@ -25,7 +25,7 @@ from imagine_bench.comparison import compare_rollout
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.files import make_folder
 from imagine_bench.interfaces import Agent, Frame, Imaginer, Observation, SceneReader, TaskSpec, ValueReader
-from imagine_bench.pictures import png, rollout_strip
+from imagine_bench.pictures import png, rgb, rollout_strip
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.results import ComparedRollout
@@ -258,9 +258,8 @@ class _Story:
             recording.set_time("imagined_depth", sequence=depth)
             real = compared.start_frame if depth == 0 else compared.real_frames[depth - 1]
             imagined = rollout.start_frame if depth == 0 else rollout.frames[depth - 1]
-            gray = (np.clip(imagined, 0.0, 1.0) * 255.0).round().astype(np.uint8)
             recording.log(f"{root}/real_frame", rr.Image(real), strict=True)
-            recording.log(f"{root}/frame", rr.Image(gray, color_model="L"), strict=True)
+            recording.log(f"{root}/frame", rr.Image(rgb(imagined)), strict=True)
             if depth == 0:
                 continue
             for kind in _KINDS:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
-from imagine_bench.results import BenchResult, OpenLoop, RunResult
+from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
 
 BASE_AGENT = "dqn"
@@ -81,6 +82,37 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FuturesSummary:
+    """Sampled futures against the rules, means over all pairs of macrostate and macro-action and over seeds.
+
+    Arrays have shape (D,), index d for macro-action d + 1, at the last budget.
+
+    Attributes:
+        pairs: Macrostates of play times macro-actions.
+        samples: Futures of each pair.
+        total_variation: Distance of imagined and exact distributions of macrostates.
+        going_on: The same where the episode goes on until this macro-action, weighted by how likely that is.
+        floor: What as many samples of the exact distribution would show.
+        missing: Possible outcomes that are not imagined, all pairs together.
+        invented: Imagined outcomes that are impossible, all pairs together.
+        reward_error: Absolute error of the expected reward.
+        termination_error: Absolute error of the probability that the episode is over.
+        by_budget: Total variation at the first and at the last depth, by real episodes.
+    """
+
+    pairs: int
+    samples: int
+    total_variation: np.ndarray
+    going_on: np.ndarray
+    floor: np.ndarray
+    missing: np.ndarray
+    invented: np.ndarray
+    reward_error: np.ndarray
+    termination_error: np.ndarray
+    by_budget: dict[int, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes)."""
 
@@ -91,6 +123,7 @@ class ReportData:
     comparisons: dict[str, dict[int, Comparison]]
     acceptance: dict[str, dict[int, float]]
     open_loop: dict[str, OpenLoop]
+    futures: dict[str, FuturesSummary]
     timing: dict[str, Timing]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_random: float | None
@@ -120,6 +153,7 @@ def collect(result: BenchResult) -> ReportData:
         comparisons=_comparisons(result, spec.reference),
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
+        futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
         timing={agent: _timing(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_random=reference.random_success(spec.reference) if spec.reference else None,
@@ -157,6 +191,33 @@ def summary_csv(data: ReportData) -> str:
                 row += [""] * 7
             rows.append(row)
     return _csv(rows)
+
+
+def futures_csv(data: ReportData) -> str:
+    """One row an agent, seed, budget, depth, macrostate and macro-action of the futures that were sampled."""
+    spec, measures = data.spec, ("samples", "total_variation", "floor", "missing", "invented", "reward_error")
+    measures = (*measures, "termination_error", "going_on")
+    rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
+    for agent in data.futures:
+        for run in data.result.of(agent):
+            for checkpoint in run.checkpoints:
+                if checkpoint.futures is not None:
+                    head = [agent, run.seed, checkpoint.episodes]
+                    rows += [[*head, *row] for row in _futures_rows(checkpoint.futures, spec, measures)]
+    return _csv(rows)
+
+
+def _futures_rows(futures: Futures, spec: TaskSpec, measures: tuple[str, ...]) -> Iterator[list[object]]:
+    for depth, pair in np.ndindex(*futures.total_variation.shape):
+        state = zip(spec.macrostate_values, futures.macrostates[pair], strict=True)
+        words = [values[int(value)] for values, value in state]
+        numbers = [np.broadcast_to(getattr(futures, name), futures.floor.shape)[depth, pair] for name in measures]
+        yield [
+            depth + 1,
+            *words,
+            spec.action_names[int(futures.actions[pair])],
+            *(f"{number:.6g}" for number in numbers),
+        ]
 
 
 def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, float]]) -> dict[int, Score]:
@@ -222,6 +283,41 @@ def _open_loop(runs: tuple[RunResult, ...]) -> OpenLoop | None:
     names = [name for name in OpenLoop.__dataclass_fields__ if name != "count"]
     means = {name: _nan_mean(np.stack([getattr(loop, name) for loop in found])) for name in names}
     return OpenLoop(count=np.sum([loop.count for loop in found], axis=0), **means)
+
+
+def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
+    """Means over runs; None where no run was asked for futures."""
+    last = [run.checkpoints[-1].futures for run in runs]
+    found = [each for each in last if each is not None]
+    if not found:
+        return None
+
+    def mean(name: str) -> np.ndarray:
+        return np.mean([getattr(each, name).mean(axis=1) for each in found], axis=0)  # [D]
+
+    def total(name: str) -> np.ndarray:
+        return np.mean([getattr(each, name).sum(axis=1) for each in found], axis=0)  # [D]
+
+    weight = np.stack([each.going_on for each in found])  # [runs, D, P]
+    distance = np.stack([each.total_variation for each in found])
+    by_budget: dict[int, list[tuple[float, float]]] = {}
+    for run in runs:
+        for checkpoint in run.checkpoints:
+            if checkpoint.futures is not None:
+                first, deepest = checkpoint.futures.total_variation[[0, -1]].mean(axis=1)
+                by_budget.setdefault(checkpoint.episodes, []).append((float(first), float(deepest)))
+    return FuturesSummary(
+        pairs=len(found[0].actions),
+        samples=int(found[0].samples),
+        total_variation=mean("total_variation"),
+        going_on=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
+        floor=mean("floor"),
+        missing=total("missing"),
+        invented=total("invented"),
+        reward_error=mean("reward_error"),
+        termination_error=mean("termination_error"),
+        by_budget={budget: tuple(np.mean(pairs, axis=0).tolist()) for budget, pairs in by_budget.items()},
+    )
 
 
 def _nan_mean(table: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.pictures import first_cut, png, rollout_strip
 from imagine_bench.report import plots, words
-from imagine_bench.report.data import ReportData, collect, results_csv, summary_csv
+from imagine_bench.report.data import ReportData, collect, futures_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_view
 from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
@@ -59,21 +60,24 @@ def write_report(result: BenchResult) -> Path:
     folder = make_folder(result.folder / "report")
     data = collect(result)
     drawn = plots.all_plots(data)
-    strips = _strips(data)
+    strips, courses = _strips(data), _courses(data)
     encoder = encoder_view(result)
     picture = encoder.picture.read_bytes() if encoder and encoder.picture else b""
     context = {
         **_words(data),
         "plots": {plot.name: plot for plot in drawn},
         "strips": strips,
+        "courses": courses,
         "encoder": encoder,
         "encoder_picture": base64.b64encode(picture).decode(),
     }
-    files = {f"{plot.name}.png": plot.png for plot in drawn} | {f"{strip.name}.png": strip.png for strip in strips}
+    files = {f"{each.name}.png": each.png for each in (*drawn, *strips, *courses)}
     if picture:
         files["encoder.png"] = picture
     files["results.csv"] = results_csv(result).encode()
     files["summary.csv"] = summary_csv(data).encode()
+    if data.futures:
+        files["futures.csv"] = futures_csv(data).encode()
     files["report.md"] = _render("report.md.j2", context).encode()
     files["index.html"] = _render("report.html.j2", context).encode()
     for name, content in files.items():
@@ -210,6 +214,20 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
         alt=f"Real frames above, imagined frames below. {caption}",
         caption=caption,
     )
+
+
+def _courses(data: ReportData) -> list[Strip]:
+    """One sheet an agent: several imagined courses of one beginning, of its first seed."""
+    sheets = []
+    for agent in data.result.protocol.agents:
+        run = data.result.of(agent)[0]
+        if run.courses:
+            title = agent_words(agent).title
+            caption = f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.courses)} times."
+            sheet = png(courses_sheet(run.courses, data.spec))
+            alt = f"Only the first picture is real. {caption}"
+            sheets.append(Strip(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
+    return sheets
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -91,6 +91,9 @@ def all_plots(data: ReportData) -> list[Plot]:
     if data.open_loop:
         alt = "Open-loop quality of imagination by depth: correct share, errors, uncertainties."
         plots.append(_render("open_loop", open_loop_figure, data, alt))
+    if data.futures:
+        alt = "Imagined against exact distributions of outcomes: total variation, missing and invented outcomes."
+        plots.append(_render("futures", futures_figure, data, alt))
     return plots
 
 
@@ -163,6 +166,34 @@ def open_loop_figure(data: ReportData) -> Figure:
     panels[3].set(title="Uncertainty", ylabel="variance in latent space", yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
+        axes.legend(fontsize=8, loc="best")
+    return figure
+
+
+def futures_figure(data: ReportData) -> Figure:
+    """Four panels: total variation by depth and by real episodes, missing and invented outcomes by depth."""
+    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
+    panels: list[Axes] = list(figure.subplots(2, 2).ravel())
+    for agent, found in data.futures.items():
+        depth = np.arange(1, len(found.floor) + 1)
+        style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
+        title = agent_words(agent).title
+        panels[0].plot(depth, found.total_variation, label=title, **style)
+        budgets = list(found.by_budget)
+        panels[1].plot(budgets, [first for first, _ in found.by_budget.values()], label=title, **style)
+        deepest = [last for _, last in found.by_budget.values()]
+        panels[1].plot(budgets, deepest, linestyle="--", **style)
+        panels[2].plot(depth, found.missing / found.pairs, label=title, **style)
+        panels[3].plot(depth, found.invented / found.pairs, label=title, **style)
+    floor = next(iter(data.futures.values())).floor
+    panels[0].plot(np.arange(1, len(floor) + 1), floor, label="samples of the truth", **_REFERENCE_LINE)
+    panels[1].plot([], [], linestyle="--", color=_INK, label=f"depth {len(floor)}")
+    panels[0].set(title="Distance from the exact distribution", ylabel="total variation", ylim=(0, None))
+    panels[1].set(title="The same while learning, depth 1", ylabel="total variation", ylim=(0, None))
+    panels[2].set(title="Possible, but not imagined", ylabel="outcomes a beginning", ylim=(0, None))
+    panels[3].set(title="Imagined, but impossible", ylabel="outcomes a beginning", ylim=(0, None))
+    for index, axes in enumerate(panels):
+        axes.set_xlabel("real training episodes" if index == 1 else "imagined depth (macro-actions)")
         axes.legend(fontsize=8, loc="best")
     return figure
 
