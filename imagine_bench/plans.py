@@ -145,6 +145,7 @@ def carry_out(
     done = len(frames)
     compared = ComparedRollout(
         start_frame=frame.copy(),
+        start_macrostate=np.array(start, dtype=np.int64),
         rollout=rollout,
         real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
         real_macrostates=np.array(states, dtype=np.int64).reshape(done, len(start)),
