@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from imagine_bench.errors import require_known
 
 from .layers import Masks, MemberMLP
+from .precision import hidden_dtype
 from .settings import WorldModelSettings
 
 INPUTS = ("next_state", "transition")
@@ -42,7 +43,13 @@ class Assessment(nn.Module):
         if settings.shared_hidden:
             outputs = ((settings.shared_hidden, 2),)
         self.networks = nn.ModuleList(
-            MemberMLP((n_in, *hidden, n_out), members=_MEMBERS, dropout=settings.dropout, generator=generator)
+            MemberMLP(
+                (n_in, *hidden, n_out),
+                members=_MEMBERS,
+                dropout=settings.dropout,
+                generator=generator,
+                hidden_dtype=hidden_dtype(settings.precision, generator.device.type),
+            )
             for hidden, n_out in outputs
         )
         self._one_hot = torch.eye(n_actions, device=generator.device)

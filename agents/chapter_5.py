@@ -21,6 +21,7 @@ _QUICK: dict[str, Deviation] = {
     "model.predict_change": Deviation(True, "a macro-action moves one cube: 64 % of transitions right, 43 % without"),
     "model.sigma_floor": Deviation(0.2, "narrower components stop learning of the transitions they miss"),
     "model.gradient_clip": Deviation(10.0, "the likelihood of narrow components has steep walls"),
+    "model.precision": Deviation("float32", "batches of 128 gain little from bfloat16"),
     "controller.epsilon_decay": Deviation(
         0.003, "0.03 ends exploration after 100 episodes; 64 % against 58 % after 1000, but 28 % against 37 % after 750"
     ),

@@ -6,12 +6,17 @@ Small networks spend more time in calls, one a tensor, than in arithmetic; the a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.adam import adam
+
+from imagine_bench.errors import DivergedError
 
 
 class FlatAdam:
@@ -24,44 +29,58 @@ class FlatAdam:
     """
 
     def __init__(self, modules: Sequence[nn.Module], *, learning_rate: float, gradient_clip: float | None) -> None:
-        parameters = [list(module.parameters()) for module in modules]
-        self._clip = gradient_clip
-        self._vector = nn.Parameter(torch.cat([p.detach().reshape(-1) for group in parameters for p in group]))
-        self._gradient = torch.zeros_like(self._vector)
-        self._vector.grad = self._gradient
-        self._segments: list[Tensor] = []
-        start = 0
-        for group in parameters:
-            first = start
-            for parameter in group:
-                end = start + parameter.numel()
-                parameter.data = self._vector.data[start:end].view(parameter.shape)
-                parameter.grad = self._gradient[start:end].view(parameter.shape)
-                start = end
-            self._segments.append(self._gradient[first:start])
-        self._adam = torch.optim.Adam([self._vector], lr=learning_rate, fused=True)
+        groups = [list(module.parameters()) for module in modules]
+        self._parameters = [parameter for group in groups for parameter in group]
+        self._rate, self._clip = learning_rate, gradient_clip
+        self._vector = torch.cat([p.detach().reshape(-1) for p in self._parameters])
+        self._gradient, self._mean, self._square = (torch.zeros_like(self._vector) for _ in range(3))
+        self._step = torch.zeros((), device=self._vector.device)
+        for parameter, values in zip(
+            self._parameters, self._vector.split([p.numel() for p in self._parameters]), strict=True
+        ):
+            parameter.data = values.view(parameter.shape)
+        ends = accumulate((sum(p.numel() for p in group) for group in groups), initial=0)
+        self._segments = [self._gradient[start:end] for start, end in pairwise(ends)]
 
     def step(self, loss: Tensor) -> None:
-        """Descend the gradient of a scalar loss once."""
-        self._gradient.zero_()
-        loss.backward()
-        if self._clip is not None:
-            for segment in self._segments:
-                norm = float(segment.norm())
-                if norm > self._clip:
-                    segment.mul_(self._clip / norm)
-        self._adam.step()
+        """Descend the gradient of a scalar loss once.
+
+        Raises:
+            DivergedError: A gradient is NaN or infinite; the parameters are left as they were.
+        """
+        gradients = torch.autograd.grad(loss, self._parameters)
+        torch.cat([gradient.reshape(-1) for gradient in gradients], out=self._gradient)
+        norms = [float(segment.norm()) for segment in self._segments]
+        if not all(map(math.isfinite, norms)):
+            raise DivergedError(f"Gradients are no longer finite: their norms are {norms}. Lower the learning rate.")
+        for segment, norm in zip(self._segments, norms, strict=True):
+            if self._clip is not None and norm > self._clip:
+                segment.mul_(self._clip / norm)
+        adam(
+            [self._vector],
+            [self._gradient],
+            [self._mean],
+            [self._square],
+            [],
+            [self._step],
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self._rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies of parameters and moments; before the first step the moments are 0."""
-        blank = {"exp_avg": self._gradient * 0.0, "exp_avg_sq": self._gradient * 0.0, "step": torch.zeros(())}
-        parts = {"value": self._vector.detach(), **blank, **self._adam.state.get(self._vector, {})}
-        return {name: tensor.cpu().numpy().copy() for name, tensor in parts.items()}
+        return {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
 
-    @torch.no_grad()
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take up the result of :meth:`arrays`."""
-        self._vector.copy_(torch.tensor(arrays["value"]))
-        moments = {name: torch.tensor(arrays[name]) for name in ("exp_avg", "exp_avg_sq", "step")}
-        groups = self._adam.state_dict()["param_groups"]
-        self._adam.load_state_dict({"state": {0: moments}, "param_groups": groups})
+        for name, tensor in self._tensors().items():
+            tensor.copy_(torch.tensor(arrays[name]))
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {"value": self._vector, "exp_avg": self._mean, "exp_avg_sq": self._square, "step": self._step}

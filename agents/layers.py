@@ -6,6 +6,7 @@ case E = 1. Shapes: ``E`` members, ``N`` rows, ``H`` hidden units.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -13,46 +14,46 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from .dense import dense_stack
+
 Masks = tuple[Tensor, ...]
-"""One dropout mask a hidden layer, each (E, N, H), with entries 0 or 1 / (1 - dropout)."""
+"""One dropout mask a hidden layer, each (E, N, H), int16: -1 keeps a unit, 0 drops it."""
 
 _INT64_MIN = -(2**63)
+_PROBABILITY_BITS = 8
 
 
-def _mask_code(dropout: float) -> tuple[int, int]:
-    """The fewest bits b in (1, 2, 4, 8) that express ``dropout``, and how many of their 2**b values mean dropped."""
-    bits = next((b for b in (1, 2, 4) if (dropout * 2**b).is_integer()), 8)
-    return bits, round(dropout * 2**bits)
-
-
-@lru_cache(maxsize=32)
-def _mask_table(dropout: float, device: torch.device) -> Tensor:
-    """What each random byte says about 8 / b units. Shape (256, 8 / b)."""
-    bits, dropped = _mask_code(dropout)
-    fields = torch.arange(256)[:, None] >> torch.arange(0, 8, bits)[None, :]  # [256, 8 / b]
-    kept = (fields % 2**bits) >= dropped
-    return (kept.float() * (2**bits / (2**bits - dropped))).to(device)
+def dropout_bits(dropout: float) -> int:
+    """``dropout`` in units of 1/256, to which masks round it; never 256, which would leave nothing."""
+    return min(round(dropout * 2**_PROBABILITY_BITS), 2**_PROBABILITY_BITS - 1)
 
 
 def dropout_mask(shape: Sequence[int], dropout: float, generator: torch.Generator) -> Tensor:
-    """Inverted-dropout mask: 0 with probability ``dropout``, else 1 / (1 - dropout).
+    """A random mask: 0 with probability ``dropout`` (rounded to 1/256), else -1, that is all bits.
 
-    One bit of randomness a unit is enough at 50 %, so a 64-bit draw serves 64 units: an order of magnitude
-    cheaper than a Bernoulli draw each. Probabilities that no power of two divides are rounded to 1/256.
+    Binary digits of the probability, from the last one that is set to the first, turn fair random bits into biased
+    ones (a digit 1 is an OR with a fresh bit, a digit 0 an AND): at 50 % one random bit a unit is enough, so that a
+    64-bit draw serves 64 units, an order of magnitude cheaper than a Bernoulli draw each.
 
     Args:
         shape: Shape of the mask.
         dropout: Probability of dropping a unit, in [0, 1).
         generator: The only source of randomness; its device is the mask's.
     """
-    table = _mask_table(dropout, generator.device)
-    count = 1
-    for size in shape:
-        count *= size
-    n_bytes = -(-count // table.shape[1])
-    words = torch.empty(-(-n_bytes // 8), dtype=torch.int64, device=generator.device)
-    random_bytes = words.random_(_INT64_MIN, None, generator=generator).view(torch.uint8)
-    return table.index_select(0, random_bytes.int()).view(-1)[:count].view(*shape)
+    count = math.prod(shape)
+    words = torch.empty(-(-count // 64), dtype=torch.int64, device=generator.device)
+    digits = f"{dropout_bits(dropout):0{_PROBABILITY_BITS}b}".rstrip("0")
+    kept = torch.full_like(words, -1)
+    for digit in reversed(digits):
+        words.random_(_INT64_MIN, None, generator=generator)
+        kept = kept & words if digit == "1" else kept | words
+    fields = kept.view(torch.int16)[None, :] << _shifts(generator.device)  # [16, 4 words]: one bit each, at the sign
+    return fields.bitwise_right_shift_(15).view(-1)[:count].view(*shape)
+
+
+@lru_cache(maxsize=8)
+def _shifts(device: torch.device) -> Tensor:
+    return torch.arange(16, dtype=torch.int16, device=device)[:, None]
 
 
 class MemberMLP(nn.Module):
@@ -63,11 +64,20 @@ class MemberMLP(nn.Module):
         members: E, at least 1.
         dropout: Probability of dropping a hidden unit, in [0, 1).
         generator: Draws the initial weights: Glorot uniform, zero biases (the defaults of Keras).
+        hidden_dtype: In which hidden layers compute while a gradient is wanted, float32 or bfloat16.
     """
 
-    def __init__(self, sizes: Sequence[int], *, members: int, dropout: float, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        *,
+        members: int,
+        dropout: float,
+        generator: torch.Generator,
+        hidden_dtype: torch.dtype = torch.float32,
+    ) -> None:
         super().__init__()
-        self.sizes, self.members, self.dropout = tuple(sizes), members, dropout
+        self.sizes, self.members, self.dropout, self.hidden_dtype = tuple(sizes), members, dropout, hidden_dtype
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
@@ -84,22 +94,22 @@ class MemberMLP(nn.Module):
 
     def forward(self, x: Tensor, masks: Masks | None = None) -> Tensor:
         """Map (E, N, in) to (E, N, out); without ``masks`` no unit is dropped and the result is deterministic."""
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias, x, weight)  # [E, N, out]
-            if layer < last:
-                x = x.relu() if masks is None else x.relu() * masks[layer]
-        return x
+        exact = self.weights[0].dtype
+        dtype = self.hidden_dtype if torch.is_grad_enabled() and exact == torch.float32 else exact
+        dropout = dropout_bits(self.dropout) / 2**_PROBABILITY_BITS
+        return dense_stack(x, list(self.weights), list(self.biases), masks, dropout, dtype)
 
 
 @torch.no_grad()
-def clip_unit_norms(network: MemberMLP, limit: float) -> None:
+def clip_unit_norms(networks: Sequence[MemberMLP], limit: float) -> None:
     """Scale the incoming weights of each unit down to a Euclidean norm of at most ``limit``.
 
     "The norm of the weights in each layer" (thesis 5.2.3) is read as the max-norm constraint of Keras, per unit:
     a norm of 3 on a whole 512 x 512 matrix would cripple it.
     """
-    for weight in network.weights:
-        norms = (weight * weight).sum(dim=1, keepdim=True).sqrt()  # [E, 1, out]; several times faster than vector_norm
-        if bool((norms > limit).any()):
-            weight.mul_((limit / norms).clamp_max(1.0))
+    weights = [weight for network in networks for weight in network.weights]
+    squares = [(weight * weight).sum(dim=1, keepdim=True) for weight in weights]  # each [E, 1, out]
+    largest = torch.stack([square.amax() for square in squares])
+    for weight, square, norm in zip(weights, squares, largest.sqrt().tolist(), strict=True):
+        if norm > limit:
+            weight.mul_((limit / square.sqrt()).clamp_max(1.0))

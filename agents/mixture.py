@@ -53,8 +53,9 @@ def from_outputs(outputs: Tensor, components: int, dimensions: int, log_sigma_fl
 def log_likelihood(mixture: Mixture, targets: Tensor) -> Tensor:
     """``log p(targets)`` by log-sum-exp over components. Targets (..., Z), result (...)."""
     scaled = (targets.unsqueeze(-2) - mixture.means) * torch.exp(-mixture.log_sigmas)  # [..., K, Z]
-    log_normal = -0.5 * (scaled.square() + _LOG_2PI) - mixture.log_sigmas  # [..., K, Z]
-    return torch.logsumexp(mixture.log_weights + log_normal.sum(dim=-1), dim=-1)
+    log_normal = -0.5 * scaled.square().sum(dim=-1) - mixture.log_sigmas.sum(dim=-1)  # [..., K]
+    constant = 0.5 * _LOG_2PI * targets.shape[-1]
+    return torch.logsumexp(mixture.log_weights + log_normal, dim=-1) - constant
 
 
 def mean(mixture: Mixture) -> Tensor:

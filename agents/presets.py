@@ -18,6 +18,7 @@ from .assessment import INPUTS
 from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
+from .precision import PRECISIONS, settle
 from .settings import START_STATES, Settings
 from .uncertainty import REDUCTIONS
 
@@ -65,6 +66,7 @@ _RANGES = {
 """Ranges of the numbers; every other number is a count of at least 1."""
 
 _WORDS = {
+    "model.precision": ("precision", PRECISIONS),
     "model.assessment_input": ("assessment input", INPUTS),
     "imagination.start_states": ("start of imagined rollouts", START_STATES),
     "imagination.reduction": ("uncertainty reduction", tuple(REDUCTIONS)),
@@ -103,13 +105,15 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> Settings:
 
 
 def settings_of(context: AgentContext) -> Settings:
-    """The settings that an agent is to be built with.
+    """The settings that an agent is to be built with, the precision settled for its device.
 
     Raises:
         UnknownNameError: The context names a family, preset or setting that does not exist.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return resolve(context.preset, context.overrides, context.settings)
+    settings = resolve(context.preset, context.overrides, context.settings)
+    precision = settle(settings.model.precision, context.device)
+    return replace(settings, model=replace(settings.model, precision=precision))
 
 
 def _require_ranges(settings: Settings) -> None:

@@ -34,6 +34,8 @@ class WorldModelSettings:
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each network; None clips nothing.
+        precision: In which hidden layers train: float32, bfloat16, or auto, which is bfloat16 where the device has
+            instructions for it. Weights, moments, output layers, losses and predictions are always float32.
     """
 
     dynamics_hidden: tuple[int, ...] = (256, 256, 256)
@@ -52,6 +54,7 @@ class WorldModelSettings:
     predict_change: bool = False
     sigma_floor: float = 0.01
     gradient_clip: float | None = None
+    precision: str = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from .flat_adam import FlatAdam
 from .layers import Masks, MemberMLP, clip_unit_norms
 from .memory import Batch
 from .mixture import Mixture
+from .precision import hidden_dtype
 from .settings import WorldModelSettings
 
 
@@ -58,7 +59,13 @@ class WorldModel(nn.Module):
         self.members = settings.members
         outputs = mdn.output_size(settings.components, latent_size)
         sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
-        self.dynamics = MemberMLP(sizes, members=self.members, dropout=settings.dropout, generator=generator)
+        self.dynamics = MemberMLP(
+            sizes,
+            members=self.members,
+            dropout=settings.dropout,
+            generator=generator,
+            hidden_dtype=hidden_dtype(settings.precision, generator.device.type),
+        )
         self.assessment = Assessment(latent_size, n_actions, settings, generator)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)  # type: ignore[assignment]
         self.optimiser = FlatAdam(
@@ -98,8 +105,7 @@ class WorldModel(nn.Module):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
         self.optimiser.step(torch.stack(terms).sum())
         if self.settings.max_norm is not None:
-            for network in self.networks:
-                clip_unit_norms(network, self.settings.max_norm)
+            clip_unit_norms(self.networks, self.settings.max_norm)
         return losses
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:

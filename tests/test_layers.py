@@ -76,7 +76,7 @@ def test_max_norm_limits_each_unit_and_leaves_the_others() -> None:
     with torch.no_grad():
         network.weights[0][0, :, 1] = 10.0
     before = network.weights[0].detach().clone()
-    clip_unit_norms(network, 3.0)
+    clip_unit_norms([network], 3.0)
     norms = network.weights[0][0].norm(dim=0)
     torch.testing.assert_close(norms[1], torch.tensor(3.0))
     torch.testing.assert_close(network.weights[0][0, :, 1] / 1.5, torch.ones(4))  # the direction stays

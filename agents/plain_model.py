@@ -1,0 +1,70 @@
+"""The world model as one would first write it in PyTorch: the measure of how fast the other is, and its oracle.
+
+Ordinary modules, autograd, float32, torch's own dropout from the global generator, one Adam a network. It trains
+nothing in a bench.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from . import mixture as mdn
+from .memory import Batch
+from .settings import WorldModelSettings
+from .world_model import log_cosh
+
+
+class PlainWorldModel:
+    """Dynamics, reward and termination, trained as :class:`agents.world_model.WorldModel` is.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes and rates; the defaults of the thesis, which clip no gradient and predict z', are required.
+    """
+
+    def __init__(self, latent_size: int, n_actions: int, settings: WorldModelSettings) -> None:
+        self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
+        outputs = mdn.output_size(settings.components, latent_size)
+        self.dynamics = _network((latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout)
+        self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout)
+        self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout)
+        self.networks = (self.dynamics, self.reward, self.termination)
+        self._adams = [torch.optim.Adam(net.parameters(), lr=settings.learning_rate) for net in self.networks]
+
+    def losses(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean losses of the three networks on one batch."""
+        settings = self.settings
+        inputs = torch.cat([batch.z, functional.one_hot(batch.action, self.n_actions).float()], dim=-1)
+        floor = math.log(settings.sigma_floor)
+        mixture = mdn.from_outputs(self.dynamics(inputs), settings.components, self.latent_size, floor)
+        reward, logit = self.reward(batch.next_z).squeeze(-1), self.termination(batch.next_z).squeeze(-1)
+        return (
+            -mdn.log_likelihood(mixture, batch.next_z).mean(),
+            log_cosh(reward - batch.reward).mean(),
+            functional.binary_cross_entropy_with_logits(logit, batch.terminated),
+        )
+
+    def update(self, batch: Batch) -> None:
+        """One step of each Adam, then the max-norm constraint."""
+        for loss, adam in zip(self.losses(batch), self._adams, strict=True):
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+        with torch.no_grad():
+            for network in self.networks:
+                for layer in network:
+                    if isinstance(layer, nn.Linear):
+                        layer.weight.copy_(torch.renorm(layer.weight, p=2, dim=0, maxnorm=self.settings.max_norm))
+
+
+def _network(sizes: tuple[int, ...], dropout: float) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(sizes):
+        layers += [nn.Linear(n_in, n_out), nn.ReLU(), nn.Dropout(dropout)]
+    return nn.Sequential(*layers[:-2])

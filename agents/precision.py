@@ -1,0 +1,28 @@
+"""In which number format the world model's hidden layers train, and which formats a device multiplies quickly."""
+
+from __future__ import annotations
+
+import torch
+
+PRECISIONS = ("auto", "float32", "bfloat16")
+"""What ``model.precision`` may be: ``auto`` is bfloat16 where the device has instructions for it, else float32."""
+
+
+def settle(precision: str, device: str) -> str:
+    """``precision``, with ``auto`` replaced by what it means on ``device``: results name what was used."""
+    if precision != "auto":
+        return precision
+    return "bfloat16" if _multiplies_bfloat16(device) else "float32"
+
+
+def hidden_dtype(precision: str, device: str) -> torch.dtype:
+    """The format of hidden layers while a gradient is wanted."""
+    return {"float32": torch.float32, "bfloat16": torch.bfloat16}[settle(precision, device)]
+
+
+def _multiplies_bfloat16(device: str) -> bool:
+    """Whether the device has instructions for bfloat16 products; without them they are emulated, and slower."""
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported()
+    capabilities = torch.cpu.get_capabilities()
+    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
