@@ -1,7 +1,7 @@
 """The world model as one would first write it in PyTorch: the measure of how fast the other is, and its oracle.
 
-Ordinary modules, autograd, float32, torch's own dropout from the global generator, one Adam a network. It trains
-nothing in a bench.
+Ordinary modules, autograd, float32, a Bernoulli draw a unit for dropout, one Adam a network. It trains nothing in a
+bench.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ class PlainWorldModel:
         latent_size: Z.
         n_actions: A.
         settings: Sizes and rates; the defaults of the thesis, which clip no gradient and predict z', are required.
+        dropout: Draws the dropout masks.
     """
 
-    def __init__(self, latent_size: int, n_actions: int, settings: WorldModelSettings) -> None:
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, dropout: torch.Generator
+    ) -> None:
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
         outputs = mdn.output_size(settings.components, latent_size)
-        self.dynamics = _network((latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout)
-        self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout)
-        self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout)
+        self.dynamics = _network((latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, dropout)
+        self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout, dropout)
+        self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout, dropout)
         self.networks = (self.dynamics, self.reward, self.termination)
         self._adams = [torch.optim.Adam(net.parameters(), lr=settings.learning_rate) for net in self.networks]
 
@@ -63,8 +66,19 @@ class PlainWorldModel:
                         layer.weight.copy_(torch.renorm(layer.weight, p=2, dim=0, maxnorm=self.settings.max_norm))
 
 
-def _network(sizes: tuple[int, ...], dropout: float) -> nn.Sequential:
+class _Dropout(nn.Module):
+    """``nn.Dropout``, whose draws come from a passed generator."""
+
+    def __init__(self, probability: float, generator: torch.Generator) -> None:
+        super().__init__()
+        self._kept, self._generator = 1.0 - probability, generator
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * torch.empty_like(x).bernoulli_(self._kept, generator=self._generator).div_(self._kept)
+
+
+def _network(sizes: tuple[int, ...], dropout: float, generator: torch.Generator) -> nn.Sequential:
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(sizes):
-        layers += [nn.Linear(n_in, n_out), nn.ReLU(), nn.Dropout(dropout)]
+        layers += [nn.Linear(n_in, n_out), nn.ReLU(), _Dropout(dropout, generator)]
     return nn.Sequential(*layers[:-2])

@@ -10,9 +10,11 @@ import pytest
 import torch
 from imagine_bench.agents import mixture as mdn
 from imagine_bench.agents.memory import Batch
+from imagine_bench.agents.plain_model import PlainWorldModel
 from imagine_bench.agents.settings import WorldModelSettings
 from imagine_bench.agents.uncertainty import decompose
 from imagine_bench.agents.world_model import WorldModel, log_cosh
+from torch import nn
 
 from imagine_bench.errors import DivergedError
 
@@ -188,3 +190,27 @@ def test_the_reward_may_depend_on_where_the_action_began() -> None:
         test = batch(torch.Generator().manual_seed(3))
         errors.append((model.assess(test.z, test.action, test.next_z)[0] - test.reward).abs().max().item())
     assert errors[0] > 0.4 and errors[1] < 0.1
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-3), ("bfloat16", 0.05)])
+def test_it_trains_as_the_plain_model_does(precision: str, tolerance: float) -> None:
+    """Without dropout nothing is random: the same weights and batches must go the same way."""
+    settings = dataclasses.replace(SETTINGS, dropout=0.0, max_norm=0.8, precision=precision)
+    ours, plain = make(**dataclasses.asdict(settings)), PlainWorldModel(Z, A, settings, torch.Generator())
+    for mine, other in zip(ours.networks, plain.networks, strict=True):
+        linear = [layer for layer in other if isinstance(layer, nn.Linear)]
+        for weight, bias, layer in zip(mine.weights, mine.biases, linear, strict=True):
+            layer.weight.data, layer.bias.data = weight.detach()[0].t().clone(), bias.detach()[0, 0].clone()
+    draws, dropout = torch.Generator().manual_seed(1), torch.Generator()
+    test = chain_batch(256, torch.Generator().manual_seed(9))
+    first = [loss.item() for loss in plain.losses(test)]
+    for _ in range(25):
+        batch = chain_batch(64, draws)
+        ours.update(batch, dropout)
+        plain.update(batch)
+    for mine, other, before in zip(ours.losses(test, dropout), plain.losses(test), first, strict=True):
+        gain = before - other.item()
+        assert gain > 0.1 * abs(before), "the plain model must have learned"
+        assert abs(mine.item() - other.item()) < tolerance * gain
+    for network in ours.networks:
+        assert max(weight.norm(dim=1).max().item() for weight in network.weights) <= 0.8 + 1e-6
