@@ -34,7 +34,9 @@ class PlainWorldModel:
     ) -> None:
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
         outputs = mdn.output_size(settings.components, latent_size)
-        self.dynamics = _network((latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, dropout)
+        self.dynamics = _network(
+            (latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, dropout
+        )
         self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout, dropout)
         self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout, dropout)
         self.networks = (self.dynamics, self.reward, self.termination)
