@@ -22,7 +22,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
 
     Args:
         spec: The task.
-        recipe: A name in ``RECIPES``, or settings of one's own.
+        recipe: A name among the task's ``RECIPES``, or settings of one's own.
         appearance: Appearance level of the frames.
         seed: Root of the seed tree.
         out: Folder for ``<encoder>-<appearance>.safetensors``, ``.json`` and ``.png``; made if missing.
@@ -35,7 +35,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
     """
-    recipe = recipe_named(recipe) if isinstance(recipe, str) else recipe
+    recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     name = f"{spec.encoder}-{require_known('appearance', appearance, APPEARANCES)}"
     path = out / f"{name}.safetensors"
     refuse_existing(path, path.with_suffix(".json"), path.with_suffix(".png"))

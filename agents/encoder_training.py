@@ -22,7 +22,7 @@ from imagine_bench.seeding import SeedTree
 from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
 from .encoder_recipes import Recipe, recipe_named
 from .probe import Latents, Probe, accuracy, train_probe
-from .vae import StripVae, Vae, kl_from_standard_normal
+from .vae import MlpVae, Vae, kl_from_standard_normal
 from .weights import initialise
 
 Progress = Callable[[str, float], None]
@@ -116,7 +116,7 @@ def train_encoder(
 
     Args:
         spec: The task, which renders the frames.
-        recipe: A name in ``RECIPES``, or settings of one's own.
+        recipe: A name among the task's ``RECIPES``, or settings of one's own.
         appearance: Appearance level of every frame.
         seed: Root of the seed tree; training frames come from its ``encoder_training`` branch and held-out ones from
             its ``encoder_probe`` branch.
@@ -126,7 +126,7 @@ def train_encoder(
         UnknownNameError: An unknown recipe or appearance.
         DivergedError: The loss became NaN or infinite.
     """
-    recipe = recipe_named(recipe) if isinstance(recipe, str) else recipe
+    recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     require_known("appearance", appearance, APPEARANCES)
     progress = progress or (lambda stage, done: None)
     torch.set_num_threads(1)
@@ -193,7 +193,7 @@ def _trained_vae(
 ) -> Vae:
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
-    if isinstance(vae, StripVae):
+    if isinstance(vae, MlpVae):
         vae.remember_looks(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
     train_vae(vae, data, recipe, generator, progress)
     return _rounded_to_half(vae)

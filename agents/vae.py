@@ -16,9 +16,9 @@ from torch.nn import functional
 
 from imagine_bench.errors import require_known
 
-from .encoder_recipes import Recipe
+from .encoder_recipes import ARCHITECTURES, Recipe
 
-_LEAST_CONTRAST = 0.005  # of full scale; strips about as flat as this are amplified less
+_LEAST_CONTRAST = 0.005  # of full scale; parts about as flat as this are amplified less
 _SIDE = 64  # pixels; input and output of the Ha & Schmidhuber network
 
 
@@ -93,61 +93,64 @@ class Vae(nn.Module, abc.ABC):
         return Elbo(reconstruction + beta * kl, reconstruction, kl)
 
 
-def standardise(strips: Tensor) -> Tensor:
-    """Give every channel of every picture mean 0 and standard deviation 1, so that light matters less.
+def standardise(parts: Tensor) -> Tensor:
+    """Give every row mean 0 and standard deviation 1, so that light matters less.
 
     Args:
-        strips: Shape (N, C, H, W), in [0, 1].
+        parts: Shape (..., P), in [0, 1].
     """
     # One fused operation, since a single frame must be quick.
-    return functional.layer_norm(strips, strips.shape[2:], eps=_LEAST_CONTRAST**2)
+    return functional.layer_norm(parts, parts.shape[-1:], eps=_LEAST_CONTRAST**2)
 
 
-class StripVae(Vae):
-    """One small network shared by all strips, each read on its own at full resolution.
+class MlpVae(Vae):
+    """One small network that reads a picture whole, or each of its channels on its own.
 
-    Strips hold one cube each, so sharing the weights triples the data and lets no cube crowd out another: the
-    latents of strip c are ``[c * L, (c + 1) * L)``.
+    Channels that are strips hold one cube each: sharing the weights triples the data and lets no cube crowd out
+    another. The latents of part p are ``[p * L, (p + 1) * L)``.
 
     Args:
-        recipe: Widths, latents a strip and pixel noise.
-        channels: Strips C.
-        height: Pixels of a strip.
-        width: Pixels of a strip.
+        recipe: Widths, latents a part and pixel noise.
+        channels: Channels C.
+        height: Pixels of a channel.
+        width: Pixels of a channel.
+        parts: C where every channel is read on its own, 1 where all are read together.
     """
 
     brightness: Tensor
     contrast: Tensor
 
-    def __init__(self, recipe: Recipe, channels: int, height: int, width: int) -> None:
+    def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, parts: int) -> None:
         super().__init__()
-        self.latent_size = channels * recipe.latents
-        self._strip = (channels, height, width)
+        self.latent_size = parts * recipe.latents
+        self._parts = parts
+        self._picture = (channels, height, width)
         self._precision = recipe.pixel_std**-2
-        sizes = (height * width, *recipe.widths)
+        sizes = (channels // parts * height * width, *recipe.widths)
         self.encoder = _mlp(*sizes, 2 * recipe.latents)
         self.decoder = _mlp(recipe.latents, *reversed(sizes))
-        # The looks a person expects: the mean brightness and contrast of the training strips.
+        # The looks a person expects: the mean brightness and contrast of the training pictures.
         self.register_buffer("brightness", torch.tensor(0.5))
         self.register_buffer("contrast", torch.tensor(0.2))
 
+    def _split(self, pictures: Tensor) -> Tensor:
+        """Standardised parts, a row each. Shape (N * parts, pixels)."""
+        return standardise(pictures.reshape(len(pictures) * self._parts, -1))
+
     def target(self, pictures: Tensor) -> Tensor:
-        """Standardised strips."""
-        return standardise(pictures)
+        """Pictures whose parts are standardised."""
+        return self._split(pictures).reshape(pictures.shape)
 
     def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Each strip encoded on its own, their latents side by side. Two tensors of shape (N, C * L)."""
-        n, channels, height, width = pictures.shape
-        strips = standardise(pictures).reshape(n * channels, height * width)
-        mu, log_variance = self.encoder(strips).chunk(2, dim=1)  # [N * C, L]
-        return mu.reshape(n, self.latent_size), log_variance.reshape(n, self.latent_size)
+        """Each part encoded on its own, their latents side by side. Two tensors of shape (N, Z)."""
+        mu, log_variance = self.encoder(self._split(pictures)).chunk(2, dim=1)  # [N * parts, L]
+        return mu.reshape(len(pictures), self.latent_size), log_variance.reshape(len(pictures), self.latent_size)
 
     def generate(self, latents: Tensor) -> Tensor:
         """Means of the standardised pixels. Shape (N, C, H, W)."""
-        channels = self._strip[0]
-        apart = latents.reshape(len(latents) * channels, self.latent_size // channels)
-        strips: Tensor = self.decoder(apart)  # [N * C, H * W]
-        return strips.reshape(len(latents), *self._strip)
+        apart = latents.reshape(len(latents) * self._parts, self.latent_size // self._parts)
+        parts: Tensor = self.decoder(apart)  # [N * parts, pixels]
+        return parts.reshape(len(latents), *self._picture)
 
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
         """Gaussian pixels of a fixed standard deviation."""
@@ -155,11 +158,12 @@ class StripVae(Vae):
 
     def remember_looks(self, pictures: Tensor) -> None:
         """Take brightness and contrast for :meth:`picture` from training pictures (N, C, H, W)."""
+        parts = pictures.reshape(len(pictures) * self._parts, -1)
         self.brightness.copy_(pictures.mean())
-        self.contrast.copy_(pictures.std(dim=(2, 3), correction=0).mean())
+        self.contrast.copy_(parts.std(dim=1, correction=0).mean())
 
     def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
-        """At the mean brightness and contrast of the training strips: latents do not hold the light."""
+        """At the mean brightness and contrast of the training pictures: latents do not hold the light."""
         return (self.brightness + self.contrast * self.generate(latents)).clamp(0.0, 1.0)
 
 
@@ -226,10 +230,9 @@ def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
     Raises:
         UnknownNameError: The recipe names an unknown architecture.
     """
-    require_known("encoder architecture", recipe.architecture, ("strips", "ha_schmidhuber"))
-    if recipe.architecture == "strips":
-        return StripVae(recipe, channels, height, width)
-    return HaSchmidhuberVae(recipe, channels)
+    if require_known("encoder architecture", recipe.architecture, ARCHITECTURES) == "ha_schmidhuber":
+        return HaSchmidhuberVae(recipe, channels)
+    return MlpVae(recipe, channels, height, width, parts=channels if recipe.architecture == "strips" else 1)
 
 
 def _mlp(*sizes: int) -> nn.Sequential:

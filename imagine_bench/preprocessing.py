@@ -1,7 +1,7 @@
 """What a task may declare about how its frames are read. Numpy only, so that both sides share it.
 
 The thesis makes the arrow puzzle's frames grey and cuts them into three vertical strips, one cube each, fed as
-three channels (section 5.2.1); a task without such a declaration gives its whole RGB frame.
+three channels (section 5.2.1); those of the task with a human stay whole and in colour (section 3.2.1).
 """
 
 from __future__ import annotations
@@ -32,13 +32,20 @@ def whole_rgb(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.moveaxis(frames, -1, 1).astype(np.float32) / 255.0
 
 
+def small_rgb(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Half the resolution, 2 x 2 pixels averaged: (N, 64, 64, 3) uint8 to (N, 3, 32, 32) float32 in [0, 1]."""
+    n, height, width, _ = frames.shape
+    blocks = frames.reshape(n, height // 2, 2, width // 2, 2, 3).sum(axis=(2, 4), dtype=np.uint16)
+    return np.moveaxis(blocks, -1, 1).astype(np.float32) / (4 * 255.0)
+
+
 def join_strips(strips: NDArray[np.float32]) -> NDArray[np.float32]:
     """Undo :func:`gray_strips` for pictures: (..., 3, 64, 22) to (..., 64, 64); a shared column is the left strip's."""
     left, middle, right = strips[..., 0, :, :], strips[..., 1, :, 1:], strips[..., 2, :, 1:]
     return np.concatenate([left, middle, right], axis=-1)
 
 
-PREPROCESSING: dict[str, Preprocess] = {"gray_strips": gray_strips, "whole_rgb": whole_rgb}
+PREPROCESSING: dict[str, Preprocess] = {"gray_strips": gray_strips, "whole_rgb": whole_rgb, "small_rgb": small_rgb}
 
 
 def preprocess(name: str) -> Preprocess:

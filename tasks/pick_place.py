@@ -77,12 +77,13 @@ SPEC = TaskSpec(
         *(("placed", "picked", "handed over"),) * N_OBJECTS,
         (*_PLACES, "handover", "withdrawn"),
     ),
-    preprocessing="whole_rgb",
+    preprocessing="small_rgb",
     encoder="pick_place",
     rules=_RULES,
     facts=functools.partial(facts, _RULES, HORIZON),
     render_macrostates=render_macrostates,
     reference="pick_place",
+    settings="chapter_3",
 )
 
 
