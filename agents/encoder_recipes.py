@@ -1,11 +1,10 @@
-"""How an encoder is made: for each chapter of the thesis its own recipe and the cheap one, each setting with its reason."""
+"""How an encoder is made: for each chapter of the thesis its own recipe and a cheap one, with a reason a setting."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 from imagine_bench.errors import InvalidValueError, require_known
-
 
 ARCHITECTURES = ("ha_schmidhuber", "strips", "picture")
 

@@ -129,6 +129,34 @@ class RenderMacrostates(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Promises:
+    """What ``make speed`` holds a task in contact physics to.
+
+    Attributes:
+        objects: Bodies of the loose objects; coordinate i of a macrostate is object i's.
+        as_ruled: Least share of random macro-actions that end exactly as the rules say.
+        bystander_mm: An object that an action leaves where it stands moves by less.
+        error_mm: The object acted on ends nearer to where a perfect execution leaves it, 99 times of 100; None asks
+            for nothing.
+        error_deg: The same for its yaw.
+        physics_per_cpu_s: Least macro-actions with planning, physics and frame.
+        kinematic_per_cpu_s: Least macro-actions in the kinematic mode, with frame.
+        encoders: Least share of fresh frames whose macrostate the bundled encoder's probe reads right, by appearance.
+        goes_on: Whether a walk is measured through ends without a reset, so that errors could add up.
+    """
+
+    objects: tuple[str, ...]
+    as_ruled: float
+    bystander_mm: float
+    error_mm: float | None = None
+    error_deg: float | None = None
+    physics_per_cpu_s: float
+    kinematic_per_cpu_s: float
+    encoders: Mapping[str, float]
+    goes_on: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskSpec:
     """Everything the bench needs to know of a task. Building one is cheap: MuJoCo loads on the first frame.
 
@@ -149,6 +177,7 @@ class TaskSpec:
         reference: Name of the thesis' table in :mod:`imagine_bench.reference`, or None.
         settings: Family of settings that learners take: the thesis' chapter that the task is from.
         presets: What each protocol preset changes for this task: fields of the protocol by preset.
+        promises: What ``make speed`` measures it against; None for a task whose scene another one measures.
     """
 
     id: str
@@ -167,6 +196,7 @@ class TaskSpec:
     reference: str | None = None
     settings: str = "chapter_5"
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    promises: Promises | None = None
 
     @property
     def n_actions(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces import Frame, Promises, TaskSpec
 
 from .arrow_rules import N_CUBES, N_DIRECTIONS, ArrowPuzzleRules
 from .rules import facts
@@ -29,6 +29,18 @@ _PLAY = (
     "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a time. "
     "The arrow of the cube pointed at must come to point toward the human{extra}, and no two arrows may ever point "
     "the same way."
+)
+
+
+_PROMISES = Promises(
+    objects=tuple(f"cube_{cube}" for cube in range(N_CUBES)),
+    as_ruled=0.999,
+    bystander_mm=1.0,
+    error_deg=1.0,
+    physics_per_cpu_s=120,
+    kinematic_per_cpu_s=6_000,
+    encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
+    goes_on=True,
 )
 
 
@@ -90,6 +102,7 @@ def _spec(*, hard: bool) -> TaskSpec:
         facts=functools.partial(facts, rules, HORIZON),
         render_macrostates=render_macrostates,
         reference="arrow_puzzle_hard" if hard else "arrow_puzzle",
+        promises=None if hard else _PROMISES,
     )
 
 

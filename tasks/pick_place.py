@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces import Frame, Promises, TaskSpec
 
 from .pick_place_rules import N_OBJECTS, PickPlaceRules
 from .rules import facts, require_macrostates
@@ -84,6 +84,15 @@ SPEC = TaskSpec(
     render_macrostates=render_macrostates,
     reference="pick_place",
     settings="chapter_3",
+    promises=Promises(
+        objects=_OBJECTS,
+        as_ruled=0.995,
+        bystander_mm=3.0,
+        error_mm=5.0,
+        physics_per_cpu_s=60,
+        kinematic_per_cpu_s=3_000,
+        encoders={"clean": 0.995, "mild": 0.995},
+    ),
 )
 
 

@@ -39,7 +39,7 @@ _IN_THE_AIR_M = 0.15
 """What is held at the observation pose is at least so far above the table."""
 _HANDS_FORWARD_X_M = 0.90
 """Fingertip or palm nearer to the robot than this say something."""
-_VAIN_M = 0.04
+_VAIN_M = 0.09
 """The gripper stops so far above what it reaches out for in vain, and its lift."""
 _GRIP_SHARE = 0.5
 """Share of the objects' pose variation that remains in the grip, which centres them."""
