@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,12 @@ from .encoder import Encoder, view
 from .probe import Latents
 
 COLUMNS = 8
-_ZOOM = 3
+_CELL = 192  # pixels, edge of a picture
 _GAP = 8  # pixels
 _HEADING = 80  # pixels
 _LABEL = 150  # pixels, left of the rows
-_CAPTION = 40  # pixels, below the rows
+_CAPTION = 60  # pixels, below the rows
+_CAPTION_LETTERS = 26  # in a line of it
 _INK, _MUTED, _WRONG, _PAPER = (20, 20, 20), (110, 110, 110), (190, 20, 20), (255, 255, 255)
 
 
@@ -46,7 +48,7 @@ def sample_sheet(
         "decoded sample": encoder.decode(latents.sample(generator)),
     }
     read = encoder.read_macrostate(latents.mu)
-    cell = 64 * _ZOOM + _GAP
+    cell = _CELL + _GAP
     sheet = Image.new("RGB", (_LABEL + cell * len(frames), _HEADING + cell * len(rows) + _CAPTION), _PAPER)
     draw = ImageDraw.Draw(sheet)
     _write_heading(draw, encoder)
@@ -56,7 +58,8 @@ def sample_sheet(
         for column, picture in enumerate(pictures):
             sheet.paste(_enlarged(picture), (_LABEL + column * cell, top))
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
-        names = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
+        words = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
+        names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
         colour = _INK if (right == found).all() else _WRONG
         draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=colour, font=_font(14))
     return sheet
@@ -85,7 +88,7 @@ def _enlarged(picture: NDArray[Any]) -> Image.Image:
     if picture.dtype != np.uint8:
         picture = np.rint(picture * 255.0).astype(np.uint8)
     image = Image.fromarray(picture).convert("RGB")
-    return image.resize((image.width * _ZOOM, image.height * _ZOOM), Image.Resampling.NEAREST)
+    return image.resize((_CELL, _CELL), Image.Resampling.NEAREST)
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

@@ -132,6 +132,28 @@ def test_strips_are_encoded_apart_with_shared_weights() -> None:
     assert not torch.allclose(mu.view(2, 3, 8)[:, 0], mu.view(2, 3, 8)[:, 1])
 
 
+def test_a_picture_is_read_whole_and_comes_back_whole() -> None:
+    recipe = replace(TINY, architecture="picture", latents=4)
+    vae = empty_vae(recipe, "small_rgb").to_empty(device="cpu")
+    initialise(vae, torch.Generator().manual_seed(0))
+    batch = torch.rand(5, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    mu, log_variance = vae.posterior(batch)
+    assert mu.shape == log_variance.shape == (5, 4)
+    assert vae.generate(mu).shape == vae.target(batch).shape == batch.shape
+    torch.testing.assert_close(vae.target(batch).mean(dim=(1, 2, 3)), torch.zeros(5), rtol=0, atol=1e-5)
+    other = batch.clone()
+    other[:, 2] = other[:, 2].flip(2)
+    assert (vae.posterior(other)[0] - mu).abs().min() > 0  # every latent sees every channel
+
+
+def test_chapter_3_s_recipe_is_the_thesis() -> None:
+    thesis = recipe_named("thesis", "chapter_3")
+    assert (thesis.latents, thesis.beta, thesis.learning_rate, thesis.frames) == (4, 1.0, 1e-4, 1200)
+    assert round(thesis.steps * thesis.batch / thesis.frames, -1) == pytest.approx(1010, abs=20)  # epochs
+    with pytest.raises(UnknownNameError, match=r"No settings family 'chapter_4'"):
+        recipe_named("thesis", "chapter_4")
+
+
 def test_thesis_network_is_that_of_ha_and_schmidhuber() -> None:
     vae = empty_vae(CHAPTER_5["thesis"], "gray_strips")
     shapes = {name: tuple(weight.shape) for name, weight in vae.named_parameters() if name.endswith("weight")}
@@ -340,7 +362,8 @@ def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:
 def test_view_joins_strips_and_keeps_colours() -> None:
     frames, _ = draw_frames(arrow_spec(), "mild", 2, np.random.default_rng(0))
     assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
-    assert view(np.full((2, 3, 64, 64), 0.25, dtype=np.float32), "whole_rgb").shape == (2, 64, 64, 3)
+    colours = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
+    assert np.array_equal(view(colours, "small_rgb")[1, 5, 7], colours[1, :, 5, 7])
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

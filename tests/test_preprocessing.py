@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imagine_bench.errors import UnknownNameError
-from imagine_bench.preprocessing import gray_strips, join_strips, preprocess, whole_rgb
+from imagine_bench.preprocessing import gray_strips, join_strips, preprocess, small_rgb, whole_rgb
 
 
 def test_strips_hold_the_columns_of_their_cube():
@@ -27,6 +27,15 @@ def test_whole_rgb_moves_channels_first():
     pixels = whole_rgb(frames)
     assert pixels.shape == (2, 3, 64, 64)
     np.testing.assert_allclose(pixels[1, 2], frames[1, :, :, 2] / 255, atol=1e-6)
+
+
+def test_small_rgb_averages_blocks():
+    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    pixels = small_rgb(frames)
+    assert pixels.shape == (2, 3, 32, 32)
+    assert pixels.dtype == np.float32
+    assert pixels[1, 2, 5, 31] == pytest.approx(frames[1, 10:12, 62:, 2].mean() / 255, abs=1e-6)
+    assert small_rgb(np.full((1, 64, 64, 3), 255, dtype=np.uint8)).max() == 1.0
 
 
 def test_unknown_preprocessing_lists_the_known_ones():

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench.files import make_folder
 from imagine_bench.interfaces import SceneReader
-from imagine_bench.pictures import png, rollout_strip
+from imagine_bench.pictures import png, rgb, rollout_strip
 from imagine_bench.plans import Plan, carry_out, make_env
 from imagine_bench.recording.blueprint import scene_view
 from imagine_bench.recording.episodes import MOTION_HZ, recording_file
@@ -119,9 +118,8 @@ class _PlanStory:
         recording, compared, rollout = self._recording, plan.compared, plan.compared.rollout
         real = compared.start_frame if done == 0 else compared.real_frames[done - 1]
         imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
-        gray = (np.clip(imagined, 0.0, 1.0) * 255.0).round().astype(np.uint8)
         recording.log("/real/frame", rr.Image(real), strict=True)
-        recording.log("/imagined/frame", rr.Image(gray, color_model="L"), strict=True)
+        recording.log("/imagined/frame", rr.Image(rgb(imagined)), strict=True)
         strip = rollout_strip(_so_far(compared, done), self._trained.task.action_names)
         image = rr.EncodedImage(contents=png(strip), media_type="image/png")
         recording.log("/imagined/strip", image, strict=True)
