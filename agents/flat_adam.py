@@ -50,12 +50,7 @@ class FlatAdam:
         """
         gradients = torch.autograd.grad(loss, self._parameters)
         torch.cat([gradient.reshape(-1) for gradient in gradients], out=self._gradient)
-        norms = [float(segment.norm()) for segment in self._segments]
-        if not all(map(math.isfinite, norms)):
-            raise DivergedError(f"Gradients are no longer finite: their norms are {norms}. Lower the learning rate.")
-        for segment, norm in zip(self._segments, norms, strict=True):
-            if self._clip is not None and norm > self._clip:
-                segment.mul_(self._clip / norm)
+        self._clip_gradients()
         adam(
             [self._vector],
             [self._gradient],
@@ -73,6 +68,18 @@ class FlatAdam:
             maximize=False,
         )
 
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """Take steps of this size from now on."""
+        self._rate = learning_rate
+
+    def _clip_gradients(self) -> None:
+        """Check the gradient of each module, and scale it down to the largest norm that is allowed."""
+        norms = [float(segment.norm()) for segment in self._segments]
+        require_finite(norms)
+        for segment, norm in zip(self._segments, norms, strict=True):
+            if self._clip is not None and norm > self._clip:
+                segment.mul_(self._clip / norm)
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies of parameters and moments; before the first step the moments are 0."""
         return {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
@@ -84,3 +91,9 @@ class FlatAdam:
 
     def _tensors(self) -> dict[str, Tensor]:
         return {"value": self._vector, "exp_avg": self._mean, "exp_avg_sq": self._square, "step": self._step}
+
+
+def require_finite(norms: Sequence[float]) -> None:
+    """Raise DivergedError if a gradient's norm is NaN or infinite."""
+    if not all(map(math.isfinite, norms)):
+        raise DivergedError(f"Gradients are no longer finite: their norms are {norms}. Lower the learning rate.")
