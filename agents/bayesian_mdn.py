@@ -36,6 +36,7 @@ class MDNSettings:
         learning_rate: Of Adam.
         gradient_clip: Largest gradient norm of each network.
         sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
+        sigma_ceiling: Largest, in the same units.
         precision: Products between hidden layers while training: float32 or bfloat16.
     """
 
@@ -46,6 +47,7 @@ class MDNSettings:
     learning_rate: float = 1e-3
     gradient_clip: float = 10.0
     sigma_floor: float = 1e-3
+    sigma_ceiling: float = 10.0
     precision: str = "float32"
 
 
@@ -73,7 +75,9 @@ class BayesianMDN:
         )  # fmt: skip
 
     def _mixture(self, outputs: Tensor) -> Mixture:
-        return mdn.from_outputs(outputs, self.settings.components, self.n_outputs, math.log(self.settings.sigma_floor))
+        settings = self.settings
+        floor, ceiling = math.log(settings.sigma_floor), math.log(settings.sigma_ceiling)
+        return mdn.from_outputs(outputs, settings.components, self.n_outputs, floor, ceiling)
 
     def update(self, x: Tensor, y: Tensor) -> Tensor:
         """One step of Adam on the mean negative log-likelihood of each network's own batch (equation 4.28).

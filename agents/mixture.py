@@ -35,7 +35,9 @@ def output_size(components: int, dimensions: int) -> int:
     return components * (1 + 2 * dimensions)
 
 
-def from_outputs(outputs: Tensor, components: int, dimensions: int, log_sigma_floor: float) -> Mixture:
+def from_outputs(
+    outputs: Tensor, components: int, dimensions: int, log_sigma_floor: float, log_sigma_ceiling: float = math.inf
+) -> Mixture:
     """Read network outputs as mixtures: softmax coefficients, linear means, linear log variances.
 
     Args:
@@ -43,10 +45,14 @@ def from_outputs(outputs: Tensor, components: int, dimensions: int, log_sigma_fl
         components: K.
         dimensions: Z.
         log_sigma_floor: Smallest log sigma, approached smoothly: a hard clamp would leave no gradient below it.
+        log_sigma_ceiling: Largest log sigma, approached as smoothly: far from all data a linear output has no bound, and
+            a variance that overflows spoils every sum it is in.
     """
     logits, means, log_variances = outputs.split((components, *2 * (components * dimensions,)), dim=-1)
     shape = (*outputs.shape[:-1], components, dimensions)
     log_sigmas = log_sigma_floor + functional.softplus(0.5 * log_variances - log_sigma_floor)
+    if log_sigma_ceiling < math.inf:
+        log_sigmas = log_sigma_ceiling - functional.softplus(log_sigma_ceiling - log_sigmas)
     return Mixture(logits.log_softmax(dim=-1), means.reshape(shape), log_sigmas.reshape(shape))
 
 

@@ -135,11 +135,11 @@ def _with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
             raise UnknownNameError("setting", name, known)
         section, _, key = name.partition(".")
         hint = get_type_hints(type(getattr(settings, section)))[key]
-        sections.setdefault(section, {})[key] = _checked(name, hint, value)
+        sections.setdefault(section, {})[key] = checked(name, hint, value)
     return replace(settings, **{name: replace(getattr(settings, name), **new) for name, new in sections.items()})
 
 
-def _checked(name: str, hint: Any, value: Any) -> Any:
+def checked(name: str, hint: Any, value: Any) -> Any:
     """``value`` as the type ``hint``, where nothing is lost by it."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for option in options:

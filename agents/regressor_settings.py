@@ -1,0 +1,116 @@
+"""Settings of the regressors of chapter 4: the thesis' values, and how presets and regressors deviate from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_type_hints
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+
+from .bayesian_mdn import MDNSettings
+from .family import Deviation
+from .presets import checked
+
+PRECISIONS = ("float32", "bfloat16")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorSettings(MDNSettings):
+    """A regressor: its networks and how long they train. The defaults are the thesis' (4.5.1).
+
+    Attributes:
+        epochs: Passes over the data.
+        batch_size: Rows an update, at most; the thesis names none.
+        members: Networks of an ensemble, M; 1 is a single network with dropout.
+        weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
+        divergence_draws: Values drawn from each weight sample's mixture to estimate their divergence.
+    """
+
+    epochs: int = 3000
+    batch_size: int = 250
+    members: int = 1
+    weight_samples: int = 50
+    divergence_draws: int = 1
+
+
+PRESETS: dict[str, dict[str, Deviation]] = {
+    "smoke": {
+        "epochs": Deviation(20, "shows that every part works, within a minute"),
+        "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
+    },
+    "quick": {
+        "epochs": Deviation(600, "CPU time"),
+        "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
+    },
+    "thesis": {"precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes")},
+    "full": {},
+}
+"""What each preset changes of the thesis' values."""
+
+ENSEMBLE: dict[str, Deviation] = {
+    "members": Deviation(5, "as many as Lakshminarayanan et al. (2017) recommend"),
+    "dropout": Deviation(0.0, "in an ensemble the members are the weight samples"),
+}
+"""What a deep ensemble changes of every preset; its epochs are divided by :data:`ENSEMBLE_SHARE`."""
+ENSEMBLE_SHARE = 10
+"""Five members for a tenth of the epochs cost half of one network with dropout: it must not win by arithmetic."""
+
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "dropout": (0.0, 0.95, "must lie in [0, 0.95]"),
+    "weight_decay": (0.0, 1e6, "must be at least 0"),
+    "learning_rate": (1e-12, 1.0, "must lie in (0, 1]"),
+    "gradient_clip": (1e-12, 1e12, "must be above 0"),
+    "sigma_floor": (1e-9, 1.0, "must lie in [1e-9, 1]"),
+    "weight_samples": (2, 10_000, "must lie in [2, 10000]: the spread of one sample is 0"),
+    "components": (1, 1_000, "must lie in [1, 1000]"),
+    "members": (1, 1_000, "must lie in [1, 1000]"),
+}
+_COUNT = (1, 1e9, "must be at least 1")
+
+
+def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> RegressorSettings:
+    """The settings of a preset, with single ones replaced.
+
+    Args:
+        preset: A name of :data:`PRESETS`.
+        overrides: Values by name, such as ``{"epochs": 100}``; what is given here holds for every regressor.
+        ensemble: Whether they are for a deep ensemble.
+
+    Raises:
+        UnknownNameError: No such preset or setting; the message lists what exists.
+        InvalidValueError: A value of the wrong type or out of its range.
+    """
+    require_known("preset", preset, PRESETS)
+    values = {name: deviation.value for name, deviation in PRESETS[preset].items()}
+    if ensemble:
+        epochs = values.get("epochs", RegressorSettings().epochs)
+        values |= {name: deviation.value for name, deviation in ENSEMBLE.items()}
+        values["epochs"] = max(1, epochs // ENSEMBLE_SHARE)
+    known = {field.name for field in fields(RegressorSettings)}
+    hints = get_type_hints(RegressorSettings)
+    for name, value in overrides.items():
+        if name not in known:
+            raise UnknownNameError("setting", name, sorted(known))
+        values[name] = checked(name, hints[name], value)
+    settings = replace(RegressorSettings(), **values)
+    _require_ranges(settings)
+    return settings
+
+
+def check(preset: str, overrides: Mapping[str, Any]) -> None:
+    """Raise what any regressor would raise for these settings."""
+    for ensemble in (False, True):
+        settings = resolve(preset, overrides, ensemble=ensemble)
+    if settings.members < 2:
+        raise InvalidValueError("Setting members is 1 in an ensemble; it must be at least 2: the spread of one is 0.")
+
+
+def _require_ranges(settings: RegressorSettings) -> None:
+    require_known("precision", settings.precision, PRECISIONS)
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        low, high, words = _RANGES.get(field.name, _COUNT)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(not isinstance(number, str) and not low <= number <= high for number in numbers):
+            raise InvalidValueError(f"Setting {field.name} is {value}; it {words}.")

@@ -1,0 +1,143 @@
+"""The toy regression of thesis 4.5.1: three branches, noise, a region with little data, a region with much noise.
+
+``y = f(x) + eta``: f is one of three functions, each as likely as the others, eta is Gaussian noise. All true
+uncertainties are known in closed form.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.regression import SCORES, Assess, Dataset, Floats, RegressionSpec
+from imagine_bench.seeding import SeedTree
+
+DOMAIN = (-30.0, 30.0)
+"""Where the training inputs lie."""
+REGION = (-10.0, 10.0)
+"""Where the variants differ: little data, or much noise."""
+TEST_DOMAIN = (-30.0, 40.0)
+"""Where the networks are asked: beyond 30 they extrapolate."""
+SAMPLES, DECIMATION = 2000, 50
+SIGMA, SIGMA_HIGH = 1.0, 3.0
+GRID = 1000
+"""Test inputs of figure 4.1."""
+VARIANTS = ("base", "low_data", "high_noise")
+
+
+def branches(x: Floats) -> Floats:
+    """The three functions of thesis 4.5.1. Inputs (...), result (..., 3)."""
+    return np.stack(
+        [7 * np.sin(0.75 * x) + 0.5 * x, 3 * np.sin(0.5 * x) + 3 * x - 5, 2 * np.sin(0.3 * x) - 0.2 * x + 20], axis=-1
+    )
+
+
+def in_region(x: Floats) -> NDArray[np.bool_]:
+    """Whether inputs lie in the region where the variants differ."""
+    return (x >= REGION[0]) & (x <= REGION[1])
+
+
+def noise_sigma(variant: str, x: Floats) -> Floats:
+    """Standard deviation of the noise at each input."""
+    require_variant(variant)
+    return np.where((variant == "high_noise") & in_region(x), SIGMA_HIGH, SIGMA)
+
+
+def true_mean(x: Floats) -> Floats:
+    """E[f]: the mean of the branches."""
+    return branches(x).mean(axis=-1)
+
+
+def true_modal(x: Floats) -> Floats:
+    """V[f] (equation 4.7): the variance of the branches."""
+    return branches(x).var(axis=-1)
+
+
+def require_variant(variant: str) -> None:
+    """Raise UnknownNameError unless ``variant`` is one of the three datasets."""
+    require_known("variant of toy_regression", variant, VARIANTS)
+
+
+def training(variant: str, rng: np.random.Generator) -> Dataset:
+    """The training data: 2000 points, or with the region decimated by 50, as many as are expected to remain.
+
+    Counts inside and outside of the region are at their expectation, so that all datasets of a variant are as long.
+    """
+    require_variant(variant)
+    inside = round(SAMPLES * (REGION[1] - REGION[0]) / (DOMAIN[1] - DOMAIN[0]))
+    outside = SAMPLES - inside
+    kept = round(inside / DECIMATION) if variant == "low_data" else inside
+    left = rng.uniform(DOMAIN[0], REGION[0], size=outside // 2)
+    right = rng.uniform(REGION[1], DOMAIN[1], size=outside - outside // 2)
+    return _with_targets(variant, np.concatenate([left, right, rng.uniform(*REGION, size=kept)]), rng)
+
+
+def testing(variant: str, rng: np.random.Generator, count: int) -> Dataset:
+    """Points of the same process, uniform over the training domain: the region has its full share here."""
+    if count < 1:
+        raise InvalidValueError(f"{count} test points say nothing; ask for at least 1.")
+    return _with_targets(variant, rng.uniform(*DOMAIN, size=count), rng)
+
+
+def _with_targets(variant: str, x: Floats, rng: np.random.Generator) -> Dataset:
+    chosen = rng.integers(3, size=len(x))
+    y = branches(x)[np.arange(len(x)), chosen] + noise_sigma(variant, x) * rng.standard_normal(len(x))
+    return Dataset(inputs=x[:, None], targets=y[:, None])
+
+
+def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
+    """Distance to the nearest branch in standard deviations of the noise there. Shape (N,)."""
+    x, y = inputs[:, 0], predictions[:, 0]
+    nearest: Floats = np.abs(branches(x) - y[:, None]).min(axis=1)
+    return nearest / noise_sigma(variant, x)
+
+
+def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+    """The curves of figure 4.1 on a common grid, with the truth beside them.
+
+    Returns:
+        ``x``, ``true_mean``, ``true_modal``, ``true_aleatoric`` (GRID,); ``true_epistemic`` (equation 4.6, which needs
+        the networks' means), ``prediction``, ``mean`` and every score of :data:`SCORES`, (E, GRID); the training data
+        of the first network.
+    """
+    x = np.linspace(*TEST_DOMAIN, GRID)
+    said = assess(np.broadcast_to(x[None, :, None], (len(seeds), GRID, 1)), "figure_4_1")
+    data = training(variant, seeds[0].child("data").generator())
+    return {
+        "x": x,
+        "true_mean": true_mean(x),
+        "true_modal": true_modal(x),
+        "true_aleatoric": noise_sigma(variant, x) ** 2,
+        "true_epistemic": (true_mean(x) - said.mean[..., 0]) ** 2 + said.epistemic[..., 0],
+        "prediction": said.prediction[..., 0],
+        "mean": said.mean[..., 0],
+        "training_x": data.inputs[:, 0],
+        "training_y": data.targets[:, 0],
+        **{name: score(said) for name, score in SCORES.items()},
+    }
+
+
+SPEC = RegressionSpec(
+    id="toy_regression",
+    title="Toy regression",
+    description=(
+        "A number x leads to one of three curves, plus noise; the variants take data away in a region, or add noise "
+        "there. What is uncertain, and why, is known exactly, so it can be seen whether a model knows it too."
+    ),
+    input_names=("x",),
+    output_names=("y",),
+    variants=VARIANTS,
+    require_variant=require_variant,
+    training=training,
+    testing=testing,
+    errors=errors,
+    error_name="distance to the nearest branch (standard deviations of the noise)",
+    wrong_above=3.0,
+    evaluate=evaluate,
+    sections="imagine_bench.report.toy_regression:sections",
+    recorder="imagine_bench.recording.toy_regression:record",
+    reference=None,
+)
