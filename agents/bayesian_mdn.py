@@ -1,8 +1,8 @@
 """The Bayesian mixture density network (Bishop 1994; thesis 4.4): any inputs, any outputs, weights that are uncertain.
 
-Many networks of one shape train as one batched computation; each has its own generators, so a network is the same,
-up to rounding, whether it trains alone or among others. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs, ``D`` outputs,
-``K`` components, ``T`` weight samples.
+Many networks of one shape train as one batched computation; each has its own generators, so a network is the
+same, up to rounding, whether it trains alone or among others. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs,
+``D`` outputs, ``K`` components, ``T`` weight samples.
 """
 
 from __future__ import annotations

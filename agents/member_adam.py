@@ -34,7 +34,13 @@ class MemberAdam(FlatAdam):
     ) -> None:
         super().__init__([module], learning_rate=learning_rate, gradient_clip=gradient_clip)
         self._parameters, self._decayed = list(module.parameters()), decayed
-        self._kept = 1.0 - learning_rate * weight_decay
+        self._weight_decay = weight_decay
+        self.set_learning_rate(learning_rate)
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """Take steps of this size from now on, and let weights decay by as much less."""
+        super().set_learning_rate(learning_rate)
+        self._kept = 1.0 - learning_rate * self._weight_decay
 
     def step(self, loss: Tensor) -> None:
         """Descend the gradient of the sum of all members' losses once."""

@@ -45,8 +45,8 @@ def from_outputs(
         components: K.
         dimensions: Z.
         log_sigma_floor: Smallest log sigma, approached smoothly: a hard clamp would leave no gradient below it.
-        log_sigma_ceiling: Largest log sigma, approached as smoothly: far from all data a linear output has no bound, and
-            a variance that overflows spoils every sum it is in.
+        log_sigma_ceiling: Largest log sigma, approached as smoothly: far from all data a linear output has no bound,
+            and a variance that overflows spoils every sum it is in.
     """
     logits, means, log_variances = outputs.split((components, *2 * (components * dimensions,)), dim=-1)
     shape = (*outputs.shape[:-1], components, dimensions)

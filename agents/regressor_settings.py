@@ -21,6 +21,8 @@ class RegressorSettings(MDNSettings):
 
     Attributes:
         epochs: Passes over the data.
+        final_rate: Learning rate of the last epoch as a share of the first's; in between it falls as a cosine
+            (Loshchilov & Hutter 2017). 1 keeps it, as the thesis does.
         batch_size: Rows an update, at most; the thesis names none.
         members: Networks of an ensemble, M; 1 is a single network with dropout.
         weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
@@ -28,6 +30,7 @@ class RegressorSettings(MDNSettings):
     """
 
     epochs: int = 3000
+    final_rate: float = 1.0
     batch_size: int = 250
     members: int = 1
     weight_samples: int = 50
@@ -60,6 +63,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "dropout": (0.0, 0.95, "must lie in [0, 0.95]"),
     "weight_decay": (0.0, 1e6, "must be at least 0"),
     "learning_rate": (1e-12, 1.0, "must lie in (0, 1]"),
+    "final_rate": (0.0, 1.0, "must lie in [0, 1]"),
     "gradient_clip": (1e-12, 1e12, "must be above 0"),
     "sigma_floor": (1e-9, 1.0, "must lie in [1e-9, 1]"),
     "weight_samples": (2, 10_000, "must lie in [2, 10000]: the spread of one sample is 0"),

@@ -8,6 +8,7 @@ mixtures scaled back, so that one set of rates fits metres, radians and any othe
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import torch
@@ -76,12 +77,18 @@ class MixtureRegressor:
         rows = self._x.shape[1]
         owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
         for _ in range(epochs):
+            self._model.optimiser.set_learning_rate(self._rate())
             orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._order])
             losses = []
             for batch in orders.tensor_split(-(-rows // self.settings.batch_size), dim=1):
                 losses.append(self._model.update(self._x[owner, batch], self._y[owner, batch]))
             self._losses.append(float(torch.stack(losses).mean()))
             self._epoch += 1
+
+    def _rate(self) -> float:
+        """The learning rate of the coming epoch."""
+        final, gone = self.settings.final_rate, min(1.0, self._epoch / self.settings.epochs)
+        return self.settings.learning_rate * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * gone)))
 
     def diagnostics(self) -> dict[str, float]:
         """Mean negative log-likelihood of the standardised targets while training, since the last call."""
@@ -104,7 +111,9 @@ class MixtureRegressor:
         for e in range(self.networks):
             samples = self._weight_samples(e, self._tensor(inputs[e]))
             every.append(_numpy(mdn.average(samples, len(samples.means))))
-        return Mixtures(**{name: np.stack([getattr(m, name) for m in every]) for name in ("weights", "means", "sigmas")})
+        return Mixtures(
+            **{name: np.stack([getattr(m, name) for m in every]) for name in ("weights", "means", "sigmas")}
+        )
 
     def state(self) -> AgentState:
         """Weights, moments, running statistics, generators, epochs."""

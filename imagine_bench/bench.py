@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from imagine_bench import encoders, registry
 from imagine_bench.environment import describe_environment, gl_renderer
 from imagine_bench.errors import RunFailedError
+from imagine_bench.kinds import kind_of, require_options
 from imagine_bench.launchers import Failure, Job, Launcher
 from imagine_bench.progress import ProgressBars
 from imagine_bench.protocol import Protocol, protocol
-from imagine_bench.results import BenchResult
 from imagine_bench.runs import Observer, Progress, RunSpec
 from imagine_bench.store import BenchStore, load_bench
 
@@ -21,8 +22,30 @@ _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
 _NOTE_EVERY_S = 10.0
 
 
-def plan(task: str, preset: str, *, encoder: str | None = None, **changes: object) -> tuple[Protocol, Path | None]:
+def plan(task: str, preset: str, **options: Any) -> tuple[Any, Path | None]:
     """The protocol of a bench and the encoder it uses, with everything checked that can be before anything is run.
+
+    Args:
+        task: Registered task of any kind.
+        preset: Name of a protocol preset.
+        options: Fields of the kind's protocol that differ from the preset's; for control tasks, ``encoder`` may be a
+            bundled name or a path.
+
+    Raises:
+        UnknownNameError: Any name that does not exist; the message lists those that do.
+        InvalidValueError: A value out of its range, or an option that tasks of this kind do not take.
+        ArtefactError: The task has no bundled encoder at this appearance level.
+        SetupError: The device does not exist here.
+    """
+    require_options(task, {name: value for name, value in options.items() if name != "encoder"})
+    planned: tuple[Any, Path | None] = registry.load(kind_of(task).plan)(task, preset, **options)
+    return planned
+
+
+def plan_control(
+    task: str, preset: str, *, encoder: str | None = None, **changes: object
+) -> tuple[Protocol, Path | None]:
+    """The protocol of a control bench and the encoder it uses.
 
     Args:
         task: Registered task.
@@ -46,15 +69,18 @@ def plan(task: str, preset: str, *, encoder: str | None = None, **changes: objec
     return protocol(task, preset, **{**changes, "encoder": encoders.identity(path)}), path
 
 
-def bench(wanted: Protocol, encoder: Path | None, *, root: Path, launcher: Launcher, bars: int) -> BenchResult:
+def bench(wanted: Any, encoder: Path | None, *, root: Path, launcher: Launcher, bars: int) -> Any:
     """Run what is missing of a protocol, and read all of it.
 
     Args:
-        wanted: What is compared.
+        wanted: What is compared: a protocol of any kind.
         encoder: The encoder artefact, or None if no agent needs one.
         root: Folder of all benches.
         launcher: Carries out the runs.
         bars: Lines of progress, one a run at a time.
+
+    Returns:
+        The result class of the task's kind.
 
     Raises:
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
@@ -77,7 +103,7 @@ def bench(wanted: Protocol, encoder: Path | None, *, root: Path, launcher: Launc
 
 
 def _job(store: BenchStore, encoder: Path | None, agent: str, seed: int) -> Job:
-    needed = encoder if registry.agent_entry(agent).needs_encoder else None
+    needed = encoder if encoder is not None and registry.agent_entry(agent).needs_encoder else None
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 

@@ -19,6 +19,7 @@ from imagine_bench.encoders import bundled
 from imagine_bench.environment import usable_cores
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LocalPool
 from imagine_bench.protocol import PRESETS
 from imagine_bench.store import load_bench, newest_bench, newest_recording
@@ -46,10 +47,14 @@ class Bench:
     """Real training episodes at which agents are tested, ascending."""
     evaluation_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_PRESETS_OWN)] = None
     """Test episodes at each budget."""
-    execution: str = EXECUTIONS[0]
+    execution: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
-    appearance: str = APPEARANCES[0]
+    appearance: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: clean)")] = None
     """How much light, colours and poses vary: clean, mild or strong."""
+    variants: Annotated[tuple[str, ...], _OF_PRESET] = ()
+    """Of regression tasks: datasets, or numbers of samples, to learn from."""
+    networks: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_PRESETS_OWN)] = None
+    """Of regression tasks: networks a run, each on data of its own."""
     encoder: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
     ] = None
@@ -65,11 +70,13 @@ class Bench:
 
     def __call__(self) -> None:
         """Plan, run, report."""
-        names = ("agents", "seeds", "budgets", "evaluation_episodes")
-        changes: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) not in ((), None)}
-        changes.update(execution=self.execution, appearance=self.appearance, device=self.device)
+        names = (
+            "agents", "seeds", "budgets", "evaluation_episodes", "execution", "appearance", "variants", "networks",
+            "encoder",
+        )  # fmt: skip
+        options: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) not in ((), None)}
         wanted, encoder = plan(
-            self.task, self.preset, encoder=self.encoder, overrides=parse_settings(self.set), **changes
+            self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options
         )
         workers = usable_cores() if self.workers is None else self.workers
         _show(bench(wanted, encoder, root=self.out, launcher=LocalPool(workers), bars=workers).folder)
@@ -217,15 +224,15 @@ class List:
 
     def __call__(self) -> None:
         """List."""
-        for kind, names in {
-            "tasks": registry.TASKS,
-            "agents": registry.AGENTS,
+        for title, names in {
+            **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
+            **{f"{name} learners": kind.learners for name, kind in KINDS.items()},
             "presets": PRESETS,
             "executions": EXECUTIONS,
             "appearances": APPEARANCES,
             "encoders": bundled(),
         }.items():
-            print(f"{kind:12}{', '.join(names)}")
+            print(f"{title:22}{', '.join(names)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,11 +332,10 @@ def _value(text: str) -> Any:
 
 def _show(folder: Path) -> None:
     """Write a bench's report, and print its table and where everything lies."""
-    from imagine_bench.report import summary_table, write_report  # noqa: PLC0415 - matplotlib loads slowly
-
     result = load_bench(folder)
-    page = write_report(result)
-    print(summary_table(result))
+    kind = kind_of(result.protocol.task)
+    page = registry.load(kind.write_report)(result)
+    print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")
     recordings = [run.recording for run in result.runs if run.recording is not None]
     if recordings:

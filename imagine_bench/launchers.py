@@ -19,7 +19,8 @@ from typing import Protocol
 
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.files import make_folder, writing
-from imagine_bench.runner import run
+from imagine_bench.kinds import kind_of
+from imagine_bench.registry import load
 from imagine_bench.runs import Observer, Progress, RunSpec
 
 ONE_THREAD = {
@@ -173,7 +174,7 @@ def _work(job: Job, sender: Connection) -> None:
     try:
         _redirect_output(job)
         _log(f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
-        run(job.spec, job.folder, sender.send)
+        load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, sender.send)
         sender.send(None)
     except Exception as error:
         traceback.print_exc()

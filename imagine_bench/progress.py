@@ -79,6 +79,8 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
 
 def _sentence(progress: Progress) -> str:
+    if progress.detail is not None:
+        return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / progress.work:.0f} %"
     success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
     return (
         f"{progress.agent} seed {progress.seed}: {progress.phase}, training episode {progress.episode}, "

@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
@@ -19,8 +19,28 @@ _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
 
+class ProtocolData:
+    """What protocols of every kind can do, being dataclasses of JSON-like values."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """A JSON-serialisable copy."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """The inverse of :meth:`as_dict`."""
+        tuples = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+        tuples["overrides"] = tuple((name, value) for name, value in tuples.get("overrides", ()))
+        return cls(**tuples)
+
+    @property
+    def hash(self) -> str:
+        """Twelve hex digits that change when anything in the protocol does."""
+        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:12]
+
+
 @dataclass(frozen=True, kw_only=True)
-class Protocol:
+class Protocol(ProtocolData):
     """One comparison, completely specified.
 
     Attributes:
@@ -66,33 +86,18 @@ class Protocol:
         require_known("appearance", self.appearance, APPEARANCES)
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
-        _require_ascending("budgets", self.budgets, at_least=1)
-        _require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
-        if len({tunes(seed) for seed in self.seeds}) > 1:
-            raise InvalidValueError(
-                f"seeds {self.seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
-                "reported ones; give them to separate benches."
-            )
+        require_ascending("budgets", self.budgets, at_least=1)
+        require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
+        require_unmixed(self.seeds)
         if not self.agents or len(set(self.agents)) != len(self.agents):
             raise InvalidValueError(f"agents {self.agents} must be at least one name, none of them twice.")
         if self.evaluation_episodes < 1:
             raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
 
-    def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Protocol:
-        """The inverse of :meth:`as_dict`."""
-        tuples = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-        tuples["overrides"] = tuple((name, value) for name, value in tuples.get("overrides", ()))
-        return cls(**tuples)
-
-    @property
-    def hash(self) -> str:
-        """Twelve hex digits that change when anything in the protocol does."""
-        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:12]
+    def work(self, agent: str) -> int:
+        """Episodes that a run of this agent plays, for training and for tests."""
+        tests = self.evaluation_episodes
+        return self.budgets[-1] + len(self.budgets) * tests if agent_entry(agent).learns else tests
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -131,9 +136,19 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     return Protocol(task=task_name, preset=preset, **values)
 
 
-def _require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
+def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
+    """Raise InvalidValueError unless values are different integers, ascending, of at least ``at_least``."""
     ascending = all(a < b for a, b in itertools.pairwise(values))
     if not values or not ascending or values[0] < at_least:
         raise InvalidValueError(
             f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
+        )
+
+
+def require_unmixed(seeds: tuple[int, ...]) -> None:
+    """Raise InvalidValueError for tuning seeds among reported ones."""
+    if len({tunes(seed) for seed in seeds}) > 1:
+        raise InvalidValueError(
+            f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
+            "reported ones; give them to separate benches."
         )

@@ -9,6 +9,7 @@ from typing import Any
 
 from imagine_bench.errors import UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +80,51 @@ AGENTS: dict[str, AgentEntry] = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class RegressionEntry:
+    """A registered regression task.
+
+    Attributes:
+        spec: ``"module:attr"`` of its RegressionSpec.
+    """
+
+    spec: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorEntry:
+    """A registered regressor.
+
+    Attributes:
+        make: ``"module:attr"`` of a function from RegressorContext to Regressor.
+        title: For headings, legends and tables.
+        description: One sentence for a reader who knows none of this.
+    """
+
+    make: str
+    title: str
+    description: str
+
+
+REGRESSIONS: dict[str, RegressionEntry] = {
+    "toy_regression": RegressionEntry(spec="imagine_bench.tasks.toy_regression:SPEC"),
+    "robot_ik": RegressionEntry(spec="imagine_bench.tasks.robot_ik:SPEC"),
+}
+
+REGRESSORS: dict[str, RegressorEntry] = {
+    "mc_dropout": RegressorEntry(
+        make="imagine_bench.agents.regressors:make_mc_dropout",
+        title="MC dropout",
+        description="One network whose hidden units are dropped at random, again and again: the thesis' Bayesian MDN.",
+    ),
+    "ensemble": RegressorEntry(
+        make="imagine_bench.agents.regressors:make_ensemble",
+        title="deep ensemble",
+        description="Several networks that began and trained differently; where they disagree, they do not know.",
+    ),
+}
+
+
 def load(target: str) -> Any:
     """The object that ``"module:attr"`` names."""
     module, _, attribute = target.partition(":")
@@ -116,4 +162,33 @@ def task(name: str) -> TaskSpec:
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent of a registered kind."""
     make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
+    return make(context)
+
+
+def regression(name: str) -> RegressionSpec:
+    """The RegressionSpec of a registered regression task.
+
+    Raises:
+        UnknownNameError: No such task; the message lists all of them.
+    """
+    if name not in REGRESSIONS:
+        raise UnknownNameError("regression task", name, REGRESSIONS)
+    spec: RegressionSpec = load(REGRESSIONS[name].spec)
+    return spec
+
+
+def regressor_entry(name: str) -> RegressorEntry:
+    """The registry line of a regressor.
+
+    Raises:
+        UnknownNameError: No such regressor; the message lists all of them.
+    """
+    if name not in REGRESSORS:
+        raise UnknownNameError("regressor", name, REGRESSORS)
+    return REGRESSORS[name]
+
+
+def make_regressor(name: str, context: RegressorContext) -> Regressor:
+    """A new regressor of a registered kind."""
+    make: Callable[[RegressorContext], Regressor] = load(regressor_entry(name).make)
     return make(context)

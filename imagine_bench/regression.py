@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentState, Motion, Shape3D
 from imagine_bench.seeding import SeedTree
 
 Floats = NDArray[np.float64]
@@ -163,6 +163,16 @@ class Evaluate(Protocol):
         """
 
 
+class MovingScene(Protocol):
+    """A robot that predictions are carried out with, for recordings."""
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable part."""
+
+    def movement(self, prediction: Floats, hz: float) -> Motion:
+        """How every body moves while one prediction (D,) is carried out, sampled ``hz`` a second."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RegressionSpec:
     """Everything the bench needs to know of a regression task. Building one is cheap.
@@ -183,6 +193,7 @@ class RegressionSpec:
         evaluate: The task's own measurements.
         sections: ``"module:attr"`` of the function that turns them into sections of the report.
         recorder: ``"module:attr"`` of the function that records them, or None.
+        scene: Gives the robot that carries out predictions, where there is one.
         reference: Name of the thesis' tables, or None.
         presets: What each protocol preset changes for this task.
     """
@@ -202,5 +213,6 @@ class RegressionSpec:
     evaluate: Evaluate
     sections: str
     recorder: str | None = None
+    scene: Callable[[], MovingScene] | None = None
     reference: str | None = None
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

@@ -102,18 +102,27 @@ def finish(
         SetupError: Something cannot be written; the run is then not marked.
     """
     write_metrics(folder, checkpoints)
-    _write_arrays(folder / _TRAINING, training)
+    write_arrays(folder / _TRAINING, training)
     loops = {str(row.episodes): row.open_loop for row in checkpoints if row.open_loop is not None}
-    _write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
-    _write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
+    write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
+    write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
     _write_rollouts(folder / _IMAGINED, imagined)
     _write_rollouts(folder / _COURSES, courses)
     names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED, _COURSES]
+    mark_done(folder, names)
+
+
+def mark_done(folder: Path, names: Sequence[str]) -> None:
+    """Mark a run as done: from now on these files of it never change.
+
+    Raises:
+        SetupError: The mark cannot be written.
+    """
     write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
 
 
-def load_run(folder: Path) -> RunResult:
-    """Read a finished run.
+def require_done(folder: Path) -> dict[str, Any]:
+    """What was run in a finished folder, whose files are all as the run left them.
 
     Raises:
         ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
@@ -127,13 +136,23 @@ def load_run(folder: Path) -> RunResult:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    config = read_json(folder / _CONFIG, "a run's configuration")
-    training = _read_arrays(folder / _TRAINING)
+    config: dict[str, Any] = read_json(folder / _CONFIG, "a run's configuration")
+    return config
+
+
+def load_run(folder: Path) -> RunResult:
+    """Read a finished run.
+
+    Raises:
+        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
+    """
+    config = require_done(folder)
+    training = read_arrays(folder / _TRAINING)
     recording = recording_path(folder)
     return RunResult(
         agent=config["agent"],
         seed=config["seed"],
-        checkpoints=with_futures(_read_metrics(folder), _read_arrays(folder / _FUTURES)),
+        checkpoints=with_futures(_read_metrics(folder), read_arrays(folder / _FUTURES)),
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
@@ -168,7 +187,7 @@ def futures_arrays(checkpoints: Sequence[Checkpoint]) -> dict[str, NDArray[Any]]
 
 def with_futures(checkpoints: Sequence[Checkpoint], arrays: Mapping[str, NDArray[Any]]) -> tuple[Checkpoint, ...]:
     """The rows with their futures, as :func:`futures_arrays` gave them."""
-    found = {budget: Futures(**parts) for budget, parts in _grouped(arrays).items()}
+    found = {budget: Futures(**parts) for budget, parts in grouped(arrays).items()}
     return tuple(dataclasses.replace(row, futures=found.get(str(row.episodes))) for row in checkpoints)
 
 
@@ -179,7 +198,7 @@ def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:
 
 
 def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
-    loops = _grouped(_read_arrays(folder / _OPEN_LOOP))
+    loops = grouped(read_arrays(folder / _OPEN_LOOP))
     rows = csv.DictReader(io.StringIO((folder / _METRICS).read_text()))
     return tuple(
         Checkpoint(
@@ -197,12 +216,12 @@ def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
 
 
 def _write_rollouts(path: Path, rollouts: Sequence[ComparedRollout]) -> None:
-    _write_arrays(path, {f"{n}/{k}": v for n, one in enumerate(rollouts) for k, v in _arrays(one).items()})
+    write_arrays(path, {f"{n}/{k}": v for n, one in enumerate(rollouts) for k, v in _arrays(one).items()})
 
 
 def _read_rollouts(path: Path) -> tuple[ComparedRollout, ...]:
     examples = []
-    for _, arrays in sorted(_grouped(_read_arrays(path)).items()):
+    for _, arrays in sorted(grouped(read_arrays(path)).items()):
         rollout = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith("rollout/")}
         rest = {name: array for name, array in arrays.items() if "/" not in name}
         examples.append(ComparedRollout(rollout=ImaginedRollout(**rollout), **rest))
@@ -221,7 +240,8 @@ def _arrays(record: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, NDArray[Any]]]:
+def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, NDArray[Any]]]:
+    """Arrays by the first part of their slashed names."""
     groups: dict[str, dict[str, NDArray[Any]]] = {}
     for name, array in arrays.items():
         group, _, rest = name.partition("/")
@@ -229,13 +249,23 @@ def _grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, NDArray[
     return groups
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays, atomically.
+
+    Raises:
+        SetupError: They cannot be written.
+    """
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The inverse of :func:`write_arrays`.
+
+    Raises:
+        ArtefactError: The file is missing or damaged.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

@@ -15,7 +15,6 @@ from imagine_bench import registry, run_folder
 from imagine_bench.checkpointing import Snapshot
 from imagine_bench.evaluation import Tally
 from imagine_bench.interfaces import AgentContext, AgentState
-from imagine_bench.protocol import Protocol
 from imagine_bench.results import Checkpoint
 from imagine_bench.seeding import SeedTree
 
@@ -28,14 +27,14 @@ class RunSpec:
     """What one run is.
 
     Attributes:
-        protocol: The comparison it belongs to.
-        agent: Registered agent.
+        protocol: The comparison it belongs to, of any kind.
+        agent: Registered agent or regressor.
         seed: One of the protocol's seeds.
         encoder: The encoder artefact, or None if the agent needs none.
         checkpoint_every_s: Seconds of work that a kill may cost.
     """
 
-    protocol: Protocol
+    protocol: Any
     agent: str
     seed: int
     encoder: Path | None = None
@@ -43,9 +42,9 @@ class RunSpec:
 
     @property
     def work(self) -> int:
-        """Episodes to play, for training and for tests."""
-        tests, budgets = self.protocol.evaluation_episodes, self.protocol.budgets
-        return budgets[-1] + len(budgets) * tests if registry.agent_entry(self.agent).learns else tests
+        """Parts of work to do, of whatever the protocol counts."""
+        parts: int = self.protocol.work(self.agent)
+        return parts
 
     def context(self) -> AgentContext:
         """What the run's agent is built from."""
@@ -76,6 +75,7 @@ class Progress:
         work: Episodes to play.
         episode: Training episodes done.
         success: Share of successes among recent training episodes, or in the running test; None before the first.
+        detail: What a run without episodes is doing, in words; None where episodes say it.
     """
 
     agent: str
@@ -83,8 +83,9 @@ class Progress:
     phase: Phase
     done: int
     work: int
-    episode: int
-    success: float | None
+    episode: int = 0
+    success: float | None = None
+    detail: str | None = None
 
 
 Observer = Callable[[Progress], None]

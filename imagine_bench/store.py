@@ -15,8 +15,8 @@ from typing import Any
 from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.files import lock, make_folder, read_json, write_json
-from imagine_bench.protocol import Protocol
-from imagine_bench.results import BenchResult
+from imagine_bench.kinds import kind_of
+from imagine_bench.registry import load
 
 _PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sittings.json"
 _IDENTITY = ("commit", "versions", "gl_renderer")
@@ -28,10 +28,10 @@ class BenchStore:
 
     Args:
         root: Folder of all benches, such as ``runs``.
-        protocol: What is compared.
+        protocol: What is compared, of any kind.
     """
 
-    def __init__(self, root: Path, protocol: Protocol) -> None:
+    def __init__(self, root: Path, protocol: Any) -> None:
         self.protocol = protocol
         self.folder = root / protocol.task / f"{protocol.preset}-{protocol.hash}"
         self._began_s = time.monotonic()
@@ -100,8 +100,8 @@ class BenchStore:
         write_json(self.folder / _SITTINGS, self._sittings)
 
 
-def load_bench(folder: Path) -> BenchResult:
-    """Read a finished bench.
+def load_bench(folder: Path) -> Any:
+    """Read a finished bench, as the result class of its task's kind.
 
     Raises:
         ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
@@ -109,9 +109,11 @@ def load_bench(folder: Path) -> BenchResult:
     protocol = _read_protocol(folder)
     folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
     sittings = read_json(folder / _SITTINGS, "a bench's sittings")
-    return BenchResult(
+    kind = kind_of(protocol.task)
+    load_run = load(kind.load_run)
+    return load(kind.result)(
         protocol=protocol,
-        runs=tuple(run_folder.load_run(run) for run in folders if run_folder.is_done(run)),
+        runs=tuple(load_run(run) for run in folders if run_folder.is_done(run)),
         environment={**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings},
         folder=folder,
         wall_s=sum(sitting["wall_s"] for sitting in sittings),
@@ -151,11 +153,11 @@ def _run_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / agent / f"seed_{seed}"
 
 
-def _read_protocol(folder: Path) -> Protocol:
+def _read_protocol(folder: Path) -> Any:
     data = read_json(folder / _PROTOCOL, "a bench's protocol")
     try:
-        return Protocol.from_dict(data)
-    except (TypeError, ValueError, AttributeError, ImagineBenchError) as error:
+        return load(kind_of(data["task"]).protocol).from_dict(data)
+    except (TypeError, KeyError, ValueError, AttributeError, ImagineBenchError) as error:
         raise ArtefactError(
             f"{folder / _PROTOCOL} is not a bench's protocol: {error}. It was left untouched."
         ) from error

@@ -186,5 +186,6 @@ SPEC = RegressionSpec(
     evaluate=evaluate,
     sections="imagine_bench.report.robot_ik:sections",
     recorder="imagine_bench.recording.robot_ik:record",
+    scene=arm,
     reference="robot_ik",
 )

@@ -104,7 +104,7 @@ def summary_table(result: BenchResult) -> str:
         f"{protocol.execution}, {protocol.appearance}, {len(protocol.seeds)} seed(s) x "
         f"{protocol.evaluation_episodes} test episodes"
     )
-    return "\n".join([title, "", *_aligned(rows), "", *words.answers(data)])
+    return "\n".join([title, "", *aligned(rows), "", *words.answers(data)])
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
@@ -115,7 +115,7 @@ def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
     return [name, "", *cells, ""]
 
 
-def _aligned(rows: list[list[str]]) -> list[str]:
+def aligned(rows: list[list[str]]) -> list[str]:
     """Columns padded to the width of their widest cell, the first to the left and the others to the right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = []
@@ -136,7 +136,7 @@ def _words(data: ReportData) -> dict[str, Any]:
         "interval_words": _interval_words(data),
         "thesis_only": _thesis_only(data),
         "seed_index": {seed: index for index, seed in enumerate(protocol.seeds)},
-        "facts": _facts(data.result),
+        "facts": facts(data.result),
         "settings": {agent: rows for agent in protocol.agents if (rows := _settings(data.result, agent))},
         "recordings": [_relative(run.recording, data.result.folder) for run in data.result.runs if run.recording],
     }
@@ -161,13 +161,13 @@ def _seconds(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:,.1f}"
 
 
-def _facts(result: BenchResult) -> list[tuple[str, str]]:
-    """How the result was made, name and value, nested values joined by a dot."""
+def facts(result: Any) -> list[tuple[str, str]]:
+    """How a result of any kind was made, name and value, nested values joined by a dot."""
     protocol = result.protocol
     rows = [
         ("protocol", f"{protocol.hash}, preset {protocol.preset}"),
         ("seeds", ", ".join(str(seed) for seed in protocol.seeds)),
-        *_flat("", result.environment),
+        *flat("", result.environment),
     ]
     commit = result.environment.get("commit")
     command = result.environment.get("command", "")
@@ -178,12 +178,13 @@ def _facts(result: BenchResult) -> list[tuple[str, str]]:
 
 def _settings(result: BenchResult, agent: str) -> list[tuple[str, str]]:
     """An agent's settings as run, by dotted name; the protocol gives all its seeds the same."""
-    return _flat("", result.of(agent)[0].settings)
+    return flat("", result.of(agent)[0].settings)
 
 
-def _flat(prefix: str, value: Any) -> list[tuple[str, str]]:
+def flat(prefix: str, value: Any) -> list[tuple[str, str]]:
+    """Nested values as rows of dotted name and text."""
     if hasattr(value, "items"):
-        return [row for key, inner in value.items() for row in _flat(f"{prefix}.{key}" if prefix else str(key), inner)]
+        return [row for key, inner in value.items() for row in flat(f"{prefix}.{key}" if prefix else str(key), inner)]
     if isinstance(value, list | tuple):
         return [(prefix, "; ".join(str(item) for item in value))]
     return [(prefix, str(value))]

@@ -28,7 +28,7 @@ _COLORS = {  # Okabe and Ito's palette
     "imagination_only_uncertainty": "#56b4e9",
 }
 _SPARE_COLORS = ("#e69f00", "#882255", "#999933")
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",
     "font.family": "DejaVu Sans",
@@ -251,7 +251,7 @@ def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) 
 
 
 def _render(name: str, draw: Callable[[ReportData], Figure], data: ReportData, alt: str) -> Plot:
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = draw(data)
         FigureCanvasAgg(figure).draw()
         figure.set_layout_engine("none")  # laid out once, for both files

@@ -1,0 +1,121 @@
+"""Whether a model that says how sure it is, is right about that: pure functions on predictive mixtures and outcomes.
+
+Gneiting & Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007), and Gneiting, Balabdaoui &
+Raftery, "Probabilistic forecasts, calibration and sharpness" (2007). Shapes: ``...`` any leading axes, ``K`` mixture
+components, ``D`` dimensions, each judged by itself unless said otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.regression import Floats, Mixtures
+
+LEVELS = (0.5, 0.8, 0.95)
+"""Central intervals whose coverage is reported."""
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
+    """The probability integral transform: P(Y <= outcome), uniform in [0, 1] if the prediction is calibrated.
+
+    Args:
+        mixtures: Leading axes (...).
+        outcomes: Shape (..., D).
+
+    Returns:
+        Shape (..., D).
+    """
+    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
+    below: Floats = (mixtures.weights[..., None] * special.ndtr(scaled)).sum(axis=-2)
+    return below
+
+
+def coverage(transforms: Floats, level: float) -> float:
+    """Share of outcomes inside their central predictive interval of probability ``level``, in [0, 1].
+
+    Raises:
+        InvalidValueError: The level is not in (0, 1), or there are no outcomes.
+    """
+    if not 0.0 < level < 1.0 or transforms.size == 0:
+        raise InvalidValueError(f"Coverage needs outcomes and a level in (0, 1), not {transforms.size} and {level}.")
+    return float((np.abs(transforms - 0.5) <= 0.5 * level).mean())
+
+
+def transform_distance(transforms: Floats) -> float:
+    """How far the transforms are from uniform: the largest gap between the two distribution functions, in [0, 1]
+    (Kolmogorov-Smirnov).
+    """
+    return float(stats.kstest(transforms.ravel(), "uniform").statistic)
+
+
+def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
+    """Continuous ranked probability score, in the unit of y; lower is better, and the absolute error for a point mass.
+
+    Closed form for Gaussian mixtures (Grimit et al. 2006, equation 5): ``sum_k w_k A(y - m_k, s_k^2)
+    - 1/2 sum_kl w_k w_l A(m_k - m_l, s_k^2 + s_l^2)`` with ``A(m, v) = E|N(m, v)|``.
+
+    Args:
+        mixtures: Leading axes (...).
+        outcomes: Shape (..., D).
+
+    Returns:
+        Shape (..., D).
+    """
+    weights, means, variances = mixtures.weights, mixtures.means, mixtures.sigmas**2
+    away = _mean_size(outcomes[..., None, :] - means, variances)  # [..., K, D]
+    between = _mean_size(
+        means[..., :, None, :] - means[..., None, :, :], variances[..., :, None, :] + variances[..., None, :, :]
+    )  # [..., K, K, D]
+    first = np.einsum("...k,...kd->...d", weights, away)
+    second = np.einsum("...k,...l,...kld->...d", weights, weights, between)
+    score: Floats = first - 0.5 * second
+    return score
+
+
+def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
+    """Negative log density of the whole outcome, all dimensions together, in nats. Outcomes (..., D), result (...)."""
+    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas
+    log_normal = (-0.5 * (scaled**2 + _LOG_2PI) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
+    with np.errstate(divide="ignore"):
+        score: Floats = -special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1)
+    return score
+
+
+def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
+    """Probability that a wrong prediction has a higher score than a right one, ties counting half.
+
+    Area under the receiver operating characteristic (Hanley & McNeil 1982).
+
+    Args:
+        scores: Uncertainties. Shape (N,).
+        wrong: Shape (N,).
+
+    Returns:
+        In [0, 1]; 0.5 is chance. NaN where all predictions are right, or all wrong.
+
+    Raises:
+        InvalidValueError: Shapes differ, or a score is NaN.
+    """
+    if scores.shape != wrong.shape or np.isnan(scores).any():
+        raise InvalidValueError(f"AUROC needs one number a prediction, not {scores.shape} for {wrong.shape}, or NaN.")
+    n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
+    if not n_wrong or not n_right:
+        return math.nan
+    ranks = stats.rankdata(scores)
+    return float((ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))
+
+
+def _mean_size(mean: Floats, variance: Floats) -> Floats:
+    """E|X| of a normal X."""
+    sigma = np.sqrt(variance)
+    ratio = mean / sigma
+    size: Floats = 2.0 * sigma * np.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi) + mean * (
+        2.0 * special.ndtr(ratio) - 1.0
+    )
+    return size

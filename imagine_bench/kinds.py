@@ -1,0 +1,89 @@
+"""The kinds of task, and what each brings to the one machinery: the only place where kinds are told apart.
+
+A *control* task is acted in, by agents that learn from episodes; a *regression* task is learned from data, by
+regressors. Launchers, locks, run folders, progress, store and command line are the same for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """What a kind of task brings along; all but the tables as ``"module:attr"``.
+
+    Attributes:
+        tasks: Its registered tasks.
+        learners: Its registered agents or regressors.
+        protocol: The class of its protocols.
+        plan: Function from task, preset and options to a protocol and an encoder, or None.
+        run: Function that carries out a RunSpec in a folder.
+        load_run: Function that reads a finished run folder.
+        result: Class of a finished bench.
+        write_report: Function that writes a bench's report.
+        summary_table: Function that gives its table as text.
+    """
+
+    tasks: Mapping[str, Any]
+    learners: Mapping[str, Any]
+    protocol: str
+    plan: str
+    run: str
+    load_run: str
+    result: str
+    write_report: str
+    summary_table: str
+
+
+KINDS: dict[str, Kind] = {
+    "control": Kind(
+        tasks=registry.TASKS,
+        learners=registry.AGENTS,
+        protocol="imagine_bench.protocol:Protocol",
+        plan="imagine_bench.bench:plan_control",
+        run="imagine_bench.runner:run",
+        load_run="imagine_bench.run_folder:load_run",
+        result="imagine_bench.results:BenchResult",
+        write_report="imagine_bench.report:write_report",
+        summary_table="imagine_bench.report:summary_table",
+    ),
+    "regression": Kind(
+        tasks=registry.REGRESSIONS,
+        learners=registry.REGRESSORS,
+        protocol="imagine_bench.regression_protocol:RegressionProtocol",
+        plan="imagine_bench.regression_protocol:plan",
+        run="imagine_bench.regression_runner:run",
+        load_run="imagine_bench.regression_results:load_run",
+        result="imagine_bench.regression_results:RegressionResult",
+        write_report="imagine_bench.report.regression:write_report",
+        summary_table="imagine_bench.report.regression:summary_table",
+    ),
+}
+
+
+def kind_of(task: str) -> Kind:
+    """The kind of a registered task.
+
+    Raises:
+        UnknownNameError: No such task; the message lists those of every kind.
+    """
+    for kind in KINDS.values():
+        if task in kind.tasks:
+            return kind
+    raise UnknownNameError("task", task, [name for kind in KINDS.values() for name in kind.tasks])
+
+
+def require_options(task: str, options: Mapping[str, Any]) -> None:
+    """Raise InvalidValueError for an option that protocols of this task's kind do not have."""
+    fields = [field.name for field in dataclasses.fields(registry.load(kind_of(task).protocol))]
+    for name in options:
+        if name not in fields:
+            allowed = ", ".join(field for field in fields if field not in ("task", "preset"))
+            raise InvalidValueError(f"{task} takes no {name.replace('_', '-')}; a bench of it is made of: {allowed}.")

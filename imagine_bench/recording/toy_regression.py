@@ -1,0 +1,88 @@
+"""The toy functions and what a network says about them, along x: timeline ``x``, entities ``/<variant>/...``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from imagine_bench.recording.episodes import recording_file
+from imagine_bench.regression import RegressionSpec
+
+_KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
+_PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (170, 170, 170), (60, 60, 66)
+_TICKS = 100
+"""Steps of the timeline per unit of x, which is a sequence."""
+
+
+def record(
+    evaluations: Mapping[str, Mapping[str, NDArray[Any]]], *, task: RegressionSpec, name: str, path: Path
+) -> Path:
+    """Record the first network of every variant: data, predictions, each uncertainty beside its true value.
+
+    Args:
+        evaluations: What was measured, by variant.
+        task: The task.
+        name: The regressor.
+        path: The file to write, ending in ``.rrd``.
+
+    Returns:
+        ``path``.
+    """
+    with recording_file(path, task.id, _layout(list(evaluations), name)) as recording:
+        for variant, data in evaluations.items():
+            x = data["x"]
+            order = data["training_x"].argsort()
+            _points(
+                recording, f"/{variant}/y/training", data["training_x"][order], data["training_y"][order], _TRAINING
+            )
+            _points(recording, f"/{variant}/y/prediction", x, data["prediction"][0], _PREDICTION)
+            for kind, color in _KINDS.items():
+                known = data[f"true_{kind}"]
+                truth = known if known.ndim == 1 else known[0]
+                _line(recording, f"/{variant}/{kind}/estimated", x, np.sqrt(data[kind][0]), color)
+                _line(recording, f"/{variant}/{kind}/true", x, np.sqrt(truth), _TRUE)
+    return path
+
+
+def _layout(variants: list[str], name: str) -> rrb.Blueprint:
+    columns = [
+        rrb.Vertical(
+            rrb.TimeSeriesView(origin=f"/{variant}/y", name=f"{variant}: data and predictions ({name})"),
+            *(rrb.TimeSeriesView(origin=f"/{variant}/{kind}", name=f"{variant}: {kind} (std of y)") for kind in _KINDS),
+        )
+        for variant in variants
+    ]
+    panels = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+    return rrb.Blueprint(rrb.Horizontal(*columns), *panels, rrb.TimePanel(state="collapsed", timeline="x"))
+
+
+def _times(x: NDArray[np.float64]) -> list[rr.TimeColumn]:
+    return [rr.TimeColumn("x", sequence=np.round(x * _TICKS).astype(np.int64))]
+
+
+def _points(
+    recording: rr.RecordingStream,
+    path: str,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    color: tuple[int, int, int],
+) -> None:
+    recording.log(path, rr.SeriesPoints(colors=color, marker_sizes=1.5), static=True, strict=True)
+    recording.send_columns(path, indexes=_times(x), columns=rr.Scalars.columns(scalars=y), strict=True)
+
+
+def _line(
+    recording: rr.RecordingStream,
+    path: str,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    color: tuple[int, int, int],
+) -> None:
+    recording.log(path, rr.SeriesLines(colors=color), static=True, strict=True)
+    recording.send_columns(path, indexes=_times(x), columns=rr.Scalars.columns(scalars=y), strict=True)

@@ -1,0 +1,83 @@
+"""Calibration of a regressor's networks on unseen points: is it as sure as it may be, and unsure where it is wrong?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imagine_bench.calibration import (
+    LEVELS,
+    auroc,
+    coverage,
+    crps,
+    log_score,
+    probability_transform,
+    transform_distance,
+)
+from imagine_bench.regression import SCORES, Floats, Mixtures, RegressionSpec, Regressor
+from imagine_bench.regression_results import Arrays, Row
+from imagine_bench.seeding import SeedTree
+
+POOLED_CRPS_POINTS = 50
+"""Points of each network at which the score of all weight samples together is computed: it costs (T K)^2 a point."""
+_CHUNK = 100
+
+
+def calibrate(
+    task: RegressionSpec,
+    regressor: Regressor,
+    variant: str,
+    networks: tuple[SeedTree, ...],
+    *,
+    points: int,
+    rng: np.random.Generator,
+) -> tuple[list[Row], Arrays]:
+    """Measure every network on points of its own.
+
+    Two predictive distributions are judged: ``predictive``, from which the regressor draws its predictions (for dropout
+    the thesis' averaged parameters), and ``pooled``, all weight samples' mixtures side by side.
+
+    Args:
+        task: Gives the points and says how wrong a prediction is.
+        regressor: E trained networks.
+        variant: What they were trained on.
+        networks: One node of the seed tree each.
+        points: Unseen points a network, N.
+        rng: Draws the predictions.
+
+    Returns:
+        One row a network, and arrays: ``transform`` and ``pooled_transform`` (E, N, D), ``error`` (E, N), and one a
+        score (E, N).
+    """
+    tests = [task.testing(variant, node.child("test", variant).generator(), points) for node in networks]
+    inputs, targets = np.stack([t.inputs for t in tests]), np.stack([t.targets for t in tests])
+    said = regressor.assess(inputs, rng)
+    error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, said.prediction, strict=True)])
+    scores = {name: score(said) for name, score in SCORES.items()}
+    transform = probability_transform(said.predictive, targets)
+    pooled_transform, pooled_crps = _pooled(regressor, inputs, targets)
+    rows: list[Row] = []
+    for e in range(len(networks)):
+        own = Mixtures(**{n: getattr(said.predictive, n)[e] for n in ("weights", "means", "sigmas")})
+        wrong = error[e] > task.wrong_above
+        row: Row = {"error_mean": error[e].mean(), "error_median": np.median(error[e]), "wrong": wrong.mean()}
+        row |= {"log_score": log_score(own, targets[e]).mean(), "crps": crps(own, targets[e]).mean()}
+        row |= {f"coverage_{level:g}": coverage(transform[e], level) for level in LEVELS}
+        row |= {"transform_distance": transform_distance(transform[e]), "pooled_crps": pooled_crps[e].mean()}
+        row |= {f"pooled_coverage_{level:g}": coverage(pooled_transform[e], level) for level in LEVELS}
+        row |= {"pooled_transform_distance": transform_distance(pooled_transform[e])}
+        row |= {f"auroc_{name}": auroc(values[e], wrong) for name, values in scores.items()}
+        rows.append({name: float(value) for name, value in row.items()})
+    return rows, {"transform": transform, "pooled_transform": pooled_transform, "error": error, **scores}
+
+
+def _pooled(regressor: Regressor, inputs: Floats, targets: Floats) -> tuple[Floats, Floats]:
+    """Transforms (E, N, D), and scores at the first points (E, POOLED_CRPS_POINTS, D), of all weight samples pooled."""
+    transforms, scores = [], []
+    for start in range(0, inputs.shape[1], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        mixtures = regressor.pooled(inputs[:, part])
+        transforms.append(probability_transform(mixtures, targets[:, part]))
+        for point in range(start, min(start + _CHUNK, POOLED_CRPS_POINTS, inputs.shape[1])):
+            one = Mixtures(**{n: getattr(mixtures, n)[:, point - start] for n in ("weights", "means", "sigmas")})
+            scores.append(crps(one, targets[:, point]))  # [E, D]; a point at a time: (T K)^2 numbers each
+    return np.concatenate(transforms, axis=1), np.stack(scores, axis=1)

@@ -1,0 +1,102 @@
+"""The protocol of a regression bench: which regressors learn which variants, how many networks, from which seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import DEVICES
+from imagine_bench.protocol import ProtocolData, require_ascending, require_unmixed
+
+_CHECK_OVERRIDES = "imagine_bench.agents.regressor_settings:check"
+_CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionProtocol(ProtocolData):
+    """One comparison of regressors, completely specified.
+
+    A run is one regressor and one seed: it trains ``networks`` networks on every variant, each on data of its own, as
+    one batched computation, and that is why they share a run.
+
+    Attributes:
+        task: Registered regression task.
+        preset: Name of this protocol and of the regressors' settings preset.
+        variants: Variants of the task, in the order of the report; the task's own where none are given.
+        agents: Registered regressors, in the order of the report.
+        seeds: One run a seed and regressor; each in [0, 2**24).
+        networks: Networks a run and variant, each on data drawn for it.
+        test_points: Unseen points of each network, for errors and calibration.
+        recorded: Whether runs leave a recording.
+        overrides: Settings that replace the preset's, as sorted (name, value) pairs.
+        device: ``"cpu"`` or ``"cuda"``.
+    """
+
+    task: str
+    preset: str
+    variants: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ("mc_dropout", "ensemble")
+    seeds: tuple[int, ...] = (0,)
+    networks: int = 3
+    test_points: int = 500
+    recorded: bool = True
+    overrides: tuple[tuple[str, Any], ...] = ()
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        spec = registry.regression(self.task)
+        if not self.variants:
+            object.__setattr__(self, "variants", spec.variants)
+        for variant in self.variants:
+            spec.require_variant(variant)
+        for agent in self.agents:
+            registry.regressor_entry(agent)
+        for name, values in (("agents", self.agents), ("variants", self.variants)):
+            if not values or len(set(values)) != len(values):
+                raise InvalidValueError(f"{name} {values} must be at least one name, none of them twice.")
+        require_known("device", self.device, DEVICES)
+        require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
+        require_unmixed(self.seeds)
+        for name, value, low, high in (
+            ("networks", self.networks, 1, 1000),
+            ("test_points", self.test_points, 2, 10**5),
+        ):
+            if not low <= value <= high:
+                raise InvalidValueError(f"{name} is {value}; it must lie in [{low}, {high}].")
+
+    def work(self, agent: str) -> int:
+        """Parts of a run's work: a hundred a variant for training, ten for measuring."""
+        return 110 * len(self.variants)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {"networks": 2, "test_points": 50},
+    "quick": {},
+    "thesis": {"networks": 10, "test_points": 500},
+    "full": {"networks": 20, "test_points": 1000},
+}
+"""What each preset changes: ``thesis`` is chapter 4 as printed, ten networks on ten datasets."""
+
+
+def plan(
+    task: str, preset: str, *, encoder: str | None = None, **changes: Any
+) -> tuple[RegressionProtocol, Path | None]:
+    """The protocol of a bench, with everything checked that can be before anything is run; it has no encoder.
+
+    Raises:
+        UnknownNameError: Any name that does not exist; the message lists those that do.
+        InvalidValueError: A value out of its range.
+        SetupError: The device does not exist here.
+    """
+    if encoder is not None:
+        raise InvalidValueError(f"{task} has no pictures to encode; leave --encoder out.")
+    require_known("preset", preset, PRESETS)
+    values = {**PRESETS[preset], **registry.regression(task).presets.get(preset, {}), **changes}
+    wanted = RegressionProtocol(task=task, preset=preset, **values)
+    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides))
+    if wanted.device != "cpu":
+        registry.load(_CHECK_DEVICE)(wanted.device)
+    return wanted, None

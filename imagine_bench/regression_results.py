@@ -1,0 +1,141 @@
+"""What a regression bench measured: written by its runner, read by its report and recordings."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import run_folder
+from imagine_bench.errors import ArtefactError
+from imagine_bench.files import write_bytes
+from imagine_bench.regression_protocol import RegressionProtocol
+
+METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
+
+Row = dict[str, float | str]
+"""One network of one variant: ``variant``, ``network``, and every measure by name."""
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionRun:
+    """One finished run.
+
+    Attributes:
+        agent: Registered regressor.
+        seed: The run's seed.
+        settings: The regressor's settings as run.
+        rows: One a variant and network.
+        evaluations: The task's own measurements by variant, and under ``calibration/`` those of calibration.
+        folder: Where the run's files lie.
+        recording: Its Rerun recording, or None.
+    """
+
+    agent: str
+    seed: int
+    settings: Mapping[str, Any]
+    rows: tuple[Row, ...]
+    evaluations: Mapping[str, Arrays]
+    folder: Path
+    recording: Path | None
+
+    def values(self, variant: str, name: str) -> NDArray[np.float64]:
+        """One measure of every network of a variant. Shape (E,)."""
+        return np.array([float(row[name]) for row in self.rows if row["variant"] == variant])
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionResult:
+    """All runs of a protocol. Every regressor and seed is there, or this cannot be built.
+
+    Attributes:
+        protocol: What was compared.
+        runs: One a regressor and seed.
+        environment: Command, commit, versions, machine; JSON-like.
+        folder: Where the bench's files lie.
+        wall_s: Wall seconds of the bench, over all its sittings.
+
+    Raises:
+        ArtefactError: A run is missing or doubled.
+    """
+
+    protocol: RegressionProtocol
+    runs: tuple[RegressionRun, ...]
+    environment: Mapping[str, Any]
+    folder: Path
+    wall_s: float
+
+    def __post_init__(self) -> None:
+        wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
+        found = [(run.agent, run.seed) for run in self.runs]
+        if set(found) != wanted or len(found) != len(wanted):
+            raise ArtefactError(
+                f"{self.folder} should hold one run for each of {len(wanted)} regressors and seeds and holds "
+                f"{len(found)}; missing: {sorted(wanted - set(found)) or 'none'}. Run the same bench command again."
+            )
+
+    def of(self, agent: str) -> tuple[RegressionRun, ...]:
+        """The runs of one regressor, in the order of the protocol's seeds."""
+        by_seed = {run.seed: run for run in self.runs if run.agent == agent}
+        return tuple(by_seed[seed] for seed in self.protocol.seeds)
+
+    def values(self, agent: str, variant: str, name: str) -> NDArray[np.float64]:
+        """One measure of every network of all seeds. Shape (seeds E,)."""
+        return np.concatenate([run.values(variant, name) for run in self.of(agent)])
+
+    def arrays(self, agent: str, variant: str, name: str) -> NDArray[Any]:
+        """An array of the task's measurements, whose first axis is the network, of all seeds. Shape (seeds E, ...)."""
+        return np.concatenate([run.evaluations[variant][name] for run in self.of(agent)])
+
+    def first(self, agent: str, variant: str) -> Arrays:
+        """Everything measured in the run of the first seed."""
+        return self.of(agent)[0].evaluations[variant]
+
+
+def write_rows(folder: Path, rows: Sequence[Row]) -> None:
+    """Write one row a variant and network, atomically."""
+    write_bytes(folder / METRICS, rows_csv(rows).encode())
+
+
+def rows_csv(rows: Sequence[Row]) -> str:
+    """Rows as CSV."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return text.getvalue()
+
+
+def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
+    """Write the results of a run and mark it as done."""
+    write_rows(folder, rows)
+    flat = {f"{variant}/{name}": array for variant, arrays in evaluations.items() for name, array in arrays.items()}
+    run_folder.write_arrays(folder / EVALUATION, flat)
+    run_folder.mark_done(folder, ["config.json", METRICS, EVALUATION])
+
+
+def load_run(folder: Path) -> RegressionRun:
+    """Read a finished run.
+
+    Raises:
+        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
+    """
+    config = run_folder.require_done(folder)
+    recording = run_folder.recording_path(folder)
+    rows = csv.DictReader(io.StringIO((folder / METRICS).read_text()))
+    return RegressionRun(
+        agent=config["agent"],
+        seed=config["seed"],
+        settings=config["settings"],
+        rows=tuple({name: value if name == "variant" else float(value) for name, value in row.items()} for row in rows),
+        evaluations=run_folder.grouped(run_folder.read_arrays(folder / EVALUATION)),
+        folder=folder,
+        recording=recording if recording.is_file() else None,
+    )

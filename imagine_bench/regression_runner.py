@@ -1,0 +1,168 @@
+"""One run of a regression bench: one regressor, one seed, its networks on every variant, measured.
+
+Whatever is needed to go on is in the newest checkpoint, so a run that was killed and started again ends in the same
+bits as one that was not; only CPU times differ.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import registry, run_folder
+from imagine_bench.checkpointing import Snapshot, load_newest, save_snapshot
+from imagine_bench.errors import DivergedError
+from imagine_bench.files import lock, make_folder
+from imagine_bench.regression import Assessment, Dataset, Floats, Regressor, RegressorContext
+from imagine_bench.regression_calibration import calibrate
+from imagine_bench.regression_results import Arrays, RegressionRun, Row, finish, load_run, write_rows
+from imagine_bench.runs import Observer, Phase, Progress, RunSpec
+from imagine_bench.seeding import SeedTree
+
+_SLICES = 100
+"""Parts that a variant's training is told in."""
+_MEASURING = 10
+"""What measuring counts beside them."""
+
+
+def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RegressionRun:
+    """Do a run, or what is left of it, and read its result; a finished run is only read.
+
+    Args:
+        spec: What to run, with a regression protocol.
+        folder: The run's own folder.
+        on_progress: Told now and then how far it is.
+
+    Raises:
+        BusyError: Another process is at this run.
+        ArtefactError: The folder holds something damaged, foreign or begun with other settings.
+        DivergedError: A likelihood is no longer finite; the message says where the state lies.
+        SetupError: The folder cannot be written.
+    """
+    make_folder(folder)
+    with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):
+        if not run_folder.is_done(folder):
+            _Run(spec, folder, on_progress).to_the_end()
+    return load_run(folder)
+
+
+class _Run:
+    def __init__(self, spec: RunSpec, folder: Path, on_progress: Observer) -> None:
+        self.spec, self.folder, self.on_progress = spec, folder, on_progress
+        self.protocol, self.task = spec.protocol, registry.regression(spec.protocol.task)
+        self.seeds = SeedTree(spec.seed)
+        self.networks = tuple(self.seeds.child("network", index) for index in range(self.protocol.networks))
+        self.rows: list[Row] = []
+        self.evaluations: dict[str, Arrays] = {}
+        self.train_cpu_s = 0.0
+        self.snapshot = load_newest(folder / "checkpoints")
+        if self.snapshot is not None:
+            self.rows = list(self.snapshot.values["rows"])
+            self.evaluations = run_folder.grouped(self.snapshot.arrays)
+        self.saved_s = time.monotonic()
+
+    def to_the_end(self) -> None:
+        """Train and measure every variant, record, and mark the run as done."""
+        for variant in self.protocol.variants[len(self.evaluations) :]:
+            regressor = self._regressor(variant)
+            self._train(regressor, variant)
+            self._measure(regressor, variant)
+        self._record()
+        finish(self.folder, self.rows, self.evaluations)
+        self._tell("done", "done", 0)
+
+    def _regressor(self, variant: str) -> Regressor:
+        """A new regressor, or the one of the newest checkpoint where that was made in the middle of this variant."""
+        # the task's own measurements draw the same data again, from the same node
+        datasets = tuple(self.task.training(variant, node.child("data").generator()) for node in self.networks)
+        regressor = registry.make_regressor(self.spec.agent, self._context(datasets, variant))
+        self._check_config(regressor)
+        snapshot, self.snapshot, self.train_cpu_s = self.snapshot, None, 0.0
+        if snapshot is not None and snapshot.values["variant"] == variant:
+            regressor.restore(snapshot.agent)
+            self.train_cpu_s = snapshot.values["train_cpu_s"]
+        return regressor
+
+    def _context(self, datasets: tuple[Dataset, ...], variant: str) -> RegressorContext:
+        return RegressorContext(
+            datasets=datasets,
+            seeds=tuple(node.child("regressor", variant) for node in self.networks),
+            preset=self.protocol.preset,
+            overrides=dict(self.protocol.overrides),
+            device=self.protocol.device,
+        )
+
+    def _check_config(self, regressor: Regressor) -> None:
+        settings: Any = getattr(regressor, "settings", None)
+        run_folder.check_config(self.folder, {
+            "protocol": self.protocol.as_dict(),
+            "protocol_hash": self.protocol.hash,
+            "agent": self.spec.agent,
+            "seed": self.spec.seed,
+            "settings": {} if settings is None else dataclasses.asdict(settings),
+        })  # fmt: skip
+
+    def _train(self, regressor: Regressor, variant: str) -> None:
+        step = max(1, regressor.epochs // _SLICES)
+        try:
+            while regressor.epoch < regressor.epochs:
+                start_s = time.process_time()
+                regressor.train(min(step, regressor.epochs - regressor.epoch))
+                self.train_cpu_s += time.process_time() - start_s
+                done = _SLICES * regressor.epoch // regressor.epochs
+                self._tell("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
+                if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
+                    self._save(regressor, variant)
+        except DivergedError as error:
+            where = save_snapshot(self.folder / "diverged", self._snapshot(regressor, variant))
+            raise DivergedError(f"{error} The state lies in {where}.") from error
+        self._save(regressor, variant)
+
+    def _measure(self, regressor: Regressor, variant: str) -> None:
+        self._tell("testing", f"{variant}, measuring", _SLICES)
+        start_s = time.process_time()
+        rows, arrays = calibrate(
+            self.task, regressor, variant, self.networks, points=self.protocol.test_points,
+            rng=self.seeds.child("calibration", variant).generator(),
+        )  # fmt: skip
+
+        def assess(inputs: Floats, name: str) -> Assessment:
+            return regressor.assess(inputs, self.seeds.child("assess", variant, name).generator())
+
+        evaluation = self.task.evaluate(variant, assess, self.networks)
+        measure_cpu_s = time.process_time() - start_s
+        shared: Row = {**regressor.diagnostics()}  # of all networks together; the CPU seconds are a network's share
+        shared["train_cpu_s"] = self.train_cpu_s / self.protocol.networks
+        shared["measure_cpu_s"] = measure_cpu_s / self.protocol.networks
+        self.rows += [{"variant": variant, "network": index, **row, **shared} for index, row in enumerate(rows)]
+        self.evaluations[variant] = {**evaluation, **{f"calibration/{name}": a for name, a in arrays.items()}}
+        write_rows(self.folder, self.rows)
+        self._save(regressor, "")
+
+    def _record(self) -> None:
+        """Record beside the results; the file appears whole or not at all."""
+        if self.task.recorder is None or not self.protocol.recorded:
+            return
+        self._tell("recording", "recording", 0)
+        registry.load(self.task.recorder)(
+            self.evaluations, task=self.task, name=self.spec.agent, path=run_folder.recording_path(self.folder)
+        )
+
+    def _snapshot(self, regressor: Regressor, variant: str) -> Snapshot:
+        arrays = {f"{v}/{name}": array for v, found in self.evaluations.items() for name, array in found.items()}
+        values = {"variant": variant, "rows": self.rows, "train_cpu_s": self.train_cpu_s}
+        return Snapshot(episode=regressor.epoch, agent=regressor.state(), arrays=arrays, values=values)
+
+    def _save(self, regressor: Regressor, variant: str) -> None:
+        save_snapshot(self.folder / "checkpoints", self._snapshot(regressor, variant))
+        self.saved_s = time.monotonic()
+
+    def _tell(self, phase: Phase, detail: str, done: int) -> None:
+        before = (_SLICES + _MEASURING) * len(self.evaluations)
+        progress = Progress(
+            agent=self.spec.agent, seed=self.spec.seed, phase=phase, done=min(before + done, self.spec.work),
+            work=self.spec.work, detail=detail,
+        )  # fmt: skip
+        self.on_progress(progress)
