@@ -131,8 +131,8 @@ def _say(
     scores = data["decision/epistemic"][0, choice]
     words = [
         f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint angles "
-        "lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it reaches for the one "
-        f"in the ring.\n\nIts uncertainty there is {scores[chosen]:.3g} rad², the largest of the 20 is "
+        "lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it reaches for "
+        f"the one in the ring.\n\nIts uncertainty there is {scores[chosen]:.3g} rad², the largest of the 20 is "
         f"{scores.max():.3g} rad². The grey place lies outside of what the arm can reach and is never asked for."
     ]
     if arrived:

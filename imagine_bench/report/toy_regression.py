@@ -32,7 +32,8 @@ def sections(result: RegressionResult) -> list[Section]:
             title="The thesis' claims, in numbers",
             words=(
                 "Mean over the region [−10, 10] of the uncertainty of networks trained with little data (or much "
-                "noise) there, divided by that of the base networks. Truth: the noise is 9 times as large in the noisy region. "
+                "noise) there, divided by that of the base networks. Truth: the noise is 9 times as large in the noisy "
+                "region. "
                 "Rank correlation: of epistemic uncertainty with the distance from the data, for x from 30 to 40. "
                 "Values are the median over networks, in brackets the smallest and the largest.",
             ),
@@ -124,8 +125,8 @@ def _answers(result: RegressionResult, agent: str) -> list[str]:
     if {"base", "high_noise"} <= variants:
         noisy = [float(np.median(ratio(result, agent, kind, "high_noise"))) for kind in ("aleatoric", "epistemic")]
         sentences.append(
-            f"{title}: where noise is high, aleatoric uncertainty is {number(noisy[0])} times that of the base networks "
-            f"(truth 9) and epistemic {number(noisy[1])} times."
+            f"{title}: where noise is high, aleatoric uncertainty is {number(noisy[0])} times that of the base "
+            f"networks (truth 9) and epistemic {number(noisy[1])} times."
         )
     return sentences
 
