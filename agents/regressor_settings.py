@@ -40,10 +40,13 @@ class RegressorSettings(MDNSettings):
 PRESETS: dict[str, dict[str, Deviation]] = {
     "smoke": {
         "epochs": Deviation(20, "shows that every part works, within a minute"),
+        "learning_rate": Deviation(3e-3, "a tenth of the epochs want larger steps"),
         "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
     },
     "quick": {
         "epochs": Deviation(600, "CPU time"),
+        "learning_rate": Deviation(3e-3, "a fifth of the epochs want larger steps"),
+        "final_rate": Deviation(0.01, "with falling steps 600 epochs fit as well as 1500 without"),
         "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
     },
     "thesis": {"precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes")},

@@ -26,7 +26,7 @@ from .perception import prepare_torch
 from .regressor_settings import RegressorSettings, resolve
 from .snapshot import generator_array, jsonable, load_generator, require_fit
 from .stationarity import jensen_shannon
-from .uncertainty import decompose
+from .uncertainty import decompose, drawn_variance, surprise
 
 _ROWS = 256
 """Rows assessed at a time: T mixtures of each are in memory."""
@@ -170,8 +170,12 @@ class MixtureRegressor:
         samples = self._weight_samples(network, x)
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
+        prediction = mdn.sample(predictive, 1.0, generator)
+        drawn = drawn_variance(samples, predictive, prediction, self.settings.members)
         return Assessment(
-            prediction=mdn.sample(predictive, 1.0, generator).double().cpu().numpy(),
+            prediction=prediction.double().cpu().numpy(),
+            drawn=drawn.double().cpu().numpy(),
+            surprise=surprise(samples, prediction).double().cpu().numpy(),
             mean=mdn.mean(samples).mean(dim=0).double().cpu().numpy(),
             epistemic=parts.epistemic.double().cpu().numpy(),
             aleatoric=parts.aleatoric.double().cpu().numpy(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -42,6 +43,50 @@ def decompose(samples: Mixture) -> Uncertainty:
     modal = (weights * (samples.means - means.unsqueeze(-2)).square()).sum(dim=-2)  # [T, ..., Z]
     aleatoric = (weights * torch.exp(2.0 * samples.log_sigmas)).sum(dim=-2)  # [T, ..., Z]
     return Uncertainty(means.var(dim=0, correction=0), aleatoric.mean(dim=0), modal.mean(dim=0))
+
+
+def component_variance(samples: Mixture, members: int = 1) -> Tensor:
+    """How uncertain each component of the averaged mixture is by itself: its noise, and what weights do to its mean.
+
+    The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
+    :func:`decompose` it does not count that there are other components, which says nothing about a value that was
+    drawn from this one.
+
+    Args:
+        samples: Mixtures whose first axis is the weight sample, member by member, (E T, ..., K, Z).
+        members: E, as in :func:`~.mixture.average`, whose order of components this follows.
+
+    Returns:
+        Shape (..., E K, Z).
+    """
+    means = samples.means.unflatten(0, (members, -1))
+    noise = torch.exp(2.0 * samples.log_sigmas).unflatten(0, (members, -1)).mean(dim=1)
+    return torch.cat((noise + means.var(dim=1, correction=0)).unbind(0), dim=-2)
+
+
+def drawn_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
+    """:func:`component_variance` of the components that drawn values came from, summed over dimensions.
+
+    Each component counts by its posterior probability of having been the one.
+
+    Args:
+        samples: As in :func:`component_variance`.
+        predictive: Their average, which the values were drawn from.
+        values: Shape (..., Z).
+
+    Returns:
+        Shape (...).
+    """
+    scaled = (values.unsqueeze(-2) - predictive.means) * torch.exp(-predictive.log_sigmas)  # [..., K, Z]
+    log_joint = predictive.log_weights - (0.5 * scaled.square() + predictive.log_sigmas).sum(dim=-1)
+    own = component_variance(samples, members).sum(dim=-1)  # [..., K]
+    return (log_joint.softmax(dim=-1) * own).sum(dim=-1)
+
+
+def surprise(samples: Mixture, values: Tensor) -> Tensor:
+    """Negative log density of drawn values under all weight samples together, in nats: (..., Z) to (...)."""
+    log_p = mdn.log_likelihood(samples, values.unsqueeze(0))  # [T, ...]
+    return math.log(len(log_p)) - torch.logsumexp(log_p, dim=0)
 
 
 REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {

@@ -60,6 +60,9 @@ class Assessment:
         aleatoric: Mean variance of the components (equation 4.26). Shape (E, N, D).
         modal: Mean spread of the components (equation 4.27). Shape (E, N, D).
         stationarity: Jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
+        drawn: Variance of the component that the prediction was drawn from, noise and weights together, summed over
+            the outputs. Shape (E, N).
+        surprise: Negative log density of the prediction under all weight samples together, in nats. Shape (E, N).
         predictive: The mixture that predictions are drawn from. Leading axes (E, N).
     """
 
@@ -69,6 +72,8 @@ class Assessment:
     aleatoric: Floats
     modal: Floats
     stationarity: Floats
+    drawn: Floats
+    surprise: Floats
     predictive: Mixtures
 
 
@@ -79,6 +84,8 @@ SCORES: dict[str, Callable[[Assessment], Floats]] = {
     "epistemic_plus_aleatoric": lambda a: (a.epistemic + a.aleatoric).sum(axis=-1),
     "total": lambda a: (a.epistemic + a.aleatoric + a.modal).sum(axis=-1),
     "stationarity": lambda a: a.stationarity,
+    "drawn_component": lambda a: a.drawn,
+    "surprise": lambda a: a.surprise,
 }
 """One number a row from an assessment, (E, N): variances summed over the outputs. The higher, the less sure."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from imagine_bench import reference, registry, statistics
 from imagine_bench.regression import SCORES
 from imagine_bench.regression_results import RegressionResult
-from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
+from imagine_bench.report.sections import Picture, Section, Table, mean_std, picture
 from imagine_bench.seeding import SeedTree
 
 Values = NDArray[np.float64]
@@ -70,9 +70,9 @@ def _decisions(result: RegressionResult) -> Section:
             best[variant] = min((estimate.value, name) for name, estimate in against.items())
             answers.append(
                 f"{title}, {variant} samples: choosing the least epistemic uncertainty leaves "
-                f"{number(against['epistemic'].value, 2)} of the error of a random choice"
+                f"{against['epistemic'].value:.2f} of the error of a random choice"
                 f"{_printed_ratio(printed, variant)}; best is {best[variant][1].replace('_', ' ')} with "
-                f"{number(best[variant][0], 2)}."
+                f"{best[variant][0]:.2f}."
             )
     for variant in protocol.variants:
         if variant in printed["random"]:
