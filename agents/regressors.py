@@ -58,7 +58,8 @@ class MixtureRegressor:
         self._order = [self._generator(node.child("batches").integer()) for node in nodes]
         self._samples = [seeds.child("weight_samples") for seeds in context.seeds]
         self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._weights_and_masks)
-        self._epoch, self._losses = 0, [0.0]
+        self._epoch = 0
+        self._losses: list[float] = []
         self._trained: TrainedMDN | None = None
 
     @property
@@ -119,12 +120,11 @@ class MixtureRegressor:
         """Weights, moments, running statistics, generators, epochs."""
         arrays = {f"optimiser/{name}": array for name, array in self._model.optimiser.arrays().items()}
         arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
-        arrays["losses"] = np.array(self._losses)
         for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
             arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
         values = {
             "settings": dataclasses.asdict(self.settings), "epoch": self._epoch,
-            "batches": self._model.network.batches, "filtered": False,
+            "batches": self._model.network.batches, "filtered": False, "losses": self._losses,
         }  # fmt: skip
         return AgentState(arrays=arrays, values=jsonable(values))
 
@@ -143,7 +143,7 @@ class MixtureRegressor:
             for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
                 load_generator(generator, array)
         self._epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
-        self._losses, self._trained = arrays["losses"].tolist(), None
+        self._losses, self._trained = list(state.values["losses"]), None
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device)

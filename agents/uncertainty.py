@@ -73,6 +73,7 @@ def drawn_variance(samples: Mixture, predictive: Mixture, values: Tensor, member
         samples: As in :func:`component_variance`.
         predictive: Their average, which the values were drawn from.
         values: Shape (..., Z).
+        members: As in :func:`component_variance`.
 
     Returns:
         Shape (...).

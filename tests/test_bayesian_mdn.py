@@ -15,8 +15,9 @@ from imagine_bench.agents.normed_layers import NormedMLP
 from imagine_bench.agents.stationarity import jensen_shannon
 from imagine_bench.agents.uncertainty import decompose
 from imagine_bench.agents.weight_samples import sample_outputs
-from imagine_bench.errors import DivergedError
 from scipy import integrate, stats
+
+from imagine_bench.errors import DivergedError
 
 _SMALL = MDNSettings(hidden=(16, 16), components=3)
 

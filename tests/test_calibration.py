@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import integrate, stats
+
 from imagine_bench.calibration import auroc, coverage, crps, log_score, probability_transform, transform_distance
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.regression import Mixtures
-from scipy import integrate, stats
 
 
 def mixture(seed: int = 0, rows: int = 4, components: int = 3, size: int = 2) -> Mixtures:

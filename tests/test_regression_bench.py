@@ -1,0 +1,214 @@
+"""A regression bench through the same machinery as every other: run, resume, read, report, recording, wrong words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.bench import plan
+from imagine_bench.calibration import log_score
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.kinds import KINDS
+from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext
+from imagine_bench.regression_results import RegressionRun
+from imagine_bench.regression_runner import run
+from imagine_bench.report import regression as page
+from imagine_bench.report import robot_ik, toy_regression
+from imagine_bench.runs import Progress, RunSpec
+from imagine_bench.seeding import SeedTree
+
+_TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
+
+
+def tiny(task: str, agent: str = "mc_dropout", **changes: Any) -> RunSpec:
+    values = {"networks": 2, "test_points": 30, "overrides": _overrides(agent), "agents": (agent,), **changes}
+    protocol, encoder = plan(task, "smoke", **values)
+    assert encoder is None
+    return RunSpec(protocol=protocol, agent=agent, seed=0, checkpoint_every_s=0.0)
+
+
+def _overrides(agent: str) -> tuple[tuple[str, Any], ...]:
+    return tuple(pair for pair in _TINY if agent == "ensemble" or pair[0] != "members")
+
+
+def silent(_: Progress) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
+    return run(tiny("toy_regression"), tmp_path_factory.mktemp("toy"), silent)
+
+
+def test_every_kind_has_learners_and_all_names_load() -> None:
+    names = [name for kind in KINDS.values() for name in kind.tasks]
+    assert len(names) == len(set(names))
+    for kind in KINDS.values():
+        assert kind.tasks and kind.learners
+        for target in (kind.protocol, kind.plan, kind.run, kind.load_run, kind.result, kind.write_report):
+            assert callable(registry.load(target))
+    for name in registry.REGRESSIONS:
+        spec = registry.regression(name)
+        assert (
+            spec.id == name and callable(registry.load(spec.sections)) and callable(registry.load(str(spec.recorder)))
+        )
+
+
+def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> None:
+    assert [(row["variant"], row["network"]) for row in toy.rows] == [
+        (variant, index) for variant in ("base", "low_data", "high_noise") for index in (0, 1)
+    ]
+    for row in toy.rows:
+        assert all(np.isfinite(float(v)) for k, v in row.items() if k != "variant" and not k.startswith("auroc"))
+        assert 0 <= float(row["coverage_0.8"]) <= 1 and float(row["crps"]) > 0
+    for variant in ("base", "low_data", "high_noise"):
+        found = toy.evaluations[variant]
+        assert found["epistemic"].shape == (2, 1000) and (found["epistemic"] > 0).all()
+        total = found["epistemic"] + found["aleatoric"] + found["modal"]
+        np.testing.assert_allclose(total, found["total"], rtol=1e-6)
+        assert (found["stationarity"] <= np.log(5) + 1e-9).all() and (found["stationarity"] >= 0).all()
+    assert toy.recording is not None and toy.recording.stat().st_size > 10_000
+
+
+class _Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) -> None:
+    spec = tiny("toy_regression", agent, variants=("base", "low_data"), recorded=False)
+    whole = run(spec, tmp_path / "whole", silent)
+    for after in (2, 3, 2):
+        told = iter(range(after))
+
+        def observe(_: Progress, told: Any = told) -> None:
+            if next(told, None) is None:
+                raise _Killed
+
+        with pytest.raises(_Killed):
+            run(spec, tmp_path / "parts", observe)
+    parts = run(spec, tmp_path / "parts", silent)
+    for mine, theirs in zip(whole.rows, parts.rows, strict=True):
+        for name in set(mine) - {"train_cpu_s", "measure_cpu_s"}:
+            assert mine[name] == theirs[name] or (np.isnan(mine[name]) and np.isnan(theirs[name])), name
+    for variant, arrays in whole.evaluations.items():
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(array, parts.evaluations[variant][name], err_msg=name)
+
+
+def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "make_regressor", lambda *_: pytest.fail("a finished run was run again"))
+    again = run(tiny("toy_regression"), toy.folder, silent)
+    assert again.rows == toy.rows
+
+
+def test_a_damaged_result_is_named(toy: RegressionRun, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in toy.folder.iterdir():
+        if path.is_file():
+            (copy / path.name).write_bytes(path.read_bytes())
+    (copy / "metrics.csv").write_text("variant,network\n")
+    with pytest.raises(ArtefactError, match=r"metrics.csv is not as the run left it"):
+        run(tiny("toy_regression"), copy, silent)
+
+
+def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = [f"{name}={value}".replace(" ", "") for name, value in _overrides("mc_dropout")]
+    words = [
+        "bench", "--task", "robot_ik", "--preset", "smoke", "--agents", "mc_dropout", "--variants", "1000",
+        "--networks", "1", "--workers", "1", "--out", str(tmp_path), "--set", *settings,
+    ]  # fmt: skip
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "MC dropout, 1000" in said and "thesis, 1000" in said and "3.89 (0.67)" in said
+    (folder,) = (tmp_path / "robot_ik").iterdir()
+    report = folder / "report"
+    html = (report / "index.html").read_text()
+    assert "Table 4.1" in html and html.count("data:image/png;base64") == 4 and "unreachable" in html
+    for name in ("report.md", "results.csv", "table_4_1.csv", "ratio_to_random.csv", "calibration.csv", "auroc.csv"):
+        assert (report / name).stat().st_size > 50
+    assert (folder / "mc_dropout" / "seed_0" / "recording.rrd").stat().st_size > 10_000
+    assert main(words) == 0  # nothing is missing: the same table again, from the files
+    assert capsys.readouterr().out.splitlines()[:8] == said.splitlines()[:8]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--task", "robot_ik", "--variants", "5"], "a number of samples in [20, 1000000], such as 2000, not '5'"),
+        (["--task", "toy_regression", "--variants", "bse"], "No variant of toy_regression 'bse'. Did you mean 'base'?"),
+        (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: mc_dropout, ensemble."),
+        (["--task", "toy_regression", "--networks", "0"], "networks is 0; it must lie in [1, 1000]."),
+        (["--task", "toy_regression", "--budgets", "5"], "toy_regression takes no budgets; a bench of it is made of: "),
+        (["--task", "arrow_puzzle", "--networks", "5"], "arrow_puzzle takes no networks; a bench of it is made of: "),
+        (["--task", "toy_regression", "--set", "weight_samples=1"], "Setting weight_samples is 1; it must lie in [2,"),
+        (["--task", "toy_regression", "--set", "components=0"], "Setting components is 0; it must lie in [1, 1000]."),
+        (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
+        (["--task", "toy_regression", "--set", "members=1"], "Setting members is 1 in an ensemble; it must be at"),
+        (["--task", "toy_regression", "--set", "precision=half"], "No precision 'half'."),
+        (["--task", "toy_regresion"], "No task 'toy_regresion'. Did you mean 'toy_regression'? Known: arrow_puzzle"),
+    ],
+)  # fmt: skip
+def test_wrong_words_get_one_line_and_write_nothing(
+    words: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *words, "--out", str(tmp_path / "runs")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert sentence in line
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
+    good = Dataset(inputs=np.zeros((5, 1)), targets=np.ones((5, 1)))
+    seeds = (SeedTree(0).child("a"), SeedTree(0).child("b"))
+    for bad, words in (
+        (Dataset(inputs=np.zeros((4, 1)), targets=np.ones((4, 1))), "Dataset 1 has inputs and targets of shapes"),
+        (
+            Dataset(inputs=np.zeros((5, 1)), targets=np.full((5, 1), np.nan)),
+            "Dataset 1 holds values that are not finite",
+        ),
+    ):
+        with pytest.raises(InvalidValueError, match=words):
+            registry.make_regressor("mc_dropout", RegressorContext(datasets=(good, bad), seeds=seeds))
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_regressors_learn_two_branches_and_refuse_a_foreign_snapshot(agent: str) -> None:
+    """Chance: |y| is uniform in [0.5, 1.5], so a network that ignores x cannot go below log 2 = 0.69 nats."""
+    rng = np.random.default_rng(0)
+
+    def branches(count: int) -> Dataset:
+        x = rng.uniform(-1, 1, (count, 1))
+        y = np.where(rng.random((count, 1)) < 0.5, 1.0, -1.0) * (1 + 0.5 * x) + 0.05 * rng.standard_normal((count, 1))
+        return Dataset(inputs=x, targets=y)
+
+    settings = {"epochs": 80, "hidden": (64, 64), "components": 4, "batch_size": 50, "learning_rate": 5e-3}
+    context = RegressorContext(datasets=(branches(600),), seeds=(SeedTree(5),), overrides=settings)
+    regressor = registry.make_regressor(agent, context)
+    regressor.train(80)
+    test = branches(200)
+    said = regressor.assess(test.inputs[None], rng)
+    predictive = Mixtures(**{name: getattr(said.predictive, name)[0] for name in ("weights", "means", "sigmas")})
+    assert log_score(predictive, test.targets).mean() < 0.2
+    truth = (1 + 0.5 * test.inputs[:, 0]) ** 2  # half the distance between the branches, squared
+    assert np.corrcoef(said.modal[0, :, 0], truth)[0, 1] > 0.8
+    state = regressor.state()
+    with pytest.raises(ArtefactError):
+        regressor.restore(AgentState(arrays={**state.arrays, "other": np.zeros(1)}, values=state.values))
+
+
+def test_claims_and_ratios_by_hand() -> None:
+    values = np.array([2.0, 3.0, 4.0])
+    assert toy_regression.holds(values, "≥ 3").tolist() == [False, True, True]
+    assert toy_regression.holds(values, "≤ 3").tolist() == [True, True, False]
+    estimate = robot_ik.ratio_to_random(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.random.default_rng(0))
+    assert estimate == pytest.approx((0.5, 0.5, 0.5))  # every network halves its own random error
+    assert page.table_csv(page.Table(name="t", header=["a", "b"], rows=[["1", "x, y"]])) == 'a,b\n1,"x, y"\n'
+    assert set(SCORES) >= {"epistemic", "aleatoric", "modal", "stationarity", "surprise", "drawn_component"}
