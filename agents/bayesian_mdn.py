@@ -21,6 +21,7 @@ from .layers import MemberMLP
 from .member_adam import MemberAdam
 from .mixture import Mixture
 from .normed_layers import NormedMLP
+from .precision import hidden_dtype
 from .weight_samples import sample_outputs
 
 
@@ -37,7 +38,8 @@ class MDNSettings:
         gradient_clip: Largest gradient norm of each network.
         sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
         sigma_ceiling: Largest, in the same units.
-        precision: Products between hidden layers while training: float32 or bfloat16.
+        precision: Products between hidden layers while training: float32, bfloat16, or auto for what the device does
+            fast.
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -66,9 +68,8 @@ class BayesianMDN:
     ) -> None:
         self.n_outputs, self.settings, self._generators = n_outputs, settings, generators
         sizes = (n_inputs, *settings.hidden, mdn.output_size(settings.components, n_outputs))
-        self.network = NormedMLP(
-            sizes, generators=generators, dropout=settings.dropout, precision=getattr(torch, settings.precision)
-        )
+        precision = hidden_dtype(settings.precision, generators[0].device.type)
+        self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
         self.optimiser = MemberAdam(
             self.network, list(self.network.weights)[:-1], learning_rate=settings.learning_rate,
             weight_decay=settings.weight_decay, gradient_clip=settings.gradient_clip,

@@ -28,6 +28,11 @@ def dropout_bits(dropout: float) -> int:
     return min(round(dropout * 2**_PROBABILITY_BITS), 2**_PROBABILITY_BITS - 1)
 
 
+def kept_scale(dropout: float) -> float:
+    """What units that are kept are multiplied by, so that the mean stays: 1 / (1 - dropout), as masks round it."""
+    return 1.0 / (1.0 - dropout_bits(dropout) / 2**_PROBABILITY_BITS)
+
+
 def dropout_mask(shape: Sequence[int], dropout: float, generator: torch.Generator) -> Tensor:
     """A random mask: 0 with probability ``dropout`` (rounded to 1/256), else -1, that is all bits.
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .flat_adam import FlatAdam
+from .flat_adam import FlatAdam, require_finite
 
 
 class MemberAdam(FlatAdam):
@@ -33,27 +33,25 @@ class MemberAdam(FlatAdam):
         gradient_clip: float | None,
     ) -> None:
         super().__init__([module], learning_rate=learning_rate, gradient_clip=gradient_clip)
-        self._parameters, self._decayed = list(module.parameters()), decayed
-        self._weight_decay = weight_decay
-        self.set_learning_rate(learning_rate)
-
-    def set_learning_rate(self, learning_rate: float) -> None:
-        """Take steps of this size from now on, and let weights decay by as much less."""
-        super().set_learning_rate(learning_rate)
-        self._kept = 1.0 - learning_rate * self._weight_decay
+        self._members, self._decayed, self._weight_decay = len(self._parameters[0]), decayed, weight_decay
+        sizes = [parameter.numel() for parameter in self._parameters]
+        self._by_member = [part.view(self._members, -1) for part in self._gradient.split(sizes)]
 
     def step(self, loss: Tensor) -> None:
-        """Descend the gradient of the sum of all members' losses once."""
+        """Descend the gradient of the sum of all members' losses once.
+
+        Raises:
+            DivergedError: A gradient is NaN or infinite; the parameters are left as they were.
+        """
         super().step(loss)
         with torch.no_grad():
             for parameter in self._decayed:
-                parameter.mul_(self._kept)
+                parameter.mul_(1.0 - self._rate * self._weight_decay)
 
-    @torch.no_grad()
-    def _clip_gradients(self, limit: float) -> None:
-        gradients = [p.grad for p in self._parameters if p.grad is not None]
-        norms = torch.stack([g.flatten(1).square().sum(dim=1) for g in gradients]).sum(dim=0).sqrt()  # [E]
-        if bool((norms > limit).any()):
-            scale = (limit / norms.clamp_min(1e-30)).clamp_max(1.0)  # [E]
-            for gradient in gradients:
-                gradient.mul_(scale.view(-1, *(1,) * (gradient.dim() - 1)))
+    def _clip_gradients(self) -> None:
+        norms = torch.stack([part.square().sum(dim=1) for part in self._by_member]).sum(dim=0).sqrt()  # [E]
+        require_finite(norms.tolist())
+        if self._clip is not None and bool((norms > self._clip).any()):
+            scale = (self._clip / norms.clamp_min(1e-30)).clamp_max(1.0)[:, None]
+            for part in self._by_member:
+                part.mul_(scale)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from .layers import MemberMLP, dropout_mask
+from .layers import MemberMLP, dropout_mask, kept_scale
 
 EPSILON = 1e-3
 """Added to every variance, the default of Keras."""
@@ -58,14 +58,14 @@ class NormedMLP(nn.Module):
             self.register_buffer(f"variance_{layer}", torch.ones(self.members, n_in, 1, device=device))
 
     def draw_masks(self, rows: int, generators: Sequence[torch.Generator]) -> tuple[Tensor, ...] | None:
-        """Dropout masks of every hidden layer, each (E, H, N), a member's from its own generator; None for none."""
+        """Dropout factors of every hidden layer, each (E, H, N), a member's from its own generator; None for none."""
         if self.dropout == 0.0:
             return None
         hidden = self.sizes[1:-1]
         masks = torch.empty(self.members, sum(hidden), rows, dtype=self.precision, device=generators[0].device)
         for mask, generator in zip(masks, generators, strict=True):
             mask.copy_(dropout_mask(mask.shape, self.dropout, generator))
-        return masks.split(hidden, dim=1)
+        return masks.mul_(-kept_scale(self.dropout)).split(hidden, dim=1)
 
     def forward(self, x: Tensor, masks: Sequence[Tensor] | None) -> Tensor:
         """Map a training batch (E, in, N) to (E, out, N), and note its statistics for :meth:`folded`."""

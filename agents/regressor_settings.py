@@ -10,9 +10,8 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError, require_kn
 
 from .bayesian_mdn import MDNSettings
 from .family import Deviation
+from .precision import PRECISIONS
 from .presets import checked
-
-PRECISIONS = ("float32", "bfloat16")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +40,15 @@ PRESETS: dict[str, dict[str, Deviation]] = {
     "smoke": {
         "epochs": Deviation(20, "shows that every part works, within a minute"),
         "learning_rate": Deviation(3e-3, "a tenth of the epochs want larger steps"),
-        "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
+        "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
     },
     "quick": {
         "epochs": Deviation(600, "CPU time"),
         "learning_rate": Deviation(3e-3, "a fifth of the epochs want larger steps"),
         "final_rate": Deviation(0.01, "with falling steps 600 epochs fit as well as 1500 without"),
-        "precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes"),
+        "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
     },
-    "thesis": {"precision": Deviation("bfloat16", "CPU time; see docs/uncertainty.md for what it changes")},
+    "thesis": {"precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes")},
     "full": {},
 }
 """What each preset changes of the thesis' values."""

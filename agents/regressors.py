@@ -23,6 +23,7 @@ from .bayesian_mdn import BayesianMDN, TrainedMDN, rescaled
 from .layers import dropout_mask
 from .mixture import Mixture
 from .perception import prepare_torch
+from .precision import settle
 from .regressor_settings import RegressorSettings, resolve
 from .snapshot import generator_array, jsonable, load_generator, require_fit
 from .stationarity import jensen_shannon
@@ -45,6 +46,7 @@ class MixtureRegressor:
 
     def __init__(self, context: RegressorContext, settings: RegressorSettings) -> None:
         _require_data(context.datasets)
+        settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
         self.settings, self.networks = settings, len(context.datasets)
         self._device = prepare_torch(context.device)
         inputs = np.stack([data.inputs for data in context.datasets])

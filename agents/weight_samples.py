@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .layers import MemberMLP
+from .layers import MemberMLP, kept_scale
 
 _CHUNK = 4096
 """Rows times samples of one product: activations of 256 units then stay in a core's cache."""
@@ -27,7 +27,8 @@ def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None
     Args:
         network: One member, with masks, or the T members of an ensemble, without.
         x: Shape (N, in).
-        masks: One a hidden layer, each (T, H); None makes every member a sample.
+        masks: One a hidden layer, each (T, H), as :func:`~.layers.dropout_mask` draws them; None makes every member a
+            sample.
 
     Returns:
         Shape (T, N, out).
@@ -47,9 +48,10 @@ def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None
 def _masked(network: MemberMLP, x: Tensor, masks: Sequence[Tensor]) -> Tensor:
     """One member under T masks: (N, in) to (T, N, out)."""
     samples, last = len(masks[0]), len(network.weights) - 1
+    factors = [mask.to(x.dtype).mul_(-kept_scale(network.dropout)) for mask in masks]  # -1 keeps a unit, 0 drops it
     for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         x = torch.addmm(bias[0], x, weight[0])  # [N, H], from the second layer on [T N, H]
         if layer < last:
-            x = x.relu_().view(samples if layer else 1, -1, x.shape[-1]) * masks[layer].unsqueeze(1)
+            x = x.relu_().view(samples if layer else 1, -1, x.shape[-1]) * factors[layer].unsqueeze(1)
             x = x.view(-1, x.shape[-1])  # [T N, H]
     return x.view(samples, -1, x.shape[-1])
