@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench plan generalise view report encoder film doctor test test-slow lint speed clean
+.PHONY: help setup bench plan generalise study view report encoder film doctor test test-slow lint speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,6 +30,9 @@ plan: $(READY)  ## Let the best imagining agent of the newest bench plan from on
 
 generalise: $(READY)  ## Ask the newest bench's models for transitions that no training can contain
 	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
+
+study: $(READY)  ## Change one factor of the comparison on TASK at a time, on tuning seeds
+	@$(BIN)/imagine-bench study --task $(TASK) $(ARGS)
 
 view: $(READY)  ## Open the newest recording in the Rerun viewer
 	@$(BIN)/imagine-bench view $(ARGS)

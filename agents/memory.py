@@ -79,9 +79,11 @@ class RealMemory(_Ring):
         capacity: Largest number of transitions.
         latent_size: Z.
         device: Where the rows lie.
+        spread: Latents are drawn with this many times the posterior's standard deviation.
     """
 
-    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
+    def __init__(self, capacity: int, latent_size: int, device: torch.device, spread: float = 1.0) -> None:
+        self._spread = spread
         latents = ("mu", "sigma", "next_mu", "next_sigma")
         columns = {name: torch.zeros(capacity, latent_size, device=device) for name in latents}
         columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -107,7 +109,7 @@ class RealMemory(_Ring):
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """Draw transitions with replacement, and latents from their posteriors."""
         rows = self._draw(count, generator)
-        noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator)
+        noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * self._spread
         return Batch(
             z=torch.addcmul(rows["mu"], rows["sigma"], noise[0]),
             action=rows["action"],

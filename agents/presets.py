@@ -56,6 +56,7 @@ _RANGES = {
     "controller.epsilon_min": _PROBABILITY,
     "controller.epsilon_max": _PROBABILITY,
     "controller.epsilon_decay": _NOT_NEGATIVE,
+    "memory.spread": _NOT_NEGATIVE,
     "imagination.start_episode": _NOT_NEGATIVE,
     "imagination.updates_per_step": _NOT_NEGATIVE,
     "imagination.temperature": _NOT_NEGATIVE,

@@ -128,11 +128,15 @@ class MemorySettings:
 
     Attributes:
         real: Transitions of the real memory.
+        spread: Latents of a batch are drawn from N(mu, (spread sigma)^2), anew for each batch; the thesis draws with 1.
+            An encoder whose posteriors are narrower than the looks of one macrostate vary leaves networks to learn the
+            few pictures they saw by heart; a larger spread keeps them from it.
         imagined: Transitions of the imagined memory.
         starts: Starts of real episodes, for those who imagine whole episodes.
     """
 
     real: int = 50_000
+    spread: float = 1.0
     imagined: int = 3_000
     starts: int = 1_000
 

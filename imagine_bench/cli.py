@@ -17,7 +17,7 @@ from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
 from imagine_bench.encoders import bundled
 from imagine_bench.environment import usable_cores
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LocalPool
@@ -162,6 +162,36 @@ class Generalise:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StudyCommand:
+    """Change one factor of a comparison at a time, on tuning seeds. The same command again goes on."""
+
+    task: str
+    """Task to study on; 'imagine-bench list' names them."""
+    name: str = "factors"
+    """Which study; 'imagine-bench list' names them."""
+    variants: tuple[str, ...] = ()
+    """Only these variants and what they are compared with; by default all."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    """Runs at a time."""
+    out: Path = Path("runs")
+    """Folder of all benches."""
+
+    def __call__(self) -> None:
+        """Run, compare, write."""
+        from imagine_bench.report.study import study_table, write_study  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - as above
+        from imagine_bench.study import run_study  # noqa: PLC0415 - as above
+
+        study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
+        workers = usable_cores() if self.workers is None else self.workers
+        lines = run_study(study, self.task, root=self.out, launcher=LocalPool(workers), bars=workers)
+        folder = self.out / self.task / f"study-{study.name}"
+        write_study(folder, study, lines)
+        print(study_table(study, lines))
+        print(f"\nStudy:      {folder / 'study.md'}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """Open a recording in the Rerun viewer."""
 
@@ -224,10 +254,13 @@ class List:
 
     def __call__(self) -> None:
         """List."""
+        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - scipy loads slowly
+
         for title, names in {
             **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
             **{f"{name} learners": kind.learners for name, kind in KINDS.items()},
             "presets": PRESETS,
+            "studies": STUDIES,
             "executions": EXECUTIONS,
             "appearances": APPEARANCES,
             "encoders": bundled(),
@@ -277,6 +310,7 @@ Command = (
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Generalise, tyro.conf.subcommand("generalise")]
+    | Annotated[StudyCommand, tyro.conf.subcommand("study")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Encoder, tyro.conf.subcommand("encoder")]
     | Annotated[Film, tyro.conf.subcommand("film")]

@@ -78,3 +78,13 @@ def test_a_stored_memory_does_not_follow_later_writes() -> None:
 def test_sampling_an_empty_memory_is_an_error() -> None:
     with pytest.raises(InvalidValueError, match="The memory is empty; store a transition before"):
         RealMemory(4, 2, CPU).sample(1, torch.Generator())
+
+
+def test_latents_spread_as_widely_as_asked() -> None:
+    memory = RealMemory(1, 2, CPU, spread=5.0)
+    sigma = torch.tensor([0.1, 0.2])
+    memory.add((torch.tensor([3.0, -1.0]), sigma), 0, 0.0, (torch.zeros(2), sigma), False)
+    drawn = memory.sample(4000, torch.Generator().manual_seed(0))
+    for values, centre in ((drawn.z, torch.tensor([3.0, -1.0])), (drawn.next_z, torch.zeros(2))):
+        torch.testing.assert_close(values.mean(dim=0), centre, rtol=0.0, atol=0.06)
+        torch.testing.assert_close(values.std(dim=0), 5.0 * sigma, rtol=0.06, atol=0.0)

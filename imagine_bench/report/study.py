@@ -1,0 +1,114 @@
+"""What a study found: one table, one row a seed in CSV, one plot."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from imagine_bench import statistics
+from imagine_bench.files import make_folder, write_bytes
+from imagine_bench.report.plots import STYLE
+from imagine_bench.report.words import estimate_text, percent
+from imagine_bench.study import Line, Study
+
+_HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's palette
+
+
+def study_table(study: Study, lines: Sequence[Line]) -> str:
+    """Success (%) of every variant at every budget, and its difference in points from what it is compared with."""
+    budgets = [f"{budget:,}" for budget in study.budgets]
+    rows = [
+        f"| factor | variant | agent | {' | '.join(budgets)} | against | {' | '.join(budgets)} | CPU s |",
+        f"|---|---|---|{'---|' * len(budgets)}---|{'---|' * len(budgets)}---|",
+    ]
+    for line in lines:
+        reached = [percent(statistics.iqm(column)) for column in line.success.T]
+        moved = [estimate_text(one) for one in line.difference] if line.difference else ["–"] * len(budgets)
+        variant = line.variant
+        rows.append(
+            f"| {variant.factor} | {variant.name} | {variant.agent} | {' | '.join(reached)} | "
+            f"{variant.against or '–'} | {' | '.join(moved)} | {line.train_cpu_s:.0f} |"
+        )
+    return "\n".join(rows)
+
+
+def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
+    """Write ``study.md``, ``seeds.csv``, ``summary.csv`` and ``study.png``.
+
+    Raises:
+        SetupError: The folder cannot be written.
+    """
+    make_folder(folder)
+    head = (
+        f"# {study.question}\n\n{study.execution}, {study.appearance}, tuning seeds "
+        f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, differences in points with 95 % bootstrap "
+        "intervals over seeds.\n\n![Differences](study.png)\n\n"
+    )
+    write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
+    write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())
+    write_bytes(folder / "summary.csv", _summary(study, lines).encode())
+    write_bytes(folder / "study.png", _plot(study, lines))
+
+
+def _seeds(study: Study, lines: Sequence[Line]) -> str:
+    rows: list[list[Any]] = [["factor", "variant", "agent", "protocol", "seed", "episodes", "success"]]
+    for line in lines:
+        for seed, row in zip(study.seeds, line.success, strict=True):
+            for budget, success in zip(study.budgets, row, strict=True):
+                variant, protocol = line.variant, line.folder.name.rpartition("-")[2]
+                rows.append([variant.factor, variant.name, variant.agent, protocol, seed, budget, f"{success:.6g}"])
+    return _csv(rows)
+
+
+def _summary(study: Study, lines: Sequence[Line]) -> str:
+    rows: list[list[Any]] = [
+        ["factor", "variant", "agent", "episodes", "success_iqm", "against", "difference", "low_95", "high_95", "cpu_s"]
+    ]
+    for line in lines:
+        for index, budget in enumerate(study.budgets):
+            estimate = line.difference[index] if line.difference else ("", "", "")
+            variant, iqm = line.variant, statistics.iqm(line.success[:, index])
+            rows.append([
+                variant.factor, variant.name, variant.agent, budget, f"{iqm:.6g}", variant.against or "", *estimate,
+                f"{line.train_cpu_s:.1f}",
+            ])  # fmt: skip
+    return _csv(rows)
+
+
+def _plot(study: Study, lines: Sequence[Line]) -> bytes:
+    """Differences in points with their intervals, a panel a budget, a row a variant."""
+    compared = [line for line in lines if line.difference]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.2, 1.4 + 0.3 * max(1, len(compared))), layout="constrained")
+        panels = np.atleast_1d(figure.subplots(1, len(study.budgets), sharey=True))
+        for index, (axes, budget) in enumerate(zip(panels, study.budgets, strict=True)):
+            axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)
+            for row, line in enumerate(compared):
+                assert line.difference is not None
+                value, low, high = (100.0 * number for number in line.difference[index])
+                color = _HELPS if low > 0 else _HURTS if high < 0 else _UNCLEAR
+                axes.plot([low, high], [row, row], color=color)
+                axes.plot([value], [row], marker="o", markersize=5, color=color)
+            axes.set(title=f"after {budget:,} real episodes", xlabel="points of success")
+        panels[0].set_yticks(
+            range(len(compared)), [f"{line.variant.name} – {line.variant.against}" for line in compared]
+        )
+        panels[0].invert_yaxis()
+        FigureCanvasAgg(figure).draw()
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
+    return png.getvalue()
+
+
+def _csv(rows: list[list[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()

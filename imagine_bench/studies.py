@@ -1,0 +1,68 @@
+"""The studies that come with the package, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from imagine_bench.study import BASE, Study, Variant
+
+_DQN, _IMAGINATION, _FILTERED = "dqn", "imagination", "imagination_uncertainty"
+
+
+def _variant(factor: str, name: str, settings: Mapping[str, Any], agent: str = _IMAGINATION) -> Variant:
+    return Variant(name=name, factor=factor, agent=agent, against="imagination", settings=settings)
+
+
+_FACTORS = (
+    Variant(name="dqn", factor=BASE, agent=_DQN),
+    Variant(name="imagination", factor=BASE, agent=_IMAGINATION, against="dqn"),
+    Variant(
+        name="dqn, as many updates", factor="updates", agent=_DQN, against="dqn",
+        settings={"controller.updates_per_step": 6},
+    ),
+    _variant("updates", "one imagined update a step", {"imagination.updates_per_step": 1}),
+    _variant("start of rollouts", "from the current state", {"imagination.start_states": "current"}),
+    _variant("start of rollouts", "depth 10, breadth 3", {"imagination.depth": 10, "imagination.breadth": 3}),
+    _variant("start of imagination", "I_start 300", {"imagination.start_episode": 300}),
+    _variant("sampling", "temperature 1", {"imagination.temperature": 1.0}),
+    _variant("augmentation", "latents drawn with the posterior's spread", {"memory.spread": 1.0}),
+    _variant("reward", "reward counted in tens", {"model.reward_scale": 10.0}),
+    _variant("reward", "reward and end from the transition", {"model.assessment_input": "transition"}),
+    _variant("filter", "max below 0.3", {}, _FILTERED),
+    _variant("filter", "sum below 0.3", {"imagination.reduction": "sum"}, _FILTERED),
+    _variant("filter", "below the 90 % quantile", {"imagination.threshold_quantile": 0.9}, _FILTERED),
+    _variant(
+        "filter", "five networks, 90 % quantile",
+        {"model.members": 5, "model.dropout": 0.0, "imagination.threshold_quantile": 0.9}, _FILTERED,
+    ),
+)  # fmt: skip
+
+STUDIES: dict[str, Study] = {
+    "factors": Study(
+        name="factors",
+        question="When does imagination help? One factor at a time",
+        budgets=(500, 1000),
+        seeds=(1000, 1001, 1002),
+        evaluation_episodes=300,
+        appearance="mild",
+        execution="kinematic",
+        variants=_FACTORS,
+    ),
+    "smoke": Study(
+        name="smoke",
+        question="Does every part of a study work?",
+        budgets=(5,),
+        seeds=(1000, 1001),
+        evaluation_episodes=5,
+        appearance="clean",
+        execution="kinematic",
+        variants=(
+            Variant(name="dqn", factor=BASE, agent=_DQN),
+            Variant(
+                name="dqn, more updates", factor="updates", agent=_DQN, against="dqn",
+                settings={"controller.updates_per_step": 2},
+            ),
+        ),
+    ),
+}  # fmt: skip
