@@ -49,8 +49,8 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
     make_folder(folder)
     head = (
         f"# {study.question}\n\n{study.execution}, {study.appearance}, tuning seeds "
-        f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, differences in points with 95 % bootstrap "
-        "intervals over seeds.\n\n![Differences](study.png)\n\n"
+        f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, "
+        "differences in points with 95 % bootstrap intervals over seeds.\n\n![Differences](study.png)\n\n"
     )
     write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
     write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())
