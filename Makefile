@@ -2,6 +2,7 @@
 
 TASK ?= arrow_puzzle
 PRESET ?= quick
+LAUNCHER ?= local
 ARGS ?=
 PYTEST ?= -n auto --dist loadfile
 
@@ -23,7 +24,7 @@ setup: $(READY)  ## Install everything into .venv and stop
 	@:
 
 bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
-	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) $(ARGS)
+	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) $(ARGS)
 
 plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
 	@$(BIN)/imagine-bench plan --task $(TASK) $(ARGS)
@@ -32,7 +33,7 @@ generalise: $(READY)  ## Ask the newest bench's models for transitions that no t
 	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
 
 study: $(READY)  ## Change one factor of the comparison on TASK at a time, on tuning seeds
-	@$(BIN)/imagine-bench study --task $(TASK) $(ARGS)
+	@$(BIN)/imagine-bench study --task $(TASK) --launcher $(LAUNCHER) $(ARGS)
 
 view: $(READY)  ## Open the newest recording in the Rerun viewer
 	@$(BIN)/imagine-bench view $(ARGS)

@@ -20,7 +20,7 @@ from imagine_bench.environment import usable_cores
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
-from imagine_bench.launchers import LocalPool
+from imagine_bench.launchers import LAUNCHERS, launcher
 from imagine_bench.protocol import PRESETS
 from imagine_bench.store import load_bench, newest_bench, newest_recording
 
@@ -63,6 +63,8 @@ class Bench:
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
     """Runs at a time."""
+    launcher: str = "local"
+    """Where runs are carried out: local processes, or ray (the cluster at RAY_ADDRESS, else one started here)."""
     device: str = DEVICES[0]
     """Where agents compute: cpu or cuda."""
     out: Path = Path("runs")
@@ -79,7 +81,7 @@ class Bench:
             self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options
         )
         workers = usable_cores() if self.workers is None else self.workers
-        _show(bench(wanted, encoder, root=self.out, launcher=LocalPool(workers), bars=workers).folder)
+        _show(bench(wanted, encoder, root=self.out, launcher=launcher(self.launcher, workers), bars=workers).folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +175,8 @@ class StudyCommand:
     """Only these variants and what they are compared with; by default all."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
     """Runs at a time."""
+    launcher: str = "local"
+    """Where runs are carried out: local or ray."""
     out: Path = Path("runs")
     """Folder of all benches."""
 
@@ -184,7 +188,8 @@ class StudyCommand:
 
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
         workers = usable_cores() if self.workers is None else self.workers
-        lines = run_study(study, self.task, root=self.out, launcher=LocalPool(workers), bars=workers)
+        where = launcher(self.launcher, workers)
+        lines = run_study(study, self.task, root=self.out, launcher=where, bars=workers)
         folder = self.out / self.task / f"study-{study.name}"
         write_study(folder, study, lines)
         print(study_table(study, lines))
@@ -262,6 +267,7 @@ class List:
             "presets": PRESETS,
             "studies": STUDIES,
             "executions": EXECUTIONS,
+            "launchers": LAUNCHERS,
             "appearances": APPEARANCES,
             "encoders": bundled(),
         }.items():

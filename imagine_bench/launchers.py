@@ -17,10 +17,10 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Protocol
 
-from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_known
 from imagine_bench.files import make_folder, writing
 from imagine_bench.kinds import kind_of
-from imagine_bench.registry import load
 from imagine_bench.runs import Observer, Progress, RunSpec
 
 ONE_THREAD = {
@@ -54,6 +54,27 @@ class Failure:
 
     job: Job
     reason: str
+
+
+LAUNCHERS = {"local": "imagine_bench.launchers:LocalPool", "ray": "imagine_bench.launcher_ray:RayCluster"}
+"""Where runs can be carried out, by name."""
+
+
+def launcher(name: str, workers: int) -> Launcher:
+    """The launcher of that name.
+
+    Args:
+        name: One of :data:`LAUNCHERS`.
+        workers: Runs at a time on this machine.
+
+    Raises:
+        UnknownNameError: No such launcher.
+        InvalidValueError: Fewer than one worker.
+        SetupError: It needs something that is not installed.
+    """
+    make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
+    made: Launcher = make(workers)
+    return made
 
 
 class Launcher(Protocol):
@@ -172,18 +193,18 @@ def _work(job: Job, sender: Connection) -> None:
     """The life of a worker process: one run, its output to the log, its end told to the parent."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
     try:
-        _redirect_output(job)
-        _log(f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
-        load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, sender.send)
+        redirect_output(job)
+        log_line(f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
+        registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, sender.send)
         sender.send(None)
     except Exception as error:
         traceback.print_exc()
         sender.send(str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}")
         sys.exit(1)
-    _log("done")
+    log_line("done")
 
 
-def _redirect_output(job: Job) -> None:
+def redirect_output(job: Job) -> None:
     """Let everything this process prints, native libraries included, end in the run's log."""
     make_folder(job.folder)
     with writing(job.log):
@@ -193,7 +214,8 @@ def _redirect_output(job: Job) -> None:
     os.close(log)
 
 
-def _log(line: str) -> None:
+def log_line(line: str) -> None:
+    """Print a line with the time."""
     print(time.strftime("%Y-%m-%d %H:%M:%S"), line, flush=True)
 
 

@@ -1,0 +1,153 @@
+"""The same runs on a Ray cluster: one task a run, in a fresh process with one thread, resumed wherever it was lost.
+
+The folder of the bench must be on a file system that all nodes share. A worker or a whole node that dies costs what a
+``kill -9`` costs locally, the time since the run's last checkpoint: Ray starts its task again elsewhere, which finds
+that checkpoint.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError, SetupError
+from imagine_bench.launchers import ONE_THREAD, Failure, Job, log_line, redirect_output
+from imagine_bench.runner import run
+from imagine_bench.runs import Observer, Progress
+
+_LOST = 20
+"""Times that one run may lose its worker or its node before it counts as failed."""
+_POLL_S = 0.5
+_FREED_WITHIN_S = 60.0
+"""How long the process of a dead node may hold on to its run's folder."""
+
+
+class RayCluster:
+    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or of one started here for the purpose.
+
+    Args:
+        workers: Runs at a time on a cluster started here; an existing one runs as many as it has CPUs.
+
+    Raises:
+        InvalidValueError: Fewer than one worker.
+        SetupError: Ray is not installed.
+    """
+
+    def __init__(self, workers: int) -> None:
+        if workers < 1:
+            raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
+        try:
+            import ray  # noqa: F401, PLC0415 - an optional dependency
+        except ImportError as error:
+            raise SetupError("The launcher 'ray' needs Ray: pip install 'imagine-bench[ray]'.") from error
+        self._workers = workers
+
+    def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+        """Carry out every job; see :class:`imagine_bench.launchers.Launcher`.
+
+        Raises:
+            SetupError: There is no cluster at ``RAY_ADDRESS``.
+        """
+        import ray  # noqa: PLC0415 - as above
+
+        self._connect(ray)
+        try:
+            return _carry_out(ray, jobs, on_progress)
+        finally:
+            ray.shutdown()
+
+    def _connect(self, ray: Any) -> None:
+        address = os.environ.get("RAY_ADDRESS")
+        local = {} if address else {"num_cpus": self._workers, "include_dashboard": False}
+        try:
+            ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **local)
+        except (ConnectionError, ValueError) as error:
+            reason = str(error).splitlines()[0].rstrip(".")
+            raise SetupError(
+                f"No Ray cluster answers at RAY_ADDRESS={address} ({reason}); start one, or unset it."
+            ) from error
+
+
+def _carry_out(ray: Any, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+    here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+        ray.get_runtime_context().get_node_id(), soft=False
+    )
+    board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
+    work = ray.remote(_work).options(
+        num_cpus=1,
+        max_calls=1,  # a fresh process for each run: no threads, GL contexts or open logs of another
+        max_retries=_LOST,
+        runtime_env={"env_vars": ONE_THREAD},
+    )
+    running = {work.remote(_absolute(job), board): job for job in jobs}
+    failures = []
+    while running:
+        ended, _ = ray.wait(list(running), timeout=_POLL_S)
+        for progress in ray.get(board.take.remote()):
+            on_progress(progress)
+        for task in ended:
+            job, reason = running.pop(task), _reason(ray, task)
+            if reason:
+                failures.append(Failure(job=job, reason=reason))
+    for progress in ray.get(board.take.remote()):
+        on_progress(progress)
+    return tuple(failures)
+
+
+def _absolute(job: Job) -> Job:
+    """The job with paths that mean the same in every process."""
+    encoder = job.spec.encoder
+    spec = replace(job.spec, encoder=None if encoder is None else encoder.resolve())
+    return replace(job, spec=spec, folder=job.folder.resolve())
+
+
+def _reason(ray: Any, task: Any) -> str:
+    """Why an ended task's run failed, or an empty string."""
+    try:
+        reason: str = ray.get(task)
+    except ray.exceptions.RayError as error:
+        return f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"
+    return reason
+
+
+class _Board:
+    """Where tasks on any node leave how far they are, for the process that shows it."""
+
+    def __init__(self) -> None:
+        self._news: dict[tuple[str, int], Progress] = {}
+
+    def put(self, progress: Progress) -> None:
+        self._news[progress.agent, progress.seed] = progress
+
+    def take(self) -> list[Progress]:
+        news, self._news = list(self._news.values()), {}
+        return news
+
+
+def _work(job: Job, board: Any) -> str:
+    """One run, its output to the log. Returns why it failed, or an empty string."""
+    try:
+        redirect_output(job)
+        log_line(f"{job.spec.agent} seed {job.spec.seed} begins or goes on, on a Ray worker")
+        _run_when_free(job, board.put.remote)
+    except Exception as error:
+        traceback.print_exc()
+        return str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}"
+    log_line("done")
+    return ""
+
+
+def _run_when_free(job: Job, on_progress: Observer) -> None:
+    """Run; wait a while for the folder, which the worker of a node that just died may not have let go of yet."""
+    deadline_s = time.monotonic() + _FREED_WITHIN_S
+    while True:
+        try:
+            run(job.spec, job.folder, on_progress)
+            return
+        except BusyError:
+            if time.monotonic() > deadline_s:
+                raise
