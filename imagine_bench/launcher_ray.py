@@ -77,12 +77,12 @@ def _carry_out(ray: Any, jobs: Sequence[Job], on_progress: Observer) -> tuple[Fa
         ray.get_runtime_context().get_node_id(), soft=False
     )
     board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
-    work = ray.remote(_work).options(
+    work = ray.remote(
         num_cpus=1,
         max_calls=1,  # a fresh process for each run: no threads, GL contexts or open logs of another
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
-    )
+    )(_work)
     running = {work.remote(_absolute(job), board): job for job in jobs}
     failures = []
     while running:
