@@ -84,7 +84,7 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
     """Two raylets; the second, with the runs on it, is killed outright, and a worker of the first by signal 9."""
     from ray.cluster_utils import Cluster
 
-    seeds, episodes = (0, 1, 2), 400
+    seeds, episodes = (0, 1, 2), 240
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     doomed = cluster.add_node(num_cpus=2)
     monkeypatch.setenv("RAY_ADDRESS", cluster.address)
