@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from imagine_bench import registry
 from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError, SetupError
+from imagine_bench.kinds import kind_of
 from imagine_bench.launchers import ONE_THREAD, Failure, Job, log_line, redirect_output
-from imagine_bench.runner import run
 from imagine_bench.runs import Observer, Progress
 
 _LOST = 20
@@ -146,7 +147,7 @@ def _run_when_free(job: Job, on_progress: Observer) -> None:
     deadline_s = time.monotonic() + _FREED_WITHIN_S
     while True:
         try:
-            run(job.spec, job.folder, on_progress)
+            registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, on_progress)
             return
         except BusyError:
             if time.monotonic() > deadline_s:
