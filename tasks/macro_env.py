@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 FRAME_PX = 64
 MAX_PICTURE_PX = 4096
+_ANSWER_S = 0.05
+"""People answer a macro-action so long after it, in a recording."""
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
 
@@ -132,6 +134,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self.capture_motion_hz = 0.0
         self._macrostate = self._starts[0]
         self._latest: MacroResult | None = None
+        self._people = self._mocap()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -167,6 +170,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         start = self._macrostate
         intended = self._intended(start, chosen)
         if self._execution == "physics":
+            self._people = self._mocap()
             self._latest = self._world.execute(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
@@ -201,13 +205,18 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return shapes_of(self._world.model)
 
     def motion(self) -> Motion:
-        """The motion of the latest macro-action as captured, else one sample of the standing scene."""
+        """The motion of the latest macro-action as captured, else one sample of the standing scene.
+
+        People stand still meanwhile; what they do when it is over is one sample more.
+        """
         latest, model, data = self._latest, self._world.model, self._world.data
+        standing = poses_of(model, data.qpos[None], *self._mocap())
         if latest is None or not len(latest.time_s):
-            time_s, qpos = np.zeros(1), data.qpos[None].copy()
-        else:
-            time_s, qpos = latest.time_s, latest.qpos
-        poses = poses_of(model, qpos, data.mocap_pos, data.mocap_quat)
+            return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
+        time_s, poses = latest.time_s, poses_of(model, latest.qpos, *self._people)
+        if not all(np.array_equal(*pair) for pair in zip(self._people, self._mocap(), strict=True)):
+            time_s = np.append(time_s, time_s[-1] + _ANSWER_S)
+            poses = np.concatenate([poses, standing])
         return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
 
     def agent_view(self) -> Frame:
@@ -228,17 +237,23 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         world, latest = self._world, self._latest
         if latest is None or not len(latest.time_s):
             return self.human_view(width, height)[None]
-        standing = world.data.qpos.copy()
+        standing, people = world.data.qpos.copy(), self._mocap()
         pictures = []
+        world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
         for qpos in latest.qpos:
             world.data.qpos[:] = qpos
             mujoco.mj_kinematics(world.model, world.data)
             pictures.append(self.human_view(width, height))
         world.data.qpos[:] = standing
+        world.data.mocap_pos[:], world.data.mocap_quat[:] = people
         mujoco.mj_kinematics(world.model, world.data)
         return np.stack(pictures)
 
     # --- details -------------------------------------------------------------------------------------------------
+
+    def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""
+        return self._world.data.mocap_pos.copy(), self._world.data.mocap_quat.copy()
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
         for key in options:

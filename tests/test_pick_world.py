@@ -343,3 +343,23 @@ def test_the_arm_is_out_of_the_agent_s_frame_while_it_holds_something(world):
     for eye in eyes:
         eye.close()
     assert np.array_equal(hidden[:40], shown[:40])  # only the fingers beside what they hold would be seen
+
+
+# --- recordings --------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_shows_the_human_answer_when_the_motion_is_over():
+    env = gymnasium.make(SPEC.env_id).unwrapped
+    env.capture_motion_hz = 20.0
+    env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})
+    *_, info = env.step(1)
+    motion, film = env.motion(), env.film(64, 48)
+    hand = motion.poses_in_world[:, motion.body_names.index("hand")]
+    car = motion.poses_in_world[:, motion.body_names.index("car")]
+    env.close()
+    assert info["macrostate"][3] != 1
+    assert np.array_equal(hand[:-1], np.repeat(hand[:1], len(hand) - 1, axis=0))
+    assert np.linalg.norm(hand[-1, :3] - hand[0, :3]) > 0.05
+    assert np.linalg.norm(car[-1, :3] - car[-2, :3]) < 0.002
+    assert (np.diff(motion.time_s) > 0).all()
+    assert len(film) == len(motion.time_s) - 1
