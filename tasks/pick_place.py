@@ -90,7 +90,7 @@ SPEC = TaskSpec(
         bystander_mm=3.0,
         error_mm=5.0,
         physics_per_cpu_s=60,
-        kinematic_per_cpu_s=3_000,
+        kinematic_per_cpu_s=5_000,
         encoders={"clean": 0.995, "mild": 0.995},
     ),
 )
