@@ -61,6 +61,21 @@ def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.
     return frames_of(world, macrostates, eye, rng)
 
 
+_CHAPTER_3 = ("dqn", "imagination_only")
+_COMPARED = ("random", "oracle", *_CHAPTER_3, "imagination_only_uncertainty")
+_PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {"agents": _COMPARED},
+    "quick": {"agents": _COMPARED, "evaluation_episodes": 100, "sampled_futures": 400},
+    "thesis": {  # section 3.2.3: 10 runs of 1000 episodes, each tested on 100
+        "agents": _CHAPTER_3,
+        "seeds": tuple(range(10)),
+        "budgets": (1000,),
+        "evaluation_episodes": 100,
+        "sampled_futures": 400,
+    },
+    "full": {"agents": _COMPARED, "budgets": (100, 250, 500, 1000), "sampled_futures": 400},
+}
+
 _RULES = PickPlaceRules()
 SPEC = TaskSpec(
     id="pick_place",
@@ -93,6 +108,7 @@ SPEC = TaskSpec(
         kinematic_per_cpu_s=5_000,
         encoders={"clean": 0.995, "mild": 0.995},
     ),
+    presets=_PRESETS,
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from imagine_bench import reference
@@ -12,6 +13,14 @@ def test_table_5_1() -> None:
     assert reference.success("arrow_puzzle", "dqn")[2000] == pytest.approx((0.4218, 0.0601))
     assert reference.success("arrow_puzzle", "imagination")[3000] == pytest.approx((0.814, 0.0295))
     assert reference.success("arrow_puzzle", "imagination_uncertainty")[6000] == pytest.approx((0.9697, 0.0208))
+
+
+def test_section_3_2_3_gives_no_standard_deviation() -> None:
+    (dqn,), (only,) = (reference.success("pick_place", agent).values() for agent in ("dqn", "imagination_only"))
+    assert (dqn[0], only[0]) == (0.98, 0.78)
+    assert np.isnan([dqn[1], only[1]]).all()
+    assert reference.success_source("pick_place").startswith("section 3.2.3")
+    assert reference.success_source("robot_ik") == ""
 
 
 def test_table_5_3() -> None:

@@ -6,6 +6,7 @@ The files keep the thesis' own units (percent, metres); :func:`success` and :fun
 from __future__ import annotations
 
 import json
+import math
 from importlib import resources
 from typing import Any
 
@@ -28,7 +29,9 @@ def load(name: str) -> dict[str, Any]:
 
 
 def success(task_reference: str, agent: str) -> dict[int, tuple[float, float]]:
-    """Success shares of one agent in tables 5.1 and 5.3: real episodes to (mean, standard deviation), in [0, 1].
+    """Success shares of one agent (tables 5.1 and 5.3, section 3.2.3): real episodes to (mean, standard deviation).
+
+    Shares lie in [0, 1]; a standard deviation that the thesis does not give is NaN.
 
     Args:
         task_reference: One of :data:`NAMES`.
@@ -38,7 +41,19 @@ def success(task_reference: str, agent: str) -> dict[int, tuple[float, float]]:
         UnknownNameError: The thesis has no such task.
     """
     rows = load(task_reference).get("success", {}).get("agents", {}).get(agent, {})
-    return {int(episodes): (mean / 100.0, std / 100.0) for episodes, (mean, std) in rows.items()}
+    return {
+        int(episodes): (mean / 100.0, math.nan if std is None else std / 100.0)
+        for episodes, (mean, std) in rows.items()
+    }
+
+
+def success_source(task_reference: str) -> str:
+    """Where in the thesis :func:`success` stands, and over what; empty where it gives no success.
+
+    Raises:
+        UnknownNameError: The thesis has no such task.
+    """
+    return str(load(task_reference).get("success", {}).get("source", ""))
 
 
 def gain(task_reference: str, agent: str) -> dict[int, float]:

@@ -126,6 +126,7 @@ class ReportData:
     futures: dict[str, FuturesSummary]
     timing: dict[str, Timing]
     thesis: dict[str, dict[int, tuple[float, float]]]
+    thesis_source: str
     thesis_random: float | None
 
     @property
@@ -156,6 +157,7 @@ def collect(result: BenchResult) -> ReportData:
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
         timing={agent: _timing(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
+        thesis_source=reference.success_source(spec.reference) if spec.reference else "",
         thesis_random=reference.random_success(spec.reference) if spec.reference else None,
     )
 

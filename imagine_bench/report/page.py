@@ -154,7 +154,8 @@ def _thesis_only(data: ReportData) -> list[int]:
 
 
 def _thesis_text(printed: tuple[float, float]) -> str:
-    return f"{percent(printed[0])} ({percent(printed[1])})"
+    mean, std = printed
+    return percent(mean) if math.isnan(std) else f"{percent(mean)} ({percent(std)})"
 
 
 def _seconds(value: float) -> str:
