@@ -23,7 +23,7 @@ _THESIS = Settings(
         precision="float32",  # batches of 64 gain nothing from bfloat16
     ),
     controller=ControllerSettings(hidden=(512, 256), learning_rate=2.5e-4),
-    imagination=ImaginationSettings(depth=50, weight_samples=1, reduction="max"),
+    imagination=ImaginationSettings(depth=50, weight_samples=1),
     memory=MemorySettings(imagined=50_000),
 )
 

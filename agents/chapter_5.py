@@ -29,7 +29,6 @@ _QUICK: dict[str, Deviation] = {
     "imagination.temperature": Deviation(0.0, "sampled latents leave the manifold that the networks know"),
     "imagination.exploration": Deviation(0.2, "a greedy rollout repeats the real actions"),
     "imagination.weight_samples": Deviation(10, "CPU time; the filter needs a rank, not a precise variance"),
-    "imagination.reduction": Deviation("max", "0.3 on the sum of 24 latents keeps one in ten, on the mean everything"),
 }
 
 _SMOKE: dict[str, Deviation] = {

@@ -102,7 +102,8 @@ class ImaginationSettings:
         temperature: Scale of the component's standard deviation when z' is drawn: 1 the thesis, 0 its mean.
         exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
         weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
-        reduction: How the epistemic variances of the latent dimensions become one: sum, mean or max.
+        reduction: How the epistemic variances of the latent dimensions become one: sum, mean or max. The thesis has a
+            vector (equation 4.25) and one threshold; see docs/deviations.md for why that is read as max.
         threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
         threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
             epistemic variance of transitions that really happened, a batch of them a real step.
@@ -117,7 +118,7 @@ class ImaginationSettings:
     temperature: float = 1.0
     exploration: float = 0.0
     weight_samples: int = 50
-    reduction: str = "sum"
+    reduction: str = "max"
     threshold: float = 0.3
     threshold_quantile: float | None = None
 

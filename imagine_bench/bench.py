@@ -91,20 +91,32 @@ def bench(wanted: Any, encoder: Path | None, *, root: Path, launcher: Launcher, 
     store = BenchStore(root, wanted)
     store.open()
     with store.lock():
-        jobs = [_job(store, encoder, *pair) for pair in store.missing()]
-        if jobs:
+        missing = len(store.missing())
+        if missing:
             gl_renderer()  # fails here, in one sentence, rather than in every run
             _warn(store.begin_sitting(describe_environment()), store.folder)
-            with ProgressBars([job.spec for job in jobs], bars) as show:
-                failures = launcher.launch(jobs, _noting_time(store, show))
+            failures = _in_waves(store, encoder, launcher, bars)
             store.note_time()
-            _raise_if_any(failures, len(jobs))
+            _raise_if_any(failures, missing)
     return load_bench(store.folder)
 
 
-def _job(store: BenchStore, encoder: Path | None, agent: str, seed: int) -> Job:
+def _in_waves(store: BenchStore, encoder: Path | None, launcher: Launcher, bars: int) -> list[Failure]:
+    """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
+    failures: list[Failure] = []
+    for until in store.protocol.waves:
+        failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
+        pairs = [pair for pair in store.missing(until) if pair not in failed]
+        jobs = [_job(store, encoder, *pair, until) for pair in pairs]
+        if jobs:
+            with ProgressBars([job.spec for job in jobs], bars) as show:
+                failures += launcher.launch(jobs, _noting_time(store, show))
+    return failures
+
+
+def _job(store: BenchStore, encoder: Path | None, agent: str, seed: int, until: int | None) -> Job:
     needed = encoder if encoder is not None and registry.agent_entry(agent).needs_encoder else None
-    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed)
+    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=until)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 
 

@@ -22,7 +22,7 @@ from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
 from imagine_bench.protocol import PRESETS
-from imagine_bench.store import load_bench, newest_bench, newest_recording
+from imagine_bench.store import newest_bench, newest_recording, read_protocol
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -86,7 +86,7 @@ class Bench:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a finished bench again, from its files, and show its table."""
+    """Write a bench's report again, from its files, and show its table; of an unfinished bench, what there is."""
 
     folder: Annotated[Path | None, tyro.conf.Positional] = None
     """The bench's folder; by default the newest."""
@@ -372,8 +372,8 @@ def _value(text: str) -> Any:
 
 def _show(folder: Path) -> None:
     """Write a bench's report, and print its table and where everything lies."""
-    result = load_bench(folder)
-    kind = kind_of(result.protocol.task)
+    kind = kind_of(read_protocol(folder).task)
+    result = registry.load(kind.load_so_far)(folder)
     page = registry.load(kind.write_report)(result)
     print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")

@@ -26,6 +26,7 @@ class Kind:
         plan: Function from task, preset and options to a protocol and an encoder, or None.
         run: Function that carries out a RunSpec in a folder.
         load_run: Function that reads a finished run folder.
+        load_so_far: Function that reads a bench folder, as far as it can be reported.
         result: Class of a finished bench.
         write_report: Function that writes a bench's report.
         summary_table: Function that gives its table as text.
@@ -37,6 +38,7 @@ class Kind:
     plan: str
     run: str
     load_run: str
+    load_so_far: str
     result: str
     write_report: str
     summary_table: str
@@ -50,6 +52,7 @@ KINDS: dict[str, Kind] = {
         plan="imagine_bench.bench:plan_control",
         run="imagine_bench.runner:run",
         load_run="imagine_bench.run_folder:load_run",
+        load_so_far="imagine_bench.partial:load_so_far",
         result="imagine_bench.results:BenchResult",
         write_report="imagine_bench.report:write_report",
         summary_table="imagine_bench.report:summary_table",
@@ -61,6 +64,7 @@ KINDS: dict[str, Kind] = {
         plan="imagine_bench.regression_protocol:plan",
         run="imagine_bench.regression_runner:run",
         load_run="imagine_bench.regression_results:load_run",
+        load_so_far="imagine_bench.store:load_bench",
         result="imagine_bench.regression_results:RegressionResult",
         write_report="imagine_bench.report.regression:write_report",
         summary_table="imagine_bench.report.regression:summary_table",

@@ -18,6 +18,9 @@ _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
+_FIRST_WAVE = 2000
+"""Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
+
 
 class ProtocolData:
     """What protocols of every kind can do, being dataclasses of JSON-like values."""
@@ -37,6 +40,14 @@ class ProtocolData:
     def hash(self) -> str:
         """Twelve hex digits that change when anything in the protocol does."""
         return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
+    def waves(self) -> tuple[int | None, ...]:
+        """The order of work: all runs come to each of these budgets before any goes on; None is the end.
+
+        A long bench that is stopped early is then a whole bench of fewer episodes.
+        """
+        return (None,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,10 +105,16 @@ class Protocol(ProtocolData):
         if self.evaluation_episodes < 1:
             raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
 
-    def work(self, agent: str) -> int:
-        """Episodes that a run of this agent plays, for training and for tests."""
+    def work(self, agent: str, until: int | None = None) -> int:
+        """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
+        budgets = [budget for budget in self.budgets if until is None or budget <= until]
         tests = self.evaluation_episodes
-        return self.budgets[-1] + len(self.budgets) * tests if agent_entry(agent).learns else tests
+        return budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+
+    @property
+    def waves(self) -> tuple[int | None, ...]:
+        """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
+        return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_WAVE), None)
 
 
 PRESETS: dict[str, dict[str, Any]] = {

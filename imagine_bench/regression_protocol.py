@@ -67,8 +67,8 @@ class RegressionProtocol(ProtocolData):
             if not low <= value <= high:
                 raise InvalidValueError(f"{name} is {value}; it must lie in [{low}, {high}].")
 
-    def work(self, agent: str) -> int:
-        """Parts of a run's work: a hundred a variant for training, ten for measuring."""
+    def work(self, agent: str, until: int | None = None) -> int:
+        """Parts of a run's work: a hundred a variant for training, ten for measuring; it never rests before its end."""
         return 110 * len(self.variants)
 
 

@@ -173,6 +173,8 @@ class BenchResult:
         environment: Command, commit, versions, machine, GL renderer, threads; JSON-like.
         folder: Where the bench's files lie.
         wall_s: Wall seconds of the bench, over all its sittings.
+        whole: The protocol of which this is a part; None if it is all of it.
+        missing: What a part lacks, one sentence a run.
 
     Raises:
         ArtefactError: A run of the protocol is missing, doubled or has other budgets.
@@ -183,6 +185,8 @@ class BenchResult:
     environment: Mapping[str, Any]
     folder: Path
     wall_s: float
+    whole: Protocol | None = None
+    missing: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
@@ -197,6 +201,11 @@ class BenchResult:
             budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
             if budgets != self.protocol.budgets:
                 raise ArtefactError(f"{run.folder} has budgets {budgets}, the protocol says {self.protocol.budgets}.")
+
+    @property
+    def protocol_hash(self) -> str:
+        """The hash of the whole protocol, which names the bench's folder."""
+        return (self.whole or self.protocol).hash
 
     def of(self, agent: str) -> tuple[RunResult, ...]:
         """The runs of one agent, in the order of the protocol's seeds."""

@@ -43,6 +43,13 @@ def is_done(folder: Path) -> bool:
     return (folder / _DONE).is_file()
 
 
+def reached(folder: Path) -> int:
+    """The last budget at which the run in ``folder`` was tested, 0 before the first."""
+    path = folder / _METRICS
+    rows = list(csv.DictReader(io.StringIO(path.read_text()))) if path.is_file() else []
+    return int(rows[-1]["episodes"]) if rows else 0
+
+
 def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Write what is run into a new run folder, or see that an old one holds the same.
 

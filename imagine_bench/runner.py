@@ -35,13 +35,16 @@ _RECENT = 100
 _REPORT_EVERY_S = 0.25
 
 
-def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult:
+def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult | None:
     """Do a run, or what is left of it, and read its result; a finished run is only read.
 
     Args:
         spec: What to run.
         folder: The run's own folder.
         on_progress: Told now and then how far it is.
+
+    Returns:
+        The result, or None if the run rests before its end.
 
     Raises:
         BusyError: Another process is at this run.
@@ -61,8 +64,8 @@ def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult:
                 disable_env_checker=True,  # the tests run it; here it would only cost time
             )
             with closing(env):
-                _Run(spec, folder, on_progress, env).to_the_end()
-    return run_folder.load_run(folder)
+                _Run(spec, folder, on_progress, env).go_on()
+    return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 
 class _Run:
@@ -80,16 +83,22 @@ class _Run:
             self.counters = Counters.of(snapshot)
         self.saved_s = self.reported_s = time.monotonic()
 
-    def to_the_end(self) -> None:
-        """Train and test at every budget, look at the imagination, record, and mark the run as done."""
+    def go_on(self) -> None:
+        """Train and test at every budget that is wanted now; after the last one of all, finish."""
         try:
-            for budget in self.spec.protocol.budgets[len(self.counters.rows) :]:
+            for budget in self.spec.budgets[len(self.counters.rows) :]:
                 if self.entry.learns:
                     self._train(budget)
                 self._test(budget)
         except DivergedError as error:
             where = save_snapshot(self.folder / "diverged", self.counters.snapshot(self.agent.state()))
             raise DivergedError(f"{error} The agent's state lies in {where}.") from error
+        if len(self.counters.rows) == len(self.spec.protocol.budgets):
+            self._finish()
+        self._tell("done", at_once=True)
+
+    def _finish(self) -> None:
+        """Look at the imagination, record, and mark the run as done."""
         imagined, courses = self._examples()
         self._record()
         run_folder.finish(
@@ -99,7 +108,6 @@ class _Run:
             imagined=imagined,
             courses=courses,
         )
-        self._tell("done", at_once=True)
 
     def _train(self, budget: int) -> None:
         while self.counters.episode < budget:

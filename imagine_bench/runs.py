@@ -31,6 +31,7 @@ class RunSpec:
         agent: Registered agent or regressor.
         seed: One of the protocol's seeds.
         encoder: The encoder artefact, or None if the agent needs none.
+        until: Budget after which it rests, or None to the end.
         checkpoint_every_s: Seconds of work that a kill may cost.
     """
 
@@ -38,12 +39,19 @@ class RunSpec:
     agent: str
     seed: int
     encoder: Path | None = None
+    until: int | None = None
     checkpoint_every_s: float = 20.0
+
+    @property
+    def budgets(self) -> tuple[int, ...]:
+        """The protocol's budgets up to where the run rests."""
+        budgets = self.protocol.budgets
+        return tuple(budget for budget in budgets if self.until is None or budget <= self.until)
 
     @property
     def work(self) -> int:
         """Parts of work to do, of whatever the protocol counts."""
-        parts: int = self.protocol.work(self.agent)
+        parts: int = self.protocol.work(self.agent, self.until)
         return parts
 
     def context(self) -> AgentContext:

@@ -48,7 +48,7 @@ class BenchStore:
         path = self.folder / _PROTOCOL
         if not path.exists():
             write_json(path, self.protocol.as_dict())
-        elif _read_protocol(self.folder) != self.protocol:
+        elif read_protocol(self.folder) != self.protocol:
             raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
 
     def lock(self) -> AbstractContextManager[None]:
@@ -63,10 +63,11 @@ class BenchStore:
         """The folder of one run."""
         return _run_folder(self.folder, agent, seed)
 
-    def missing(self) -> list[tuple[str, int]]:
-        """Agents and seeds that are not finished, seed by seed."""
+    def missing(self, until: int | None = None) -> list[tuple[str, int]]:
+        """Agents and seeds that are not finished, or have not come to the budget ``until``, seed by seed."""
         wanted = [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
-        return [pair for pair in wanted if not run_folder.is_done(self.run_folder(*pair))]
+        unfinished = [pair for pair in wanted if not run_folder.is_done(self.run_folder(*pair))]
+        return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
     def begin_sitting(self, environment: dict[str, Any]) -> list[str]:
         """Note that work starts now.
@@ -106,18 +107,23 @@ def load_bench(folder: Path) -> Any:
     Raises:
         ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
     """
-    protocol = _read_protocol(folder)
+    protocol = read_protocol(folder)
     folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
-    sittings = read_json(folder / _SITTINGS, "a bench's sittings")
     kind = kind_of(protocol.task)
     load_run = load(kind.load_run)
-    return load(kind.result)(
-        protocol=protocol,
-        runs=tuple(load_run(run) for run in folders if run_folder.is_done(run)),
-        environment={**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings},
-        folder=folder,
-        wall_s=sum(sitting["wall_s"] for sitting in sittings),
-    )
+    runs = tuple(load_run(run) for run in folders if run_folder.is_done(run))
+    return load(kind.result)(protocol=protocol, runs=runs, **bench_facts(folder))
+
+
+def bench_facts(folder: Path) -> dict[str, Any]:
+    """``environment``, ``folder`` and ``wall_s`` of a bench's result.
+
+    Raises:
+        ArtefactError: A file is missing or damaged; the message names it.
+    """
+    sittings = read_json(folder / _SITTINGS, "a bench's sittings")
+    environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings}
+    return {"environment": environment, "folder": folder, "wall_s": sum(sitting["wall_s"] for sitting in sittings)}
 
 
 def newest_bench(root: Path, task: str | None = None) -> Path:
@@ -153,7 +159,12 @@ def _run_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / agent / f"seed_{seed}"
 
 
-def _read_protocol(folder: Path) -> Any:
+def read_protocol(folder: Path) -> Any:
+    """The protocol of a bench folder.
+
+    Raises:
+        ArtefactError: It is missing or damaged; the message names it.
+    """
     data = read_json(folder / _PROTOCOL, "a bench's protocol")
     try:
         return load(kind_of(data["task"]).protocol).from_dict(data)

@@ -166,7 +166,7 @@ def facts(result: Any) -> list[tuple[str, str]]:
     """How a result of any kind was made, name and value, nested values joined by a dot."""
     protocol = result.protocol
     rows = [
-        ("protocol", f"{protocol.hash}, preset {protocol.preset}"),
+        ("protocol", f"{result.protocol_hash}, preset {protocol.preset}"),
         ("seeds", ", ".join(str(seed) for seed in protocol.seeds)),
         *flat("", result.environment),
     ]

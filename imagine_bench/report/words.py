@@ -95,7 +95,7 @@ def question(data: ReportData) -> str:
 def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
     budget = data.budgets[-1]
-    sentences = []
+    sentences = [] if data.result.whole is None else [_unfinished(data)]
     if BASE_AGENT in data.scores:
         sentences.append(
             f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
@@ -113,6 +113,16 @@ def answers(data: ReportData) -> list[str]:
             "seeds: read it as a hint. The presets thesis (5 seeds) and full (20) settle more."
         )
     return sentences
+
+
+def _unfinished(data: ReportData) -> str:
+    whole, part = data.result.whole, data.result.protocol
+    assert whole is not None
+    return (
+        f"This bench is not finished: shown are {len(part.seeds)} of {_count(len(whole.seeds), 'seed')} up to "
+        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {'; '.join(data.result.missing)}. "
+        "The same bench command goes on."
+    )
 
 
 def _verdict(data: ReportData, agent: str) -> str:

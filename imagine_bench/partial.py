@@ -1,0 +1,97 @@
+"""A bench that is not finished: the largest complete table of seeds and budgets in it, and what it lacks."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from imagine_bench import run_folder
+from imagine_bench.checkpointing import load_newest
+from imagine_bench.errors import ArtefactError
+from imagine_bench.files import read_json
+from imagine_bench.protocol import Protocol
+from imagine_bench.results import BenchResult, RunResult
+from imagine_bench.runs import Counters
+from imagine_bench.store import BenchStore, bench_facts, load_bench, read_protocol
+
+
+def load_so_far(folder: Path) -> BenchResult:
+    """Read a bench, finished or not.
+
+    Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
+    and no agent has more seeds or episodes than another.
+
+    Raises:
+        ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
+    """
+    whole = read_protocol(folder)
+    store = BenchStore(folder.parent.parent, whole)
+    if not store.missing():
+        return load_bench(folder)
+    reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
+    part = _largest_table(whole, reached)
+    return BenchResult(
+        protocol=part,
+        runs=tuple(_load(store.run_folder(agent, seed), part) for agent in part.agents for seed in part.seeds),
+        **bench_facts(folder),
+        whole=whole,
+        missing=tuple(
+            f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
+            for (agent, seed), at in reached.items()
+            if at < whole.budgets[-1]
+        ),
+    )
+
+
+def _reached(store: BenchStore, agent: str, seed: int) -> int:
+    """The last budget of which a run has results; they lie in its newest checkpoint until it is done."""
+    folder = store.run_folder(agent, seed)
+    return run_folder.reached(folder) if run_folder.is_done(folder) or load_newest(folder / "checkpoints") else 0
+
+
+def _largest_table(whole: Protocol, reached: dict[tuple[str, int], int]) -> Protocol:
+    """The protocol that is complete: among all cuts through the budgets, the one that leaves most results."""
+
+    def seeds_at(budget: int) -> tuple[int, ...]:
+        return tuple(seed for seed in whole.seeds if all(reached[agent, seed] >= budget for agent in whole.agents))
+
+    budgets = whole.budgets
+    count = max(range(1, len(budgets) + 1), key=lambda count: (count * len(seeds_at(budgets[count - 1])), count))
+    seeds = seeds_at(budgets[count - 1])
+    if not seeds:
+        raise ArtefactError(
+            f"No seed of this bench has brought every agent to {budgets[0]} real episodes yet, so there is nothing to "
+            "compare. Run the same bench command again to go on."
+        )
+    return dataclasses.replace(whole, seeds=seeds, budgets=budgets[:count])
+
+
+def _load(folder: Path, part: Protocol) -> RunResult:
+    result = run_folder.load_run(folder) if run_folder.is_done(folder) else _unfinished(folder)
+    episodes, whole = part.budgets[-1], len(result.checkpoints) == len(part.budgets)
+    return dataclasses.replace(
+        result,
+        checkpoints=result.checkpoints[: len(part.budgets)],
+        training_success=result.training_success[:episodes],
+        training_length=result.training_length[:episodes],
+        imagined=result.imagined if whole else (),
+        courses=result.courses if whole else (),
+    )
+
+
+def _unfinished(folder: Path) -> RunResult:
+    snapshot = load_newest(folder / "checkpoints")
+    assert snapshot is not None, "a run that has reached a budget has a checkpoint"
+    config, counters = read_json(folder / "config.json", "a run's configuration"), Counters.of(snapshot)
+    training = counters.training()
+    return RunResult(
+        agent=config["agent"],
+        seed=config["seed"],
+        checkpoints=tuple(counters.rows),
+        settings=config["settings"],
+        training_success=training["success"],
+        training_length=training["length"],
+        imagined=(),
+        folder=folder,
+        recording=None,
+    )
