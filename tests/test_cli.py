@@ -118,7 +118,8 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(tmp_path: Path) -> N
     ]
     assert "Traceback" not in done.stderr
     assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()
-    assert main(["report", str(folder)]) == 2  # what is missing is never left out
+    assert main(["report", str(folder)]) == 0
+    assert "Missing are failing seed 1: 0 of 5" in capsys.readouterr().out, "what is missing is never left out"
 
 
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
