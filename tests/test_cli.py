@@ -106,7 +106,7 @@ def test_settings_are_json_where_they_can_be() -> None:
         parse_settings(["a=1", "a=2"])
 
 
-def test_a_failing_seed_fails_the_command_and_names_its_log(tmp_path: Path) -> None:
+def test_a_failing_seed_fails_the_command_and_names_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = bench_words(tmp_path, "--agents", "failing", "--seeds", "0", "1", "--budgets", "5", "--workers", "1")
     command = [sys.executable, str(_HERE / "bench_fakes.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
