@@ -81,6 +81,11 @@ class RegressionResult:
                 f"{len(found)}; missing: {sorted(wanted - set(found)) or 'none'}. Run the same bench command again."
             )
 
+    @property
+    def protocol_hash(self) -> str:
+        """The hash of the protocol, which names the bench's folder."""
+        return self.protocol.hash
+
     def of(self, agent: str) -> tuple[RegressionRun, ...]:
         """The runs of one regressor, in the order of the protocol's seeds."""
         by_seed = {run.seed: run for run in self.runs if run.agent == agent}
