@@ -106,7 +106,7 @@ SPEC = TaskSpec(
         error_mm=5.0,
         physics_per_cpu_s=60,
         kinematic_per_cpu_s=5_000,
-        encoders={"clean": 0.995, "mild": 0.995},
+        encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
     ),
     presets=_PRESETS,
 )
