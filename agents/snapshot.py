@@ -76,7 +76,8 @@ def _require_same_names(given: Collection[str], own: Collection[str]) -> None:
 
 
 def _require_equal(name: str, given: Any, own: Any) -> None:
-    if isinstance(own, dict) and isinstance(given, dict) and set(given) == set(own):
+    if isinstance(own, dict) and isinstance(given, dict):
+        _require_same_names(given, own)
         for key in own:
             _require_equal(f"{name}.{key}", given[key], own[key])
     elif given != own:
