@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.comparison import compare_rollout
-from imagine_bench.interfaces import ImaginedRollout, Imaginer, Rules, TaskSpec
+from imagine_bench.interfaces import Frame, ImaginedRollout, Imaginer, Rules, TaskSpec
 from imagine_bench.results import ComparedRollout, OpenLoop
 from imagine_bench.seeding import Purpose, SeedTree
 
@@ -155,11 +155,34 @@ def imagine_courses(
     rng = SeedTree(0).child("evaluation", "courses", spec.id).generator()
     start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
     frame = spec.render_macrostates(start[None], appearance, rng)[0]
+    return courses_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)
+
+
+def courses_from(
+    agent: Imaginer,
+    spec: TaskSpec,
+    *,
+    frame: Frame,
+    macrostate: NDArray[np.int64],
+    appearance: str,
+    seeds: SeedTree,
+) -> tuple[ComparedRollout, ...]:
+    """Imagine one beginning several times, the agent's greedy controller choosing.
+
+    Args:
+        agent: It is not changed.
+        spec: The task.
+        frame: The real frame it begins with. Shape (64, 64, 3).
+        macrostate: What that frame shows. Shape (M,).
+        appearance: Appearance level of the real counterparts.
+        seeds: Names the generators that imagination and reality draw from.
+    """
+    rng = seeds.child("reality").generator()
     return tuple(
         compare_rollout(
             spec,
             frame=frame,
-            macrostate=start,
+            macrostate=macrostate,
             rollout=agent.imagine(frame, actions=None, depth=COURSE_DEPTH, rng=seeds.child(index).generator()),
             appearance=appearance,
             rng=rng,

@@ -11,12 +11,13 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
+from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
-from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
+from imagine_bench.interfaces import Agent, Frame, ImaginedRollout, Motion, Observation, Shape3D
 from imagine_bench.recording import episodes, q_table, record_run, recording_file
 from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
 
@@ -81,6 +82,28 @@ def test_on_the_depth_timeline_only_the_first_start_is_real(imagined: Path) -> N
         for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
     ]
     assert depths == [0]
+
+
+class _HandsOver(FakeImaginer):
+    """Acts and imagines within the four macro-actions of pick-and-place."""
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        return 3
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        return super().imagine(frame, actions=rng.integers(4, size=depth), depth=depth, rng=rng)
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        return np.arange(4, dtype=np.float32)
+
+
+def test_where_chance_plays_several_courses_are_shown_and_elsewhere_not(imagined: Path, tmp_path: Path) -> None:
+    options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
+    path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
+    assert contents(path)["/imagined/courses"] >= {"sim_time", "env_step", "episode"}
+    assert "/imagined/courses" not in contents(imagined)
 
 
 def test_application_and_blueprint(imagined: Path) -> None:

@@ -16,7 +16,7 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
     """The 3D scene, seen from beside the human's hand."""
     return rrb.Spatial3DView(
         origin=ROOT,
-        name="The scene: the arm turns cubes, a human points",
+        name="The scene: the arm acts, a human gestures",
         eye_controls=rrb.EyeControls3D(
             position=target_m + _EYE_FROM_TARGET_M, look_target=target_m, eye_up=[0.0, 0.0, 1.0]
         ),
@@ -25,13 +25,14 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
     )
 
 
-def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) -> rrb.Blueprint:
+def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool) -> rrb.Blueprint:
     """The layout: the scene large, beside it what the agent sees, says and expects, below it what it imagines.
 
     Args:
         target_m: What the 3D view looks at. Shape (3,).
         values: Whether the agent has Q-values.
         imagines: Whether the agent imagines.
+        several: Whether it imagines several courses from each frame.
     """
     scene = scene_view(target_m)
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
@@ -42,7 +43,7 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool) ->
     top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.1, 1.0])
     pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
     if imagines:
-        pages = [_imagined_now(), *pages, _by_depth()]
+        pages = [_imagined_now(), *([_courses()] if several else []), *pages, _by_depth()]
     bottom = rrb.Tabs(*pages, active_tab=0)
     return rrb.Blueprint(
         rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]),
@@ -64,6 +65,14 @@ def _imagined_now() -> rrb.Horizontal:
         plot_legend=rrb.PlotLegend(visible=False),
     )
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
+
+
+def _courses() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(
+        origin="/imagined/courses",
+        name="Several futures imagined from the current frame: blue words are possible, orange ones are not",
+        background=[255, 255, 255],
+    )
 
 
 def _over_time(*, values: bool) -> rrb.Horizontal:

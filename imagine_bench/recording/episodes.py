@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.comparison import compare_rollout
+from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.files import make_folder
+from imagine_bench.imagination_quality import courses_from, is_random
 from imagine_bench.interfaces import Agent, Frame, Imaginer, Observation, SceneReader, TaskSpec, ValueReader
 from imagine_bench.pictures import png, rgb, rollout_strip
 from imagine_bench.recording.blueprint import blueprint
@@ -73,6 +75,7 @@ def record_run(
             target_m=look_target_m(scene),
             values=isinstance(agent, ValueReader),
             imagines=isinstance(agent, Imaginer),
+            several=isinstance(agent, Imaginer) and is_random(spec.rules),
         )
         with recording_file(path, task, layout) as recording:
             story = _Story(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
@@ -238,8 +241,18 @@ class _Story:
         strip = png(rollout_strip(compared, self._spec.action_names, columns=IMAGINED_DEPTH))
         self._recording.log("/imagined/strip", rr.EncodedImage(contents=strip, media_type="image/png"), strict=True)
         self._uncertainty_bars(compared)
+        if is_random(self._spec.rules):
+            self._several(self._agent, frame, macrostate, SeedTree(self._seed).child("courses", episode, step))
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
+
+    def _several(self, agent: Imaginer, frame: Frame, macrostate: NDArray[np.int64], seeds: SeedTree) -> None:
+        """Several imagined courses from here, where what happens next is partly chance."""
+        courses = courses_from(
+            agent, self._spec, frame=frame, macrostate=macrostate, appearance=self._appearance, seeds=seeds
+        )
+        sheet = png(courses_sheet(courses, self._spec))
+        self._recording.log("/imagined/courses", rr.EncodedImage(contents=sheet, media_type="image/png"), strict=True)
 
     def _uncertainty_bars(self, compared: ComparedRollout) -> None:
         """Three bars, side by side, at each depth; none after the rollout's end, so that the axis stays the same."""
