@@ -159,6 +159,23 @@ def test_every_motion_does_what_the_rules_say_within_the_robot_s_limits(world, s
     assert np.abs(world._poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
+@pytest.mark.parametrize("index", range(3))
+def test_gripper_and_object_pass_the_pointing_hand(world, index):
+    state = (0, 0, 0, index)
+    world.place(state, rng())
+    people = world.data.mocap_pos.copy()
+    motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
+    model, hand = world.model, world.model.geom("hand_skin").id
+    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", THINGS[index].name))]
+    closest_m, data = 1.0, mujoco.MjData(model)
+    data.mocap_pos[:] = people
+    for qpos in motion:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
+    assert 0.005 < closest_m < 0.05  # near, so the check is not vacuous, and free
+
+
 def ghost_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
