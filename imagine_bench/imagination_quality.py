@@ -104,7 +104,26 @@ def open_loop(agent: Imaginer, questions: tuple[Question, ...], seeds: SeedTree)
         epistemic=_mean([answer.epistemic for answer in answers]),
         aleatoric=_mean([answer.aleatoric for answer in answers]),
         modal=_mean([answer.modal for answer in answers]),
+        **_detection(correct, answers),
     )
+
+
+def _detection(correct: NDArray[np.bool_], answers: list[ImaginedRollout]) -> dict[str, NDArray[np.float64]]:
+    """How well each uncertainty tells wrong transitions from right ones, by depth, where they began right.
+
+    Args:
+        correct: Shape (starts, D).
+        answers: Length starts.
+    """
+    from imagine_bench.calibration import auroc  # noqa: PLC0415 - scipy loads slowly
+
+    began = np.concatenate([np.ones((len(correct), 1), dtype=np.bool_), correct[:, :-1]], axis=1)
+    found = {"judged": began.sum(axis=0).astype(np.float64)}
+    for kind in ("epistemic", "aleatoric", "modal"):
+        scores = np.array([getattr(answer, kind) for answer in answers], dtype=np.float64)
+        columns = zip(scores.T, correct.T, began.T, strict=True)
+        found[f"auroc_{kind}"] = np.array([auroc(score[b], ~right[b]) for score, right, b in columns])
+    return found
 
 
 def examples(agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree) -> tuple[ComparedRollout, ...]:

@@ -31,6 +31,11 @@ class OpenLoop:
         epistemic: Mean epistemic uncertainty.
         aleatoric: Mean aleatoric uncertainty.
         modal: Mean modal uncertainty.
+        judged: Imagined transitions that began in the right macrostate, so that they can be wrong by themselves.
+        auroc_epistemic: How well epistemic uncertainty finds the wrong ones among those: the probability that a wrong
+            one has the higher uncertainty of two; 0.5 is chance, NaN where none or all are wrong.
+        auroc_aleatoric: The same for aleatoric uncertainty.
+        auroc_modal: The same for modal uncertainty.
     """
 
     count: NDArray[np.int64]
@@ -42,6 +47,10 @@ class OpenLoop:
     epistemic: NDArray[np.float64]
     aleatoric: NDArray[np.float64]
     modal: NDArray[np.float64]
+    judged: NDArray[np.float64]
+    auroc_epistemic: NDArray[np.float64]
+    auroc_aleatoric: NDArray[np.float64]
+    auroc_modal: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

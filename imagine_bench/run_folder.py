@@ -200,7 +200,9 @@ def with_futures(checkpoints: Sequence[Checkpoint], arrays: Mapping[str, NDArray
 
 def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:
     integers = {"count": np.asarray(arrays["count"], dtype=np.int64)}
-    numbers = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "count"}
+    unmeasured = np.full(len(integers["count"]), np.nan)  # by the version that made an older run
+    names = [field.name for field in dataclasses.fields(OpenLoop) if field.name not in integers]
+    numbers = {name: np.asarray(arrays.get(name, unmeasured), dtype=np.float64) for name in names}
     return OpenLoop(**{**numbers, **integers})
 
 

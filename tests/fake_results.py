@@ -92,6 +92,10 @@ def open_loop(rng: np.random.Generator, *, filters: bool) -> OpenLoop:
         epistemic=0.05 * 1.3**depth,
         aleatoric=0.08 * 1.1**depth,
         modal=0.01 * 1.1**depth,
+        judged=np.full(DEPTH, 80.0),
+        auroc_epistemic=0.8 - 0.01 * depth,
+        auroc_aleatoric=0.6 + 0.0 * depth,
+        auroc_modal=np.where(depth == 0, np.nan, 0.5),
     )
 
 

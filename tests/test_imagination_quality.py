@@ -91,6 +91,32 @@ def test_marks_are_right_by_depth(questions: tuple[Question, ...]) -> None:
     assert (loop.epistemic[0], loop.aleatoric[0], loop.modal[0]) == (0.25, 0.5, 0.75)
 
 
+class Doubts(bench_fakes.RulesImaginer):
+    """Wrong at depth 3 in every other rollout, where its epistemic uncertainty is high; modal is high where right."""
+
+    def __init__(self, questions: tuple[Question, ...]) -> None:
+        super().__init__(context())
+        self.questions = questions
+
+    def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
+        (index,) = [i for i, q in enumerate(self.questions) if q.frame is frame and q.actions is actions]
+        blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        states = np.array([only(belief) for belief in self.questions[index].beliefs])
+        epistemic, modal = np.full(depth, 0.1, np.float32), np.full(depth, 0.9, np.float32)
+        if index % 2:
+            states[2:, 3] += 1
+            epistemic[2], modal[2] = 0.8, 0.2
+        return dataclasses.replace(blank, macrostates=states, epistemic=epistemic, modal=modal)
+
+
+def test_uncertainty_is_held_to_the_errors_it_should_find(questions: tuple[Question, ...]) -> None:
+    loop = open_loop(Doubts(questions), questions, SeedTree(0))
+    half = len(questions) // 2
+    assert loop.judged.tolist() == [len(questions)] * 3 + [len(questions) - half] * 7  # after an error nobody is judged
+    assert loop.auroc_epistemic[2] == 1.0 and loop.auroc_modal[2] == 0.0 and loop.auroc_aleatoric[2] == 0.5
+    assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
+
+
 def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
     agent = bench_fakes.RulesImaginer(context())
     first = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
