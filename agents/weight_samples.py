@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .layers import MemberMLP, kept_scale
+from .products import affine
 
 _CHUNK = 4096
 """Rows times samples of one product: activations of 256 units then stay in a core's cache."""
@@ -34,6 +35,8 @@ def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None
         Shape (T, N, out).
     """
     samples = network.members if masks is None else len(masks[0])
+    scale = -kept_scale(network.dropout)  # in a mask -1 keeps a unit and 0 drops it
+    factors = [mask.to(x.dtype).mul_(scale).unsqueeze(1) for mask in masks or ()]  # [T, 1, H] each
     rows = max(1, _CHUNK // samples)
     outputs = x.new_empty((samples, len(x), network.sizes[-1]))
     for start in range(0, len(x), rows):
@@ -41,17 +44,17 @@ def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None
         if masks is None:
             outputs[:, start : start + rows] = network(piece.expand(samples, -1, -1))
         else:
-            outputs[:, start : start + rows] = _masked(network, piece, masks)
+            outputs[:, start : start + rows] = _masked(network, piece, factors)
     return outputs
 
 
-def _masked(network: MemberMLP, x: Tensor, masks: Sequence[Tensor]) -> Tensor:
+def _masked(network: MemberMLP, x: Tensor, factors: Sequence[Tensor]) -> Tensor:
     """One member under T masks: (N, in) to (T, N, out)."""
-    samples, last = len(masks[0]), len(network.weights) - 1
-    factors = [mask.to(x.dtype).mul_(-kept_scale(network.dropout)) for mask in masks]  # -1 keeps a unit, 0 drops it
+    samples, last = len(factors[0]), len(network.weights) - 1
     for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        x = torch.addmm(bias[0], x, weight[0])  # [N, H], from the second layer on [T N, H]
+        x = affine(x.unsqueeze(0), weight, bias).squeeze(0)  # [N, H], from the second layer on [T N, H]
         if layer < last:
-            x = x.relu_().view(samples if layer else 1, -1, x.shape[-1]) * factors[layer].unsqueeze(1)
+            x = x.relu_().view(samples if layer else 1, -1, x.shape[-1])
+            x = x.mul_(factors[layer]) if layer else x * factors[layer]
             x = x.view(-1, x.shape[-1])  # [T N, H]
     return x.view(samples, -1, x.shape[-1])

@@ -15,7 +15,8 @@ from imagine_bench.recording.episodes import recording_file
 from imagine_bench.regression import RegressionSpec
 
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
-_PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (170, 170, 170), (60, 60, 66)
+_PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (150, 150, 150), (190, 190, 196)
+_SHOWN = (-30, 40)
 _TICKS = 100
 """Steps of the timeline per unit of x, which is a sequence."""
 
@@ -51,10 +52,16 @@ def record(
 
 
 def _layout(variants: list[str], name: str) -> rrb.Blueprint:
+    ends = [rrb.TimeRangeBoundary.absolute(seq=x * _TICKS) for x in _SHOWN]
+    axis = rrb.TimeAxis(view_range=rrb.TimeRange(start=ends[0], end=ends[1]))
+
+    def view(variant: str, part: str, words: str) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(origin=f"/{variant}/{part}", name=f"{variant}: {words}", axis_x=axis)
+
     columns = [
         rrb.Vertical(
-            rrb.TimeSeriesView(origin=f"/{variant}/y", name=f"{variant}: data and predictions ({name})"),
-            *(rrb.TimeSeriesView(origin=f"/{variant}/{kind}", name=f"{variant}: {kind} (std of y)") for kind in _KINDS),
+            view(variant, "y", f"data and predictions ({name})"),
+            *(view(variant, kind, f"{kind} (std of y)") for kind in _KINDS),
         )
         for variant in variants
     ]

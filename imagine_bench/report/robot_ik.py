@@ -145,7 +145,7 @@ def _ratio_picture(result: RegressionResult, rng: np.random.Generator) -> Pictur
                 label = "thesis" if index == 0 else None
                 axes.hlines(ratios, index - 0.42, index + 0.42, color="#2b2b2f", linewidth=0.9, label=label)
         axes.axhline(1.0, color="#8c8c8c", linewidth=1, linestyle=(0, (4, 3)))
-        axes.set_xticks(places, [name.replace("_", " ").replace(" plus ", " +\n") for name in SCORES])
+        axes.set_xticks(places, [name.replace("_plus_", " +\n").replace("_", "\n") for name in SCORES])
         axes.set(ylabel="error, as a share of\na random choice's", ylim=(0, None))
         figure.legend(loc="outside right upper", fontsize=8.5)
         return figure

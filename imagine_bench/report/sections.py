@@ -86,7 +86,8 @@ def number(value: float, digits: int = 3) -> str:
         return "–"
     if value and (abs(value) >= 10**5 or abs(value) < 10**-3):
         return f"{value:.{digits - 1}e}".replace("-", "\u2212")
-    return f"{value:.{max(0, digits - len(str(int(abs(value)))))}f}".replace("-", "\u2212")
+    whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
+    return f"{value:.{max(0, digits - whole)}f}".replace("-", "\u2212")
 
 
 def mean_std(values: Sequence[float]) -> str:
