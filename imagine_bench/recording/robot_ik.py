@@ -5,6 +5,7 @@ Timelines: ``sim_time`` (the arm moves), ``choice`` (one a decision). Entities: 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,8 @@ def record(
             _show_candidates(recording, data, points, scores, chosen)
             _say(recording, name, variant, data, choice, chosen, arrived=False)
             motion = scene.movement(data["decision/joints"][0, choice, chosen], _HZ)
+            still = dataclasses.replace(motion, time_s=motion.time_s[:1], poses_in_world=motion.poses_in_world[:1])
+            log_motion(recording, still, start_s=clock_s, sequences={"choice": choice}, only_moved=False)
             log_motion(recording, motion, start_s=clock_s + _LOOK_S, sequences={"choice": choice}, only_moved=False)
             clock_s += _LOOK_S + float(motion.time_s[-1])
             _at(recording, clock_s, choice)
@@ -101,8 +104,9 @@ def _show_candidates(
     ring = points[chosen] + 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_CHOSEN, radii=0.007), strict=True)
     outside_m = data["map/outside_m"]
-    far = int(np.where(outside_m < 0.35, outside_m, 0).argmax())
-    label = f"unreachable: {outside_m[far]:.2f} m outside of the workspace"
+    in_view = (outside_m < 0.2) & (data["map/points"][:, 0] > 0)
+    far = int(np.where(in_view, outside_m, 0).argmax())
+    label = f"unreachable: {outside_m[far]:.2f} m outside"
     place = _lifted(data["map/points"][far])
     recording.log("/choice/outside", rr.Points3D(place, colors=_OUTSIDE, radii=0.022, labels=label), strict=True)
     recording.log("/choice/miss", rr.Clear(recursive=False), strict=True)
