@@ -11,16 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Promises, TaskSpec
 
-from .arrow_rules import N_CUBES, N_DIRECTIONS, ArrowPuzzleRules
+from .arrow_rules import N_CUBES, ArrowPuzzleRules
 from .rules import facts
 
 if TYPE_CHECKING:
-    from .arrow_world import ArrowWorld
     from .macro_env import MacroEnv
-    from .rendering import Renderer
 
 HORIZON = 10
 _DIRECTIONS = ("toward the human", "right", "toward the agent", "left")
@@ -44,43 +41,12 @@ _PROMISES = Promises(
 )
 
 
-@functools.lru_cache(maxsize=3)
-def _studio(appearance: str) -> tuple[ArrowWorld, Renderer]:
-    """One scene and eye a process and level, for pictures of macrostates."""
-    from .arrow_world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
-    from .macro_env import agent_eye  # noqa: PLC0415
-    from .scenes.appearance import appearance as level  # noqa: PLC0415
-
-    world = ArrowWorld(level(appearance))
-    return world, agent_eye(world.model)
-
-
 def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode.
+    """Frames of macrostates in the kinematic mode; see :func:`.studio.frames_of`."""
+    from .arrow_world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
+    from .studio import frames_of  # noqa: PLC0415
 
-    Args:
-        macrostates: Any of the 192. Shape (N, 4).
-        appearance: A level's name.
-        rng: Draws the variation.
-
-    Returns:
-        Shape (N, 64, 64, 3), uint8.
-
-    Raises:
-        UnknownNameError: No such appearance.
-        InvalidValueError: Macrostates of another shape or out of range.
-    """
-    from .macro_env import frames_of  # noqa: PLC0415
-    from .scenes.appearance import appearance as level  # noqa: PLC0415
-
-    macrostates = np.asarray(macrostates)
-    tops = np.array([N_DIRECTIONS] * N_CUBES + [N_CUBES])
-    if macrostates.ndim != 2 or macrostates.shape[1] != len(tops) or not np.issubdtype(macrostates.dtype, np.integer):
-        raise InvalidValueError(f"Macrostates must be integers of shape (N, {len(tops)}), not {macrostates.shape}.")
-    if ((macrostates < 0) | (macrostates >= tops)).any():
-        raise InvalidValueError(f"Macrostates must lie below {tops.tolist()} in each coordinate and not be negative.")
-    world, eye = _studio(level(appearance).name)
-    return frames_of(world, macrostates, eye, rng)
+    return frames_of(ArrowWorld, SPEC.rules, macrostates, appearance, rng)
 
 
 def _spec(*, hard: bool) -> TaskSpec:

@@ -319,16 +319,6 @@ def _picture_size(width: int, height: int) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def frames_of(world: World, macrostates: NDArray[np.int64], eye: Renderer, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates (N, M), each placed and varied anew. Shape (N, 64, 64, 3), uint8."""
-    frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
-    for row, macrostate in enumerate(macrostates.tolist()):
-        world.place(tuple(macrostate), rng)
-        world.vary(rng)
-        frames[row] = eye.frame(world.data)
-    return frames
-
-
 def agent_eye(model: mujoco.MjModel) -> Renderer:
     """The agent's view of a model."""
     return Renderer(model, _AGENT_VIEW)

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Promises, TaskSpec
 
 from .pick_place_rules import N_OBJECTS, PickPlaceRules
-from .rules import facts, require_macrostates
+from .rules import facts
 
 if TYPE_CHECKING:
     from .macro_env import MacroEnv
-    from .pick_world import PickWorld
-    from .rendering import Renderer
 
 HORIZON = 50
 """Of no weight: an optimal agent needs 6 actions on average and is cut off once in 25,000 episodes."""
@@ -27,38 +25,12 @@ _OBJECTS = ("ball", "car", "cup")
 _PLACES = ("left", "middle", "right")
 
 
-@functools.lru_cache(maxsize=3)
-def _studio(appearance: str) -> tuple[PickWorld, Renderer]:
-    """One scene and eye a process and level, for pictures of macrostates."""
-    from .macro_env import agent_eye  # noqa: PLC0415  (MuJoCo loads on the first frame)
-    from .pick_world import PickWorld  # noqa: PLC0415
-    from .scenes.appearance import appearance as level  # noqa: PLC0415
-
-    world = PickWorld(level(appearance))
-    return world, agent_eye(world.model)
-
-
 def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode.
+    """Frames of macrostates in the kinematic mode; see :func:`.studio.frames_of`."""
+    from .pick_world import PickWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
+    from .studio import frames_of  # noqa: PLC0415
 
-    Args:
-        macrostates: Any of the 19. Shape (N, 4).
-        appearance: A level's name.
-        rng: Draws the variation.
-
-    Returns:
-        Shape (N, 64, 64, 3), uint8.
-
-    Raises:
-        UnknownNameError: No such appearance.
-        InvalidValueError: Macrostates of another shape, or none of the rules'.
-    """
-    from .macro_env import frames_of  # noqa: PLC0415
-    from .scenes.appearance import appearance as level  # noqa: PLC0415
-
-    macrostates = require_macrostates(_RULES, macrostates)
-    world, eye = _studio(level(appearance).name)
-    return frames_of(world, macrostates, eye, rng)
+    return frames_of(PickWorld, _RULES, macrostates, appearance, rng)
 
 
 _CHAPTER_3 = ("dqn", "imagination_only")

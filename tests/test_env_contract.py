@@ -262,8 +262,8 @@ def test_a_wrong_action_is_refused(kinematic, action):
     [
         (np.zeros((2, 3), np.int64), r"of shape \(N, 4\), not \(2, 3\)"),
         (np.zeros((2, 4)), r"must be integers"),
-        (np.full((1, 4), 3), r"must lie below \[4, 4, 4, 3\]"),
-        (np.full((1, 4), -1), r"not be negative"),
+        (np.full((1, 4), 3), r"No macrostate \(3, 3, 3, 3\); give one of 192, such as \(0, 0, 0, 0\)"),
+        (np.full((1, 4), -1), r"No macrostate \(-1, -1, -1, -1\)"),
     ],
 )
 def test_render_macrostates_refuses_what_is_none(macrostates, message):

@@ -1,0 +1,54 @@
+"""Frames of macrostates that nobody acted for: one scene and one eye a process, world and appearance level."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, Rules
+
+from .macro_env import FRAME_PX, World, agent_eye
+from .rendering import Renderer
+from .rules import require_macrostates
+from .scenes.appearance import Appearance
+from .scenes.appearance import appearance as appearance_level
+
+MakeWorld = Callable[[Appearance], World]
+
+
+@functools.lru_cache(maxsize=8)
+def _studio(make_world: MakeWorld, level: Appearance) -> tuple[World, Renderer]:
+    world = make_world(level)
+    return world, agent_eye(world.model)
+
+
+def frames_of(
+    make_world: MakeWorld, rules: Rules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator
+) -> Frame:
+    """Frames of macrostates in the kinematic mode, each placed and varied anew.
+
+    Args:
+        make_world: The task's world, at an appearance level.
+        rules: Which macrostates there are.
+        macrostates: Any of them. Shape (N, M).
+        appearance: A level's name.
+        rng: Draws the variation.
+
+    Returns:
+        Shape (N, 64, 64, 3), uint8.
+
+    Raises:
+        UnknownNameError: No such appearance.
+        InvalidValueError: Macrostates of another shape or type, or none of the rules'.
+    """
+    macrostates = require_macrostates(rules, macrostates)
+    world, eye = _studio(make_world, appearance_level(appearance))
+    frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
+    for row, macrostate in enumerate(macrostates.tolist()):
+        world.place(tuple(macrostate), rng)
+        world.vary(rng)
+        frames[row] = eye.frame(world.data)
+    return frames
