@@ -63,9 +63,8 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     """
     config = read_json(folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
     protocol = Protocol.from_dict(config["protocol"])
-    settings = tuple(sorted(_flat(config["settings"]).items()))
     spec = RunSpec(
-        protocol=dataclasses.replace(protocol, overrides=settings),  # as it ran, whatever the presets say by now
+        protocol=protocol,
         agent=config["agent"],
         seed=config["seed"],
         encoder=_encoder(protocol, config["agent"], encoder),
@@ -73,7 +72,9 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
-    agent = registry.make_agent(spec.agent, spec.context())
+    settings = tuple(sorted(_flat(config["settings"]).items()))
+    as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
+    agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
     agent.restore(snapshot.agent)
     return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
 
