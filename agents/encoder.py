@@ -19,7 +19,9 @@ from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueE
 from imagine_bench.interfaces import Frame
 from imagine_bench.preprocessing import PREPROCESSING, join_strips, preprocess
 
+from .coder import Coder
 from .encoder_recipes import Recipe
+from .parts import PartsCoder
 from .probe import Probe
 from .vae import Vae, build_vae
 
@@ -51,6 +53,7 @@ class EncoderCard:
         reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
         probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
             ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
+        code_sizes: Where latents are one-hot codes of parts: the number of values of each part; else empty.
     """
 
     task: str
@@ -68,6 +71,7 @@ class EncoderCard:
     kl_nats: float
     reconstruction: float
     probe: dict[str, float]
+    code_sizes: tuple[int, ...] = ()
 
     def to_json(self) -> str:
         """The card as indented JSON."""
@@ -86,7 +90,8 @@ class EncoderCard:
                 raise InvalidValueError("its format is another one")
             recipe = values.pop("recipe")
             recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
-            tuples: dict[str, Any] = {key: tuple(values.pop(key)) for key in ("macrostate_names", "cardinalities")}
+            names = ("macrostate_names", "cardinalities", "code_sizes")
+            tuples: dict[str, Any] = {key: tuple(values.pop(key)) for key in names if key in values}
             card = cls(recipe=recipe, **tuples, **values)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise InvalidValueError(f"Not an {FORMAT} card: {error}.") from error
@@ -99,17 +104,17 @@ class Encoder:
     """Frames to latents and back, with no gradient and no randomness.
 
     Args:
-        vae: The trained network.
+        coder: The trained network.
         probe: The evaluation-only reader of the macrostate.
         card: Its origin.
         device: A torch device name.
     """
 
-    def __init__(self, vae: Vae, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
+    def __init__(self, coder: Coder, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
         self.card = card
         self.latent_size = card.latent_size
         self.device = torch.device(device)
-        self._vae = vae.to(self.device).requires_grad_(False).eval()
+        self._coder = coder.to(self.device).requires_grad_(False).eval()
         self._probe = probe.to(self.device).requires_grad_(False).eval()
         self._preprocess = preprocess(card.preprocessing)
 
@@ -140,14 +145,28 @@ class Encoder:
 
     def _encode_chunk(self, frames: Frame) -> tuple[Tensor, Tensor]:
         pictures = torch.from_numpy(self._preprocess(frames)).to(self.device)
-        mu, log_variance = self._vae.posterior(pictures)
+        mu, log_variance = self._coder.posterior(pictures)
         return mu, (0.5 * log_variance).exp()
+
+    def codes(self, frame: Frame) -> tuple[int, ...]:
+        """The value of each part of one frame (64, 64, 3), where latents are codes; P integers.
+
+        Raises:
+            InvalidValueError: Its latents are continuous.
+        """
+        if not self.card.code_sizes:
+            raise InvalidValueError(
+                f"This agent reads codes of parts, and the encoder {self.card.recipe.name!r} of {self.card.task} gives "
+                "continuous latents; give one made with `imagine-bench encoder --recipe codes`."
+            )
+        hot = self.encode(frame[None])[0][0]
+        return tuple(int(part.argmax()) for part in hot.split(self.card.code_sizes))
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.float32]:
         """One picture of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
         _, height, width = picture_shape(self.card.preprocessing)
-        return view(self._vae.picture(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
+        return view(self._coder.picture(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
 
     def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
         """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
@@ -163,7 +182,7 @@ class Encoder:
         refuse_existing(path, card_path)
         tensors = {
             f"{name}.{key}": value.half().contiguous().cpu()
-            for name, module in (("vae", self._vae), ("probe", self._probe))
+            for name, module in (("vae", self._coder), ("probe", self._probe))
             for key, value in module.state_dict().items()
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -185,14 +204,14 @@ class Encoder:
             with safe_open(path, framework="pt") as file:
                 card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
                 tensors = {key: file.get_tensor(key).float() for key in file.keys()}
-            vae = empty_vae(card.recipe, card.preprocessing)
-            probe = empty_probe(vae.latent_size, card.cardinalities)
-            _fill(vae, tensors, "vae.")
+            coder = empty_coder(card)
+            probe = empty_probe(coder.latent_size, card.cardinalities)
+            _fill(coder, tensors, "vae.")
             _fill(probe, tensors, "probe.")
         except (OSError, SafetensorError, RuntimeError, ImagineBenchError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
-        return cls(vae, probe, card, device)
+        return cls(coder, probe, card, device)
 
 
 def bundled_encoder(name: str) -> Path:
@@ -224,8 +243,16 @@ def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float3
     return np.ascontiguousarray(np.moveaxis(pictures, 1, -1), dtype=np.float32)
 
 
+def empty_coder(card: EncoderCard) -> Coder:
+    """The network that a card describes, on the meta device."""
+    if card.recipe.kind == "latents":
+        return empty_vae(card.recipe, card.preprocessing)
+    with torch.device("meta"):
+        return PartsCoder(card.code_sizes, *picture_shape(card.preprocessing))
+
+
 def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:
-    """The network of a recipe on the meta device: shapes without weights, and no random numbers drawn."""
+    """The VAE of a recipe on the meta device: shapes without weights, and no random numbers drawn."""
     with torch.device("meta"):
         return build_vae(recipe, *picture_shape(preprocessing))
 

@@ -8,7 +8,7 @@ import torch
 from tqdm import tqdm
 
 from imagine_bench.errors import require_known
-from imagine_bench.interfaces import APPEARANCES, TaskSpec
+from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
 from imagine_bench.seeding import SeedTree
 
 from .encoder import Encoder, EncoderCard, bundled_encoder, refuse_existing
@@ -25,7 +25,8 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         recipe: A name among the task's ``RECIPES``, or settings of one's own.
         appearance: Appearance level of the frames.
         seed: Root of the seed tree.
-        out: Folder for ``<encoder>-<appearance>.safetensors``, ``.json`` and ``.png``; made if missing.
+        out: Folder for ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes),
+            ``.json`` and ``.png``; made if missing.
 
     Returns:
         A few lines for a person: where it is, and how it compares to the bundled encoder.
@@ -36,7 +37,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         DivergedError: The loss became NaN or infinite.
     """
     recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
-    name = f"{spec.encoder}-{require_known('appearance', appearance, APPEARANCES)}"
+    name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
     path = out / f"{name}.safetensors"
     refuse_existing(path, path.with_suffix(".json"), path.with_suffix(".png"))
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}") as bar:

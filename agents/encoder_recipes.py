@@ -16,7 +16,8 @@ class Recipe:
     Attributes:
         name: Name in its chapter's :data:`RECIPES`.
         architecture: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel
-            on its own, ``"picture"`` all together.
+            on its own, ``"picture"`` all together; or ``"parts"``: one categorical code a part of the scene, which has
+            no gradient steps and no number of latents to choose.
         latents: Latents of the whole picture, or of each strip.
         widths: Hidden units of the small network, from the pixels to the latents.
         pixel_std: Standard deviation of Gaussian pixels, in units of the contrast.
@@ -45,6 +46,11 @@ class Recipe:
     learning_rate: float = 5e-4
     cosine: bool = False
     probe_steps: int = 4000
+
+    @property
+    def kind(self) -> str:
+        """What the encoder gives: ``"latents"`` (continuous) or ``"codes"`` (categorical)."""
+        return "codes" if self.architecture == "parts" else "latents"
 
     def __post_init__(self) -> None:
         if min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps) < 1:
@@ -93,10 +99,17 @@ _CHAPTER_3 = Recipe(
     batch=64,
     learning_rate=1e-4,
 )
+_CODES = Recipe(
+    name="codes",
+    architecture="parts",
+    frames=8000,  # parts and values are found in 6000 of them
+    held_out_frames=4000,
+    probe_steps=1000,  # one-hot codes are easy to read
+)
 
 RECIPES: dict[str, dict[str, Recipe]] = {
-    "chapter_3": {"thesis": _CHAPTER_3, "default": _PICTURE},
-    "chapter_5": {"thesis": Recipe(name="thesis"), "default": _STRIPS},
+    "chapter_3": {"thesis": _CHAPTER_3, "default": _PICTURE, "codes": _CODES},
+    "chapter_5": {"thesis": Recipe(name="thesis"), "default": _STRIPS, "codes": _CODES},
 }
 """By the family of settings that a task names."""
 

@@ -1,4 +1,7 @@
-"""Make an encoder: render frames, train the VAE, fit the evaluation-only probe, measure on fresh frames."""
+"""Make an encoder: render frames, train the VAE or discover the parts, fit the evaluation-only probe, measure.
+
+Every measurement is on fresh frames.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,12 @@ from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.seeding import SeedTree
 
+from .coder import Coder
 from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
 from .encoder_recipes import Recipe, recipe_named
+from .parts import PartsCoder, discover
 from .probe import Latents, Probe, accuracy, train_probe
-from .vae import MlpVae, Vae, kl_from_standard_normal
+from .vae import MlpVae, Vae
 from .weights import initialise
 
 Progress = Callable[[str, float], None]
@@ -141,19 +146,25 @@ def train_encoder(
     held_out = frame_set(spec, appearance, recipe.held_out_frames, probe_seeds.generator(), progress)
     clock.lap("frames")
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
-    vae = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
+    coder: Coder
+    if recipe.kind == "codes":
+        coder = _rounded_to_half(discover(data.batch(torch.arange(recipe.frames)), generator))
+    else:
+        coder = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
     clock.lap("training")
     cardinalities = tuple(len(values) for values in spec.macrostate_values)
-    latents = latents_of(vae, data)
+    latents = latents_of(coder, data)
     probe, linear = (
-        _trained_probe(vae, hidden, cardinalities, latents, data, recipe, generator) for hidden in (PROBE_HIDDEN, 0)
+        _trained_probe(coder.latent_size, hidden, cardinalities, latents, data, recipe, generator)
+        for hidden in (PROBE_HIDDEN, 0)
     )
     clock.lap("probe")
     progress("probe", 1.0)
     noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
-    measured = _measure(vae, probe, linear, held_out, noise)
-    card = _card(spec, recipe, appearance, seed, latent_size=vae.latent_size, cpu_s=clock.seconds(), **measured)
-    return Encoder(vae, probe, card)
+    measured = _measure(coder, probe, linear, held_out, noise)
+    sizes = coder.code_sizes if isinstance(coder, PartsCoder) else ()
+    measured |= {"latent_size": coder.latent_size, "code_sizes": sizes, "cpu_s": clock.seconds()}
+    return Encoder(coder, probe, _card(spec, recipe, appearance, seed, **measured))
 
 
 def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured: Any) -> EncoderCard:
@@ -200,7 +211,7 @@ def _trained_vae(
 
 
 def _trained_probe(
-    vae: Vae,
+    latent_size: int,
     hidden: int,
     cardinalities: tuple[int, ...],
     latents: Latents,
@@ -208,7 +219,7 @@ def _trained_probe(
     recipe: Recipe,
     generator: torch.Generator,
 ) -> Probe:
-    probe = empty_probe(vae.latent_size, cardinalities, hidden).to_empty(device="cpu")
+    probe = empty_probe(latent_size, cardinalities, hidden).to_empty(device="cpu")
     train_probe(probe, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
     return _rounded_to_half(probe)
 
@@ -222,20 +233,22 @@ def _rounded_to_half(network: _Network) -> _Network:
 
 
 @torch.no_grad()
-def latents_of(vae: Vae, data: FrameSet) -> Latents:
+def latents_of(coder: Coder, data: FrameSet) -> Latents:
     """The latents of every frame."""
-    parts = [vae.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK)]
+    parts = [coder.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK)]
     mu, log_variance = (torch.cat(column) for column in zip(*parts, strict=True))
     return Latents(mu=mu, sigma=(0.5 * log_variance).exp())
 
 
-def _measure(vae: Vae, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator) -> dict[str, Any]:
+def _measure(
+    coder: Coder, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
+) -> dict[str, Any]:
     """What the card says of an encoder on frames that no training saw."""
-    latents, right = latents_of(vae, held_out), held_out.macrostates
-    kl = kl_from_standard_normal(latents.mu, 2.0 * latents.sigma.log())
+    latents, right = latents_of(coder, held_out), held_out.macrostates
+    kl = coder.information(latents.mu, 2.0 * latents.sigma.log())
     return {
         "kl_nats": round(kl.mean().item(), 3),
-        "reconstruction": _squared_error(vae, held_out, latents),
+        "reconstruction": _squared_error(coder, held_out, latents),
         "probe": {
             "linear": accuracy(linear, latents.mu, right),
             "mlp": accuracy(probe, latents.mu, right),
@@ -245,10 +258,10 @@ def _measure(vae: Vae, probe: Probe, linear: Probe, held_out: FrameSet, generato
 
 
 @torch.no_grad()
-def _squared_error(vae: Vae, data: FrameSet, latents: Latents) -> float:
+def _squared_error(coder: Coder, data: FrameSet, latents: Latents) -> float:
     """Squared error of the mean latents' pictures, mean a pixel."""
     total = 0.0
     for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK):
         pictures = data.batch(rows)
-        total += (vae.mean(latents.mu[rows]) - vae.target(pictures)).square().sum().item()
-    return total / vae.target(data.batch(torch.arange(1))).numel() / len(data.pictures)
+        total += (coder.mean(latents.mu[rows]) - coder.target(pictures)).square().sum().item()
+    return total / coder.target(data.batch(torch.arange(1))).numel() / len(data.pictures)

@@ -85,6 +85,11 @@ def flatten(settings: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def names() -> frozenset[str]:
+    """The dotted names of all settings."""
+    return frozenset(flatten(Settings()))
+
+
 def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> Settings:
     """The settings of a preset, with single ones replaced.
 
@@ -100,7 +105,7 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> Settings:
     chosen = FAMILIES[require_known("settings family", family, FAMILIES)]
     deviations = chosen.presets[require_known("preset", preset, chosen.presets)]
     values = {name: deviation.value for name, deviation in deviations.items()}
-    settings = _with_values(chosen.thesis, {**values, **overrides})
+    settings = checked_values(chosen.thesis, {**values, **overrides})
     _require_ranges(settings)
     return settings
 
@@ -128,8 +133,14 @@ def _require_ranges(settings: Settings) -> None:
             raise InvalidValueError(f"Setting {name} is {value}; it {allowed.words}.")
 
 
-def _with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    known = flatten(Settings())
+def checked_values(settings: Any, values: Mapping[str, Any]) -> Any:
+    """Settings of two levels with single ones replaced by dotted name, each checked against its declared type.
+
+    Raises:
+        UnknownNameError: No such setting; the message lists what exists.
+        InvalidValueError: A value of the wrong type.
+    """
+    known = flatten(settings)
     sections: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         if name not in known:

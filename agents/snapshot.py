@@ -43,21 +43,22 @@ def jsonable(values: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-_ROWS_VARY = ("real/", "imagination/memory/", "rehearsal/memory/", "starts/")
+_ROWS_VARY = ("real/", "imagination/memory/", "rehearsal/memory/", "starts/", "memory/")
 
 
-def require_fit(given: AgentState, own: AgentState) -> None:
+def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = ("filtered", "settings")) -> None:
     """Check a snapshot against the agent's own: settings, names of values, and names, types and shapes of arrays.
 
     Args:
         given: The snapshot.
         own: The agent's present state.
+        equal: Values that must be the same in both.
 
     Raises:
         ArtefactError: It does not fit; the message names the first difference.
     """
     _require_same_names(given.values, own.values)
-    for part in ("filtered", "settings"):
+    for part in equal:
         _require_equal(part, given.values[part], own.values[part])
     _require_same_names(given.arrays, own.arrays)
     for name, ours in own.arrays.items():

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from imagine_bench.errors import require_known
 
+from .coder import Coder
 from .encoder_recipes import ARCHITECTURES, Recipe
 
 _LEAST_CONTRAST = 0.005  # of full scale; parts about as flat as this are amplified less
@@ -45,22 +46,8 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
     return -0.5 * (1.0 + log_variance - mu.square() - log_variance.exp()).sum(dim=1)  # [N]
 
 
-class Vae(nn.Module, abc.ABC):
-    """What the two architectures share.
-
-    Attributes:
-        latent_size: Latents Z of a whole picture.
-    """
-
-    latent_size: int
-
-    @abc.abstractmethod
-    def target(self, pictures: Tensor) -> Tensor:
-        """What :meth:`mean` should give back for ``pictures`` (N, C, H, W), in the network's own units."""
-
-    @abc.abstractmethod
-    def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log variance of the latents of ``pictures`` (N, C, H, W). Two tensors of shape (N, Z)."""
+class Vae(Coder):
+    """What the two architectures share."""
 
     @abc.abstractmethod
     def generate(self, latents: Tensor) -> Tensor:
@@ -74,9 +61,9 @@ class Vae(nn.Module, abc.ABC):
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
         """-log p(target | latents) up to a constant, a SUM over pixels. Shape (N,)."""
 
-    @abc.abstractmethod
-    def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
-        """The picture of ``latents`` (N, Z) as a person would see it. Shape (N, C, height, width), in [0, 1]."""
+    def information(self, mu: Tensor, log_variance: Tensor) -> Tensor:
+        """KL from the standard normal."""
+        return kl_from_standard_normal(mu, log_variance)
 
     def elbo(self, pictures: Tensor, noise: Tensor, beta: float) -> Elbo:
         """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of a batch.
@@ -225,7 +212,7 @@ class HaSchmidhuberVae(Vae):
 
 
 def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
-    """The network of a recipe for pictures of shape (C, H, W), with whatever weights torch initialises it to.
+    """The VAE of a recipe for pictures of shape (C, H, W), with whatever weights torch initialises it to.
 
     Raises:
         UnknownNameError: The recipe names an unknown architecture.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import encoders, registry
 from imagine_bench.environment import describe_environment, gl_renderer
-from imagine_bench.errors import RunFailedError
+from imagine_bench.errors import InvalidValueError, RunFailedError, UnknownNameError
 from imagine_bench.kinds import kind_of, require_options
 from imagine_bench.launchers import Failure, Job, Launcher
 from imagine_bench.progress import ProgressBars
@@ -17,13 +17,16 @@ from imagine_bench.protocol import Protocol, protocol
 from imagine_bench.runs import Observer, Progress, RunSpec
 from imagine_bench.store import BenchStore, load_bench
 
-_CHECK_OVERRIDES = "imagine_bench.agents.presets:resolve"
 _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
 _NOTE_EVERY_S = 10.0
 
 
-def plan(task: str, preset: str, **options: Any) -> tuple[Any, Path | None]:
-    """The protocol of a bench and the encoder it uses, with everything checked that can be before anything is run.
+Encoders = Mapping[str, Path]
+"""The encoder artefacts of a bench, by kind; none where nothing needs one."""
+
+
+def plan(task: str, preset: str, **options: Any) -> tuple[Any, Encoders]:
+    """The protocol of a bench and the encoders it uses, with everything checked that can be before anything is run.
 
     Args:
         task: Registered task of any kind.
@@ -38,19 +41,20 @@ def plan(task: str, preset: str, **options: Any) -> tuple[Any, Path | None]:
         SetupError: The device does not exist here.
     """
     require_options(task, {name: value for name, value in options.items() if name != "encoder"})
-    planned: tuple[Any, Path | None] = registry.load(kind_of(task).plan)(task, preset, **options)
+    planned: tuple[Any, Encoders] = registry.load(kind_of(task).plan)(task, preset, **options)
     return planned
 
 
 def plan_control(
     task: str, preset: str, *, encoder: str | None = None, **changes: object
-) -> tuple[Protocol, Path | None]:
-    """The protocol of a control bench and the encoder it uses.
+) -> tuple[Protocol, Encoders]:
+    """The protocol of a control bench and the encoders it uses.
 
     Args:
         task: Registered task.
         preset: Name of a protocol preset.
-        encoder: Bundled name or path, instead of the task's own.
+        encoder: Bundled name or path, instead of the task's own. One that gives codes is for every agent, one that
+            gives latents for those that read latents.
         changes: Fields of the protocol that differ from the preset's.
 
     Raises:
@@ -60,21 +64,56 @@ def plan_control(
         SetupError: The device does not exist here.
     """
     wanted = protocol(task, preset, **changes)
-    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides), wanted.settings)
+    check_overrides(wanted)
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
-    if encoder is None and not any(registry.agent_entry(agent).needs_encoder for agent in wanted.agents):
-        return wanted, None
-    path = encoders.resolve(registry.task(task), wanted.appearance, encoder)
-    return protocol(task, preset, **{**changes, "encoder": encoders.identity(path)}), path
+    paths = _encoders(wanted, encoder)
+    names = {"encoder": "latents", "codes": "codes"}
+    identities = {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
+    return protocol(task, preset, **{**changes, **identities}), paths
 
 
-def bench(wanted: Any, encoder: Path | None, *, root: Path, launcher: Launcher, bars: int) -> Any:
+def check_overrides(wanted: Protocol) -> None:
+    """Check each override by the agents that have such a setting.
+
+    Raises:
+        UnknownNameError: No agent of the protocol has it; the message lists what there is.
+        InvalidValueError: A value of the wrong type or out of its range.
+    """
+    overrides = dict(wanted.overrides)
+    known = {name for agent in wanted.agents for name in registry.setting_names(agent)} if overrides else set()
+    for name in overrides:
+        if name not in known:
+            raise UnknownNameError("setting", name, sorted(known))
+    for agent in wanted.agents:
+        registry.check_settings(agent, wanted.preset, overrides, wanted.settings)
+
+
+def _encoders(wanted: Protocol, given: str | None) -> Encoders:
+    """The artefact of each kind that an agent needs; a given one is there whether or not any does."""
+    entries = [registry.agent_entry(agent) for agent in wanted.agents]
+    needed = {entry.encoder_kind for entry in entries if entry.needs_encoder}
+    spec = registry.task(wanted.task)
+    if given is None:
+        return {kind: encoders.resolve(spec, wanted.appearance, kind=kind) for kind in sorted(needed)}
+    path = encoders.resolve(spec, wanted.appearance, given)
+    kind = encoders.kind(path)
+    if needed and kind == "latents" and kind not in needed:
+        raise InvalidValueError(
+            f"No agent of this bench reads the latents that encoder {path.stem!r} gives; give one made with "
+            "'imagine-bench encoder --recipe codes', or leave --encoder out."
+        )
+    replaced = needed | {kind} if kind == "codes" else {kind}
+    own = {other: encoders.resolve(spec, wanted.appearance, kind=other) for other in sorted(needed - replaced)}
+    return {**own, **dict.fromkeys(sorted(replaced), path)}
+
+
+def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher, bars: int) -> Any:
     """Run what is missing of a protocol, and read all of it.
 
     Args:
         wanted: What is compared: a protocol of any kind.
-        encoder: The encoder artefact, or None if no agent needs one.
+        paths: The encoder artefacts that its agents need, by kind.
         root: Folder of all benches.
         launcher: Carries out the runs.
         bars: Lines of progress, one a run at a time.
@@ -95,27 +134,28 @@ def bench(wanted: Any, encoder: Path | None, *, root: Path, launcher: Launcher, 
         if missing:
             gl_renderer()  # fails here, in one sentence, rather than in every run
             _warn(store.begin_sitting(describe_environment()), store.folder)
-            failures = _in_waves(store, encoder, launcher, bars)
+            failures = _in_waves(store, paths, launcher, bars)
             store.note_time()
             _raise_if_any(failures, missing)
     return load_bench(store.folder)
 
 
-def _in_waves(store: BenchStore, encoder: Path | None, launcher: Launcher, bars: int) -> list[Failure]:
+def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher, bars: int) -> list[Failure]:
     """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
     failures: list[Failure] = []
     for until in store.protocol.waves:
         failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
         pairs = [pair for pair in store.missing(until) if pair not in failed]
-        jobs = [_job(store, encoder, *pair, until) for pair in pairs]
+        jobs = [_job(store, paths, *pair, until) for pair in pairs]
         if jobs:
             with ProgressBars([job.spec for job in jobs], bars) as show:
                 failures += launcher.launch(jobs, _noting_time(store, show))
     return failures
 
 
-def _job(store: BenchStore, encoder: Path | None, agent: str, seed: int, until: int | None) -> Job:
-    needed = encoder if encoder is not None and registry.agent_entry(agent).needs_encoder else None
+def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
+    entry = registry.agent_entry(agent) if paths else None
+    needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=until)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 

@@ -7,8 +7,8 @@ from importlib import resources
 from pathlib import Path
 
 from imagine_bench.errors import ArtefactError, UnknownNameError
-from imagine_bench.files import sha256
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.files import read_json, sha256
+from imagine_bench.interfaces import TaskSpec, bundled_name
 
 _SUFFIX = ".safetensors"
 
@@ -19,13 +19,14 @@ def bundled() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob(f"*{_SUFFIX}"))}
 
 
-def resolve(spec: TaskSpec, appearance: str, given: str | None = None) -> Path:
+def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str = "latents") -> Path:
     """The encoder file to use.
 
     Args:
         spec: The task.
-        appearance: Its appearance level; each has its own bundled encoder.
+        appearance: Its appearance level; each has its own bundled encoders.
         given: A bundled name or a path instead; None for the task's own.
+        kind: Which of the task's own: one of ``ENCODER_KINDS``.
 
     Raises:
         UnknownNameError: ``given`` is neither; the message lists the bundled names.
@@ -33,11 +34,12 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None) -> Path:
     """
     known = bundled()
     if given is None:
-        name = f"{spec.encoder}-{appearance}"
+        name = bundled_name(spec.encoder, appearance, kind)
         if name not in known:
             raise ArtefactError(
                 f"No encoder {name!r} is bundled; train one with "
-                f"'imagine-bench encoder --task {spec.id} --appearance {appearance}' and give it with --encoder."
+                f"'imagine-bench encoder --task {spec.id} --appearance {appearance}"
+                f"{' --recipe codes' if kind == 'codes' else ''}' and give it with --encoder."
             )
         return known[name]
     if given in known:
@@ -46,6 +48,16 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None) -> Path:
     if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
         return path.resolve()
     raise UnknownNameError("encoder", given, known)
+
+
+def kind(path: Path) -> str:
+    """Whether an encoder gives ``"latents"`` or ``"codes"``, by the card beside it.
+
+    Raises:
+        ArtefactError: The card is damaged.
+    """
+    card = path.with_suffix(".json")
+    return "codes" if card.is_file() and read_json(card, "an encoder's card").get("code_sizes") else "latents"
 
 
 def identity(path: Path) -> str:

@@ -24,6 +24,8 @@ Macrostate = NDArray[np.int64]
 
 APPEARANCES = ("clean", "mild", "strong")
 EXECUTIONS = ("physics", "kinematic")
+ENCODER_KINDS = ("latents", "codes")
+"""What an encoder gives: continuous latents, or one-hot codes of discrete parts."""
 DEVICES = ("cpu", "cuda")
 
 
@@ -202,6 +204,11 @@ class TaskSpec:
     def n_actions(self) -> int:
         """Number of macro-actions A."""
         return len(self.action_names)
+
+
+def bundled_name(encoder: str, appearance: str, kind: str) -> str:
+    """Name of a bundled encoder: ``"arrow_puzzle-clean"`` gives latents, ``"arrow_puzzle-clean-codes"`` codes."""
+    return f"{encoder}-{appearance}" if kind == "latents" else f"{encoder}-{appearance}-{kind}"
 
 
 @dataclass(frozen=True, kw_only=True)

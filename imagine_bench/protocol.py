@@ -71,6 +71,7 @@ class Protocol(ProtocolData):
             distribution at each budget; 0 asks for none.
         recorded_episodes: Real episodes in each recording; 0 records none.
         encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
+        codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
         device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
     """
 
@@ -88,6 +89,7 @@ class Protocol(ProtocolData):
     sampled_futures: int = 16
     recorded_episodes: int = 5
     encoder: str | None = None
+    codes: str | None = None
     device: str = "cpu"
 
     def __post_init__(self) -> None:
@@ -115,6 +117,15 @@ class Protocol(ProtocolData):
     def waves(self) -> tuple[int | None, ...]:
         """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
         return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_WAVE), None)
+
+    def as_dict(self) -> dict[str, Any]:
+        """A JSON-serialisable copy; without ``codes`` where there are none, as in the protocols from before them."""
+        data = super().as_dict()
+        return data if self.codes is not None else {key: value for key, value in data.items() if key != "codes"}
+
+    def encoder_of(self, kind: str) -> str | None:
+        """Identity of the encoder for the agents that take this kind."""
+        return self.codes if kind == "codes" else self.encoder
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,13 +36,17 @@ class AgentEntry:
     Attributes:
         make: ``"module:attr"`` of a function from AgentContext to Agent.
         learns: Whether training changes it; others are only evaluated.
-        needs_encoder: Whether it sees latents.
+        needs_encoder: Whether it sees what an encoder gives.
+        encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
+        settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
     """
 
     make: str
     learns: bool = True
     needs_encoder: bool = True
+    encoder_kind: str = "latents"
+    settings: str = "imagine_bench.agents.presets"
     privileged: bool = False
 
 
@@ -75,6 +79,11 @@ AGENTS: dict[str, AgentEntry] = {
     "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
     "imagination": AgentEntry(make="imagine_bench.agents.imagination_agents:make"),
     "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_agents:make_uncertainty"),
+    "imagine": AgentEntry(
+        make="imagine_bench.agents.imagine.agent:make",
+        encoder_kind="codes",
+        settings="imagine_bench.agents.imagine.settings",
+    ),
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
     "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),
 }
@@ -151,6 +160,28 @@ def agent_entry(name: str) -> AgentEntry:
     if name not in AGENTS:
         raise UnknownNameError("agent", name, AGENTS)
     return AGENTS[name]
+
+
+def setting_names(agent: str) -> frozenset[str]:
+    """The dotted names of all settings that an agent has."""
+    names: frozenset[str] = load(f"{agent_entry(agent).settings}:names")()
+    return names
+
+
+def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a protocol's overrides that this agent has settings for; the others are some other agent's."""
+    names = setting_names(agent) if overrides else frozenset()
+    return {name: value for name, value in overrides.items() if name in names}
+
+
+def check_settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> None:
+    """Check the overrides that this agent has settings for.
+
+    Raises:
+        UnknownNameError: No such preset or family.
+        InvalidValueError: A value of the wrong type or out of its range.
+    """
+    load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
 
 
 def task(name: str) -> TaskSpec:

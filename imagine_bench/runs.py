@@ -65,7 +65,7 @@ class RunSpec:
             seeds=SeedTree(self.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
             settings=protocol.settings,
             preset=protocol.preset,
-            overrides=dict(protocol.overrides),
+            overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,
             optimal_action=task.rules.optimal_action if entry.privileged else None,
         )

@@ -101,13 +101,14 @@ def best_run(result: BenchResult) -> RunResult:
 
 
 def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
-    if not registry.agent_entry(agent).needs_encoder or protocol.encoder is None:
+    entry = registry.agent_entry(agent)
+    used = protocol.encoder_of(entry.encoder_kind)
+    if not entry.needs_encoder or used is None:
         return None
-    name = protocol.encoder.partition("@")[0]
-    path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given or name)
-    if encoders.identity(path) != protocol.encoder:
+    path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given or used.partition("@")[0])
+    if encoders.identity(path) != used:
         raise ArtefactError(
-            f"The run saw through encoder {protocol.encoder}, and {path} is {encoders.identity(path)}; give the right "
+            f"The run saw through encoder {used}, and {path} is {encoders.identity(path)}; give the right "
             "file with --encoder."
         )
     return path

@@ -1,0 +1,243 @@
+"""The agent ``imagine``: sees codes, learns a structured model of them, plans in it, and goes where it is in doubt."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, ImaginedRollout, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from .. import snapshot
+from ..encoder import Encoder
+from ..meters import Meters
+from ..perception import load_perception, prepare_torch
+from ..presets import flatten
+from .memory import CodeMemory, CodeTransition
+from .model import StructuredModel, as_codes
+from .pictures import Imagined, picture
+from .planner import Planner
+from .settings import ImagineSettings, resolve
+
+_SURE = 0.9
+"""A transition held less probable than this is a surprise, and the agent thinks anew."""
+_KNOWN = 0.05
+"""So is one of which more than this was unknown."""
+_TERMINAL = 0.5
+"""Predicted probability above which an imagined episode ends."""
+_TIE = 1e-9
+
+
+class ImagineAgent:
+    """Learns from codes alone; every transition is remembered, and the model is a function of what is remembered.
+
+    Args:
+        encoder: Frames to codes of parts.
+        n_actions: A.
+        settings: All hyperparameters.
+        seeds: This agent's node of the seed tree.
+    """
+
+    def __init__(self, encoder: Encoder, n_actions: int, settings: ImagineSettings, seeds: SeedTree) -> None:
+        self.encoder, self.n_actions, self.settings = encoder, n_actions, settings
+        self.rng = seeds.child("exploration").generator()
+        sizes = encoder.card.code_sizes
+        self.sizes = sizes if settings.dynamics.factored else (int(np.prod(sizes)),)
+        self.memory = CodeMemory(len(self.sizes))
+        self.meters = Meters()
+        self._seen: tuple[bytes, tuple[int, ...]] | None = None
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        """An empty model; the first ``learned`` of the remembered transitions are in it."""
+        self.model = StructuredModel(self.sizes, self.n_actions, self.settings)
+        self.planner = Planner(self.model, self.settings.planning)
+        self.learned, self.surprised = 0, False
+
+    def code(self, frame: Frame) -> tuple[int, ...]:
+        """The code of a frame, one value a part; remembers the last one, which often is asked for twice."""
+        key = frame.tobytes()
+        if self._seen is None or self._seen[0] != key:
+            self._seen = (key, self.encoder.codes(frame))
+        return self._seen[1]
+
+    def _modelled(self, code: tuple[int, ...]) -> tuple[int, ...]:
+        """The code as the model takes it."""
+        if self.settings.dynamics.factored:
+            return code
+        return (int(np.ravel_multi_index(code, self.encoder.card.code_sizes)),)
+
+    def _observed(self, code: tuple[int, ...]) -> tuple[int, ...]:
+        """The inverse of :meth:`_modelled`."""
+        if self.settings.dynamics.factored:
+            return code
+        return tuple(int(value) for value in np.unravel_index(code[0], self.encoder.card.code_sizes))
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """The action of the largest worth; exploring, that which leads to the most unknown as long as there is any."""
+        if not len(self.memory):
+            return int(self.rng.integers(self.n_actions)) if explore else 0
+        self._think()
+        code = self._modelled(self.code(observation.frame))
+        if not explore:
+            return int(self.planner.worth(code).argmax())
+        values = self._exploring(code)
+        return int(self.rng.choice(np.flatnonzero(values >= values.max() - _TIE)))
+
+    def _exploring(self, code: tuple[int, ...]) -> NDArray[np.float64]:
+        planning = self.settings.planning
+        if planning.exploration == "optimism":
+            return self.planner.optimistic(code)
+        if planning.exploration == "random":
+            random = self.rng.random() < planning.epsilon
+            return np.zeros(self.n_actions) if random else self.planner.worth(code)
+        novelty = self.planner.novelty(code)
+        curious = novelty.max() >= planning.boredom
+        self.meters.add("curiosity/share", float(curious))
+        self.meters.add("curiosity/novelty", float(novelty.max()))
+        return novelty if curious else self.planner.worth(code)
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Remember the transition; think anew before the next action if it was a surprise."""
+        with self.meters.cpu_time("time/model_s"):
+            row = CodeTransition(
+                code=self._modelled(self.code(transition.observation.frame)),
+                action=transition.action,
+                following=self._modelled(self.code(transition.next_observation.frame)),
+                reward=transition.reward,
+                terminated=transition.terminated,
+            )
+            chance, unknown = self.model.expected(row)
+            surprise = chance < _SURE or unknown > _KNOWN
+            self.surprised |= surprise
+            self.memory.add(row)
+        self.meters.add("model/surprise", float(surprise))
+        self.meters.count("time/model_s")
+
+    def _think(self) -> None:
+        """After a surprise, learn from all that happened since the last one, and forget all plans."""
+        if self.surprised:
+            with self.meters.cpu_time("time/model_s"):
+                self._learn(len(self.memory))
+
+    def _learn(self, upto: int) -> None:
+        """Bring the model from the first ``learned`` transitions to the first ``upto``."""
+        for row in itertools.islice(self.memory.since(self.learned), upto - self.learned):
+            self.model.add(row)
+        self.model.outcomes.fit()
+        self.planner.forget()
+        self.learned, self.surprised = upto, False
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        """Worth of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
+        if not len(self.memory):
+            return np.zeros(self.n_actions, dtype=np.float32)
+        self._think()
+        return self.planner.worth(self._modelled(self.code(observation.frame))).astype(np.float32)
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.interfaces.Imaginer`.
+
+        ``epistemic`` is the probability that something untested decides the transition, ``modal`` that it does not
+        lead where it most probably leads; a categorical model knows no Gaussian noise, so ``aleatoric`` is 0.
+
+        Raises:
+            InvalidValueError: No depth to imagine, or actions that are none.
+        """
+        planned = None if actions is None else [int(action) for action in actions[:depth]]
+        if depth < 1 or planned == []:
+            raise InvalidValueError(f"Asked to imagine depth {depth} along actions {actions}; give at least one.")
+        if planned is not None and not all(0 <= action < self.n_actions for action in planned):
+            raise InvalidValueError(f"Actions {planned} must lie in [0, {self.n_actions}).")
+        start = self.encoder.codes(frame)
+        self._think()
+        steps: list[Imagined] = []
+        code = self._modelled(start)
+        for index in range(depth if planned is None else len(planned)):
+            steps.append(self._imagined(code, None if planned is None else planned[index], rng))
+            if planned is None and steps[-1].p_terminated > _TERMINAL:
+                break
+            code = self._modelled(steps[-1].code)
+        return picture(self.encoder, start, steps)
+
+    def _imagined(self, code: tuple[int, ...], action: int | None, rng: np.random.Generator) -> Imagined:
+        """One imagined step of ``action``, or of the greedy one."""
+        worth = self.planner.worth(code) if len(self.memory) else np.zeros(self.n_actions)
+        chosen = int(worth.argmax()) if action is None else action
+        if not len(self.memory):
+            return Imagined(
+                action=chosen,
+                code=self._observed(code),
+                reward=0.0,
+                p_terminated=0.0,
+                values=worth,
+                unknown=1.0,
+                otherwise=0.0,
+            )
+        following, sure = self.model.sample(as_codes(code), chosen, rng)
+        return Imagined(
+            action=chosen,
+            code=self._observed(tuple(following.tolist())),
+            reward=float(self.planner.reward(code)[chosen]),
+            p_terminated=float(self.planner.terminates(code)[chosen]),
+            values=worth,
+            unknown=float(self.planner.unknown(code)[chosen]),
+            otherwise=1.0 - sure,
+        )
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
+        counters = {
+            "real_transitions": len(self.memory),
+            "model/outcomes": len(self.model.outcomes.kinds),
+            "planning/imagined_codes": self.planner.imagined,
+        }
+        return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
+
+    def state(self) -> AgentState:
+        """A snapshot: what is remembered, how much of it is learned, the generator, measurements."""
+        values = {
+            "learned": self.learned,
+            "surprised": self.surprised,
+            "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(),
+            "settings": snapshot.jsonable(flatten(self.settings)),
+        }
+        return AgentState(arrays=snapshot.prefixed("memory", self.memory.arrays()), values=values)
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot by living through what is remembered once more.
+
+        Raises:
+            ArtefactError: It does not fit this agent; nothing was changed.
+        """
+        snapshot.require_fit(state, self.state(), equal=("settings",))
+        self.memory.load(snapshot.below("memory", state.arrays))
+        self._start_anew()
+        if state.values["learned"]:
+            self._learn(state.values["learned"])
+        self.surprised = state.values["surprised"]
+        self.meters.restore(state.values["meters"])
+        self.rng.bit_generator.state = state.values["exploration"]
+
+
+def make(context: AgentContext) -> ImagineAgent:
+    """The ``imagine`` agent.
+
+    Raises:
+        InvalidValueError: The context's encoder gives no codes.
+    """
+    settings = resolve(context.preset, context.overrides, context.settings)
+    prepare_torch(context.device)
+    encoder = load_perception(context).encoder
+    if not encoder.card.code_sizes:
+        raise InvalidValueError(
+            f"Agent 'imagine' reads codes of parts, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
+            "give one made with `imagine-bench encoder --recipe codes`."
+        )
+    return ImagineAgent(encoder, context.n_actions, settings, context.seeds)
