@@ -30,7 +30,7 @@ class DynamicsSettings:
     parents: int = 3
     persistence: float = 0.5
     parent_factor: float = 0.2
-    concentration: float = 0.1
+    concentration: float = 0.03
     slip: float = 0.005
 
 
