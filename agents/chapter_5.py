@@ -46,4 +46,5 @@ _SMOKE: dict[str, Deviation] = {
     "imagination.start_episode": Deviation(10, "imagination must happen within a few dozen episodes"),
 }
 
-CHAPTER_5 = Family(thesis=Settings(), presets={"smoke": _SMOKE, "quick": _QUICK, "thesis": {}, "full": {}})
+_PRESETS = {"smoke": _SMOKE, "quick": _QUICK, "thesis": {}, "full": {}, "sample_efficiency": _QUICK}
+CHAPTER_5 = Family(thesis=Settings(), presets=_PRESETS)

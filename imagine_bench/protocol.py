@@ -145,10 +145,17 @@ PRESETS: dict[str, dict[str, Any]] = {
         "evaluation_episodes": 1000,
     },
     "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
+    "sample_efficiency": {
+        "agents": ("imagine",),
+        "seeds": tuple(range(5)),
+        "budgets": (20, 40, 60, 80, 100, 120, 200),
+        "evaluation_episodes": 1000,
+        "recorded_episodes": 2,
+    },
 }
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
-thesis' own spreads)."""
+thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few."""
 
 
 def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:

@@ -6,6 +6,7 @@ Scores have shape (runs,) or (runs, strata), a stratum being a task; they are re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -75,6 +76,25 @@ def wilson(successes: int, trials: int, *, level: float = LEVEL) -> tuple[float,
         )
     interval = stats.binomtest(successes, trials).proportion_ci(confidence_level=level, method="wilson")
     return float(interval.low), float(interval.high)
+
+
+def first_lasting(budgets: Sequence[int], scores: ArrayLike, level: float) -> int | None:
+    """The first budget from which on every score is at least ``level``; None where even the last one is not.
+
+    Args:
+        budgets: Ascending. Length B.
+        scores: The score at each of them. Shape (B,).
+        level: What counts as reached.
+
+    Raises:
+        InvalidValueError: Not one score a budget.
+    """
+    values = _finite("scores", scores)
+    if values.shape != (len(budgets),):
+        raise InvalidValueError(f"{len(budgets)} budgets need as many scores, not an array of shape {values.shape}.")
+    below = np.flatnonzero(values < level)
+    first = 0 if not len(below) else int(below[-1]) + 1
+    return budgets[first] if first < len(budgets) else None
 
 
 def probability_of_improvement(

@@ -37,7 +37,10 @@ def bench_words(out: Path, *more: str) -> list[str]:
     ("words", "sentence"),
     [
         (["--task", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'? Known: arrow_puzzle, arrow_"),
-        (["--preset", "quik"], "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full."),
+        (
+            ["--preset", "quik"],
+            "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
+        ),
         (["--agents", "dnq"], "No agent 'dnq'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
         (["--appearance", "strng"], "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong."),
         (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),

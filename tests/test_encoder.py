@@ -237,7 +237,7 @@ def test_training_lowers_the_loss_and_reports_progress() -> None:
     def loss(vae: Vae) -> Elbo:
         return vae.elbo(fresh, torch.zeros(50, 24), recipe.beta)
 
-    assert loss(encoder._vae).loss < 0.9 * loss(made_vae(recipe)).loss
+    assert loss(encoder._coder).loss < 0.9 * loss(made_vae(recipe)).loss
     assert [stage for stage, done in stages if done == 1.0] == ["frames", "frames", "training", "probe"]
 
 
@@ -321,7 +321,7 @@ def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -
     with pytest.raises(ArtefactError, match=r"No encoder at .*absent.safetensors; make one with"):
         Encoder.load(tmp_path / "absent.safetensors")
     whole, card = good.read_bytes(), json.loads(tiny.card.to_json())
-    state = {f"vae.{key}": value for key, value in tiny._vae.state_dict().items()}
+    state = {f"vae.{key}": value for key, value in tiny._coder.state_dict().items()}
     state |= {f"probe.{key}": value for key, value in tiny._probe.state_dict().items()}
     bad = {
         "cut": whole[:5000],

@@ -27,7 +27,7 @@ def test_any_change_changes_the_hash():
         "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
-        "encoder": "other@0123456789ab", "device": "cuda",
+        "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
     }  # fmt: skip
     assert set(changes) >= {field.name for field in dataclasses.fields(Protocol)}
     hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
@@ -47,7 +47,11 @@ def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_wo
     ("changes", "error", "message"),
     [
         ({"task": "arrow_puzle"}, UnknownNameError, r"No task 'arrow_puzle'. Did you mean 'arrow_puzzle'\?"),
-        ({"preset": "fast"}, UnknownNameError, "No preset 'fast'.* Known: smoke, quick, thesis, full"),
+        (
+            {"preset": "fast"},
+            UnknownNameError,
+            "No preset 'fast'.* Known: smoke, quick, thesis, full, ",
+        ),
         ({"agents": ("dnq",)}, UnknownNameError, r"No agent 'dnq'. Did you mean 'dqn'\?"),
         ({"agents": ("dqn", "dqn")}, InvalidValueError, "none of them twice"),
         ({"appearance": "milld"}, UnknownNameError, r"No appearance 'milld'. Did you mean 'mild'\?"),

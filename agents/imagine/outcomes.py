@@ -69,8 +69,8 @@ class Conjunctions:
             groups.append(np.full(size, kinds.setdefault((acting, len(parts)), len(kinds))))
             first += size
         self.group = np.concatenate(groups)
-        values = np.array([max(1, order + acting) for acting, order in kinds])
-        self.prior: Floats = settings.prior * settings.order_factor ** (values - 1)
+        beyond = np.array([max(0, order + acting - 2) for acting, order in kinds])
+        self.prior: Floats = settings.prior * settings.order_factor**beyond
 
     def active(self, codes: Codes, actions: NDArray[np.int64], following: Codes) -> NDArray[np.int64]:
         """Which conjunctions hold in transitions between codes (N, P) by actions (N,). Shape (N, templates)."""

@@ -40,8 +40,8 @@ class OutcomeSettings:
 
     Attributes:
         order: Most values in a conjunction that may be a cause; the whole code may always be one.
-        prior: Prior probability that a value alone is a cause.
-        order_factor: Factor on it for each value more.
+        prior: Prior probability that one value, or a pair, is a cause.
+        order_factor: Factor on it for each value more than two.
         pseudo_tests: How many tests of one conjunction the prior is worth.
         pseudo_conjunctions: How many conjunctions of a kind the prior is worth.
         leak: Probability of an outcome without a cause.
@@ -50,7 +50,7 @@ class OutcomeSettings:
     """
 
     order: int = 3
-    prior: float = 0.2
+    prior: float = 0.1
     order_factor: float = 0.3
     pseudo_tests: float = 0.2
     pseudo_conjunctions: float = 3.0

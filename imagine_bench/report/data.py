@@ -14,6 +14,8 @@ from imagine_bench.interfaces import RuleFacts, TaskSpec
 from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
 
+REACHED = 0.95
+"""Success that an agent is asked to reach, and keep, in as few real episodes as possible."""
 BASE_AGENT = "dqn"
 """What gains are measured against, as in the thesis."""
 
@@ -114,7 +116,10 @@ class FuturesSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportData:
-    """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes)."""
+    """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
+
+    ``reached`` holds for each seed the first budget from which on success never falls below ``REACHED``, or None.
+    """
 
     result: BenchResult
     spec: TaskSpec
@@ -124,6 +129,7 @@ class ReportData:
     acceptance: dict[str, dict[int, float]]
     open_loop: dict[str, OpenLoop]
     futures: dict[str, FuturesSummary]
+    reached: dict[str, tuple[int | None, ...]]
     timing: dict[str, Timing]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_source: str
@@ -155,6 +161,7 @@ def collect(result: BenchResult) -> ReportData:
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
+        reached={agent: _reached(result.of(agent)) for agent in agents if registry.agent_entry(agent).learns},
         timing={agent: _timing(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
@@ -329,6 +336,14 @@ def _nan_mean(table: np.ndarray) -> np.ndarray:
     total = np.where(finite, table, 0.0).sum(axis=0)
     mean: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return mean
+
+
+def _reached(runs: tuple[RunResult, ...]) -> tuple[int | None, ...]:
+    def first(run: RunResult) -> int | None:
+        rows = run.checkpoints
+        return statistics.first_lasting([row.episodes for row in rows], [row.success_rate for row in rows], REACHED)
+
+    return tuple(first(run) for run in runs)
 
 
 def _timing(runs: tuple[RunResult, ...]) -> Timing:

@@ -250,6 +250,7 @@ def _render(template: str, context: dict[str, Any]) -> str:
         score_text=score_text,
         thesis_text=_thesis_text,
         seconds=_seconds,
+        lasting=words.lasting,
         words=agent_words,
         color=plots.color,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
@@ -41,6 +42,11 @@ _AGENTS = {
         "imagination + uncertainty",
         "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
     ),
+    "imagine": AgentWords(
+        "imagine",
+        "Sees discrete parts, learns which of them an action changes and what is rewarded, imagines every future "
+        "within reach, goes where it is in doubt while it trains, and plans in its model when it is tested.",
+    ),
     "imagination_only": AgentWords(
         "imagination only",
         "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world "
@@ -56,6 +62,14 @@ _AGENTS = {
 def agent_words(agent: str) -> AgentWords:
     """Title and description of an agent; one that is not known here goes by its registered name."""
     return _AGENTS.get(agent, AgentWords(agent.replace("_", " "), "A registered agent."))
+
+
+def lasting(budgets: Sequence[int | None]) -> str:
+    """Mean number of episodes; where some seeds never got there, how many did."""
+    there = [budget for budget in budgets if budget is not None]
+    if len(there) < len(budgets):
+        return f"– ({len(there)} of {len(budgets)} seeds)"
+    return f"{sum(there) / len(there):.0f}"
 
 
 def percent(share: float) -> str:
