@@ -45,9 +45,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[Any, Encoders]:
     return planned
 
 
-def plan_control(
-    task: str, preset: str, *, encoder: str | None = None, **changes: object
-) -> tuple[Protocol, Encoders]:
+def plan_control(task: str, preset: str, *, encoder: str | None = None, **changes: object) -> tuple[Protocol, Encoders]:
     """The protocol of a control bench and the encoders it uses.
 
     Args:

@@ -23,7 +23,7 @@ class Kind:
         tasks: Its registered tasks.
         learners: Its registered agents or regressors.
         protocol: The class of its protocols.
-        plan: Function from task, preset and options to a protocol and an encoder, or None.
+        plan: Function from task, preset and options to a protocol and the encoders it needs, by kind.
         run: Function that carries out a RunSpec in a folder.
         load_run: Function that reads a finished run folder.
         load_so_far: Function that reads a bench folder, as far as it can be reported.

@@ -83,7 +83,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def plan(
     task: str, preset: str, *, encoder: str | None = None, **changes: Any
-) -> tuple[RegressionProtocol, Path | None]:
+) -> tuple[RegressionProtocol, dict[str, Path]]:
     """The protocol of a bench, with everything checked that can be before anything is run; it has no encoder.
 
     Raises:
@@ -99,4 +99,4 @@ def plan(
     registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides))
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)
-    return wanted, None
+    return wanted, {}

@@ -20,14 +20,14 @@ def box(top: float, left: float, height: float, width: float) -> np.ndarray:
     return np.outer(rows, columns)
 
 
-def pictures(n: int, rng: np.random.Generator, jitter: float = 1.0) -> tuple[torch.Tensor, np.ndarray]:
+def pictures(n: int, rng: np.random.Generator, jitter: float = 0.3) -> tuple[torch.Tensor, np.ndarray]:
     """Two independent things that jitter: a bar that lies in 3 ways at the top, a dot in 2 places at the bottom."""
     values = np.stack([rng.integers(3, size=n), rng.integers(2, size=n)], axis=1)
     frames = np.full((n, 1, SIDE, SIDE), 0.5, dtype=np.float32)
     for index, (bar, dot) in enumerate(values.tolist()):
         top, left, height, width = [(2, 2, 2, 8), (2, 13, 2, 8), (0, 10, 10, 2)][bar]
-        frames[index] += 0.5 * box(top + jitter * rng.random(), left + jitter * rng.random(), height, width)
-        frames[index] -= 0.5 * box(17, 3 + 12 * dot + jitter * rng.random(), 4, 4)
+        frames[index] += 0.3 * box(top + jitter * rng.normal(), left + jitter * rng.normal(), height, width)
+        frames[index] -= 0.3 * box(17 + jitter * rng.normal(), 4 + 12 * dot + jitter * rng.normal(), 4, 4)
     light = rng.uniform(0.9, 1.1, size=(n, 1, 1, 1)).astype(np.float32)
     return torch.from_numpy(np.clip(frames * light, 0.0, 1.0)), values
 

@@ -23,9 +23,7 @@ from .planner import Planner
 from .settings import ImagineSettings, resolve
 
 _SURE = 0.9
-"""A transition held less probable than this is a surprise, and the agent thinks anew."""
-_KNOWN = 0.05
-"""So is one of which more than this was unknown."""
+"""A transition held less probable than this is a surprise, as is any that would still attract curiosity."""
 _TERMINAL = 0.5
 """Predicted probability above which an imagined episode ends."""
 _TIE = 1e-9
@@ -55,7 +53,7 @@ class ImagineAgent:
         """An empty model; the first ``learned`` of the remembered transitions are in it."""
         self.model = StructuredModel(self.sizes, self.n_actions, self.settings)
         self.planner = Planner(self.model, self.settings.planning)
-        self.learned, self.surprised = 0, False
+        self.learned = 0
 
     def code(self, frame: Frame) -> tuple[int, ...]:
         """The code of a frame, one value a part; remembers the last one, which often is asked for twice."""
@@ -80,7 +78,6 @@ class ImagineAgent:
         """The action of the largest worth; exploring, that which leads to the most unknown as long as there is any."""
         if not len(self.memory):
             return int(self.rng.integers(self.n_actions)) if explore else 0
-        self._think()
         code = self._modelled(self.code(observation.frame))
         if not explore:
             return int(self.planner.worth(code).argmax())
@@ -101,7 +98,7 @@ class ImagineAgent:
         return novelty if curious else self.planner.worth(code)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember the transition; think anew before the next action if it was a surprise."""
+        """Remember the transition; if it was a surprise, learn from all since the last one, and forget all plans."""
         with self.meters.cpu_time("time/model_s"):
             row = CodeTransition(
                 code=self._modelled(self.code(transition.observation.frame)),
@@ -111,31 +108,25 @@ class ImagineAgent:
                 terminated=transition.terminated,
             )
             chance, unknown = self.model.expected(row)
-            surprise = chance < _SURE or unknown > _KNOWN
-            self.surprised |= surprise
+            surprise = chance < _SURE or unknown > self.settings.planning.boredom
             self.memory.add(row)
+            if surprise:
+                self._learn(len(self.memory))
         self.meters.add("model/surprise", float(surprise))
         self.meters.count("time/model_s")
 
-    def _think(self) -> None:
-        """After a surprise, learn from all that happened since the last one, and forget all plans."""
-        if self.surprised:
-            with self.meters.cpu_time("time/model_s"):
-                self._learn(len(self.memory))
-
     def _learn(self, upto: int) -> None:
-        """Bring the model from the first ``learned`` transitions to the first ``upto``."""
+        """Bring the model from the first ``learned`` transitions to the first ``upto``, and plan anew."""
         for row in itertools.islice(self.memory.since(self.learned), upto - self.learned):
             self.model.add(row)
         self.model.outcomes.fit()
         self.planner.forget()
-        self.learned, self.surprised = upto, False
+        self.learned = upto
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Worth of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
         if not len(self.memory):
             return np.zeros(self.n_actions, dtype=np.float32)
-        self._think()
         return self.planner.worth(self._modelled(self.code(observation.frame))).astype(np.float32)
 
     def imagine(
@@ -155,7 +146,6 @@ class ImagineAgent:
         if planned is not None and not all(0 <= action < self.n_actions for action in planned):
             raise InvalidValueError(f"Actions {planned} must lie in [0, {self.n_actions}).")
         start = self.encoder.codes(frame)
-        self._think()
         steps: list[Imagined] = []
         code = self._modelled(start)
         for index in range(depth if planned is None else len(planned)):
@@ -203,7 +193,6 @@ class ImagineAgent:
         """A snapshot: what is remembered, how much of it is learned, the generator, measurements."""
         values = {
             "learned": self.learned,
-            "surprised": self.surprised,
             "exploration": self.rng.bit_generator.state,
             "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
@@ -221,7 +210,6 @@ class ImagineAgent:
         self._start_anew()
         if state.values["learned"]:
             self._learn(state.values["learned"])
-        self.surprised = state.values["surprised"]
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
 
