@@ -2,7 +2,7 @@
 
 The mathematics is that of ``baddbmm``, ``relu`` and a multiplication by an inverted-dropout mask, differentiated by
 autograd; the tests hold it to that. What is saved: masks and the gate of ReLU act on the bits of a number as one
-integer operation, their factor rides on the weights, and hidden layers may compute in bfloat16. The output layer
+integer operation, their factor is applied once, and hidden layers may compute in bfloat16. The output layer
 always computes in float32: a reward of 50 has no decimals in bfloat16.
 """
 
@@ -43,7 +43,11 @@ def dense_stack(
 
 
 class _Stack(torch.autograd.Function):
-    """``p = scale (x W + b)`` and ``h = relu(p) & keep``: as scale > 0, ``h`` is the inverted-dropout activation."""
+    """``g = relu(g_before W + b / scale^l) & keep`` at hidden layer l, from 0: the activation over ``scale^(l + 1)``.
+
+    As ReLU lets a positive factor pass, those of all L layers meet in one, ``scale^L``, which is applied to the last
+    activation and to the gradient that comes back: no weight and no hidden unit is ever multiplied by it.
+    """
 
     @staticmethod
     def forward(
@@ -51,34 +55,33 @@ class _Stack(torch.autograd.Function):
     ) -> Tensor:
         layers = len(parameters) // 2
         weights, biases = parameters[:layers], parameters[layers:]
-        h, hidden, scaled = x.to(dtype), [], []
+        g, inputs, rounded = x.to(dtype), [], []
         for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
-            hidden.append(h)
-            scaled.append(_times(weight, scale).to(dtype))
-            h = _relu_(affine(h, scaled[-1], _times(bias, scale).to(dtype)))
+            inputs.append(g)
+            rounded.append(weight.to(dtype))
+            g = _relu_(affine(g, rounded[-1], (bias * scale**-layer).to(dtype)))
             if keep is not None:
-                _and_(h, keep[layer])
-        exact = h.to(weights[-1].dtype)
-        ctx.save_for_backward(*hidden, *scaled, h, exact, weights[-1])
+                _and_(g, keep[layer])
+        exact = _times(g.to(weights[-1].dtype), scale ** (layers - 1))
+        ctx.save_for_backward(*inputs, *rounded, g, exact, weights[-1])
         ctx.scale = scale
         return affine(exact, weights[-1], biases[-1])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        *pairs, h, exact, last = ctx.saved_tensors
-        inputs, scaled = pairs[: len(pairs) // 2], pairs[len(pairs) // 2 :]
+        *pairs, g, exact, last = ctx.saved_tensors
+        inputs, rounded = pairs[: len(pairs) // 2], pairs[len(pairs) // 2 :]
         by_weight = [product(exact.transpose(1, 2), gradient)]
         by_bias = [gradient.sum(dim=1, keepdim=True)]
-        g = _times(gradient, ctx.scale)  # of every p, times scale: so it is what the weights want, layer after layer
-        g, by_x = product(g, last.transpose(1, 2)).to(h.dtype), None
-        for x, weight in zip(reversed(inputs), reversed(scaled), strict=True):
-            _gate_(g, h)
-            by_weight.append(product(x.transpose(1, 2), g).to(last.dtype))
-            by_bias.append(g.sum(dim=1, keepdim=True).to(last.dtype))
-            if x is not inputs[0] or ctx.needs_input_grad[0]:
-                g, h = product(g, weight.transpose(1, 2)), x
-        if ctx.needs_input_grad[0]:
-            by_x = (g / ctx.scale).to(last.dtype) if inputs else product(gradient, last.transpose(1, 2))
+        back = product(_times(gradient, ctx.scale ** len(inputs)), last.transpose(1, 2)).to(g.dtype)
+        for layer in reversed(range(len(inputs))):
+            x, weight = inputs[layer], rounded[layer]
+            _gate_(back, g)
+            by_weight.append(product(x.transpose(1, 2), back).to(last.dtype))
+            by_bias.append(back.sum(dim=1, keepdim=True).to(last.dtype) * ctx.scale**-layer)
+            if layer > 0 or ctx.needs_input_grad[0]:
+                back, g = product(back, weight.transpose(1, 2)), x
+        by_x = back.to(last.dtype) if ctx.needs_input_grad[0] else None
         return by_x, None, None, None, *reversed(by_weight), *reversed(by_bias)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,10 +59,32 @@ def from_outputs(
 
 def log_likelihood(mixture: Mixture, targets: Tensor) -> Tensor:
     """``log p(targets)`` by log-sum-exp over components. Targets (..., Z), result (...)."""
-    scaled = (targets.unsqueeze(-2) - mixture.means) * torch.exp(-mixture.log_sigmas)  # [..., K, Z]
-    log_normal = -0.5 * scaled.square().sum(dim=-1) - mixture.log_sigmas.sum(dim=-1)  # [..., K]
-    constant = 0.5 * _LOG_2PI * targets.shape[-1]
-    return torch.logsumexp(mixture.log_weights + log_normal, dim=-1) - constant
+    result: Tensor = _LogLikelihood.apply(mixture.log_weights, mixture.means, mixture.log_sigmas, targets)
+    return result
+
+
+class _LogLikelihood(torch.autograd.Function):
+    """With its gradient written out (Bishop 1994, equations 33 to 40), a third of the passes that autograd takes."""
+
+    @staticmethod
+    def forward(ctx: Any, log_weights: Tensor, means: Tensor, log_sigmas: Tensor, targets: Tensor) -> Tensor:
+        inverse = torch.exp(-log_sigmas)  # [..., K, Z]
+        scaled = (targets.unsqueeze(-2) - means).mul_(inverse)  # [..., K, Z]
+        joint = log_weights - 0.5 * scaled.square().sum(dim=-1) - log_sigmas.sum(dim=-1)  # [..., K]
+        total = torch.logsumexp(joint, dim=-1)
+        ctx.save_for_backward(inverse, scaled, torch.exp(joint - total.unsqueeze(-1)))
+        ctx.shapes = log_weights.shape, means.shape, log_sigmas.shape, targets.shape
+        return total - 0.5 * _LOG_2PI * targets.shape[-1]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        inverse, scaled, responsibilities = ctx.saved_tensors
+        shares = gradient.unsqueeze(-1) * responsibilities  # [..., K]
+        pull = scaled * shares.unsqueeze(-1)  # [..., K, Z]
+        by_means = pull * inverse
+        by_log_sigmas = pull.mul_(scaled).sub_(shares.unsqueeze(-1))
+        parts = shares, by_means, by_log_sigmas, -by_means.sum(dim=-2)
+        return tuple(part.sum_to_size(shape) for part, shape in zip(parts, ctx.shapes, strict=True))
 
 
 def mean(mixture: Mixture) -> Tensor:

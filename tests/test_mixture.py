@@ -48,6 +48,19 @@ def test_gradient_of_the_log_likelihood_against_finite_differences() -> None:
     assert torch.autograd.gradcheck(loss, (outputs.requires_grad_(),), eps=1e-6, atol=1e-7)
 
 
+def test_every_gradient_of_the_log_likelihood_is_summed_over_what_was_broadcast() -> None:
+    """Targets of one leading axis more than the mixture, and a mixture of one more than the targets."""
+    draws = torch.Generator().manual_seed(5)
+
+    def loss(log_weights: torch.Tensor, means: torch.Tensor, sigmas: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        return mdn.log_likelihood(Mixture(log_weights, means, sigmas), t)
+
+    for leading, targets in (((), (3,)), ((2, 3), (3,))):
+        shapes = (*leading, K), (*leading, K, Z), (*leading, K, Z), (*targets, Z)
+        values = [torch.randn(shape, dtype=torch.float64, generator=draws).requires_grad_() for shape in shapes]
+        assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-7)
+
+
 def test_sigma_never_falls_below_the_floor_and_keeps_a_gradient_near_it() -> None:
     outputs = torch.full((1, mdn.output_size(K, Z)), -8.0, dtype=torch.float64, requires_grad=True)
     mixture = mdn.from_outputs(outputs, K, Z, log_sigma_floor=-4.0)

@@ -1,0 +1,107 @@
+"""How fast algorithm 1 learns its model, beside plain PyTorch and beside what the processor could do at best."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from .memory import Batch
+from .perception import prepare_torch
+from .plain_model import PlainWorldModel
+from .precision import hidden_dtype, settle
+from .products import product
+from .settings import WorldModelSettings
+from .world_model import WorldModel
+
+LATENTS, ACTIONS = 24, 6
+"""Those of the arrow puzzle's bundled encoders."""
+_SIDE = 512
+"""Rows and columns of the product that measures the peak."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSpeed:
+    """CPU time of one update of the three networks, all measured in turn in one run.
+
+    Attributes:
+        plain_ms: By :class:`.plain_model.PlainWorldModel`, float32.
+        float32_ms: By the world model, in float32.
+        settled_ms: The same in the format that ``auto`` chooses here.
+        precision: That format.
+        roofline_ms: The matrix products of one update at the peak rate measured for that format.
+        peak_gflops: That rate, of 512 x 512 x 512 products.
+    """
+
+    plain_ms: float
+    float32_ms: float
+    settled_ms: float
+    precision: str
+    roofline_ms: float
+    peak_gflops: float
+
+
+def measure(rounds: int = 40) -> ModelSpeed:
+    """Measure at the thesis' settings, on one thread with denormals flushed; the least of ``rounds`` readings counts.
+
+    Args:
+        rounds: Readings of each, taken in turn, so that all see the same neighbours.
+    """
+    device = prepare_torch("cpu")
+    settings = WorldModelSettings()
+    precision = settle("auto", device.type)
+    draws = torch.Generator().manual_seed(0)
+    batch = _batch(settings.batch_size, draws)
+    plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
+    models = {name: _model(settings, name) for name in ("float32", precision)}
+    square = torch.randn(1, _SIDE, _SIDE, generator=draws).to(hidden_dtype(precision, device.type))
+    best = _least_cpu_s(
+        {
+            "plain": lambda: plain.update(batch),
+            "peak": lambda: product(square, square),
+            **{name: lambda model=model: model.update(batch, draws) for name, model in models.items()},
+        },
+        rounds,
+    )
+    peak_flops = 2 * _SIDE**3 / best["peak"]
+    return ModelSpeed(
+        plain_ms=1e3 * best["plain"],
+        float32_ms=1e3 * best["float32"],
+        settled_ms=1e3 * best[precision],
+        precision=precision,
+        roofline_ms=1e3 * _flops(models[precision], settings.batch_size) / peak_flops,
+        peak_gflops=peak_flops / 1e9,
+    )
+
+
+def _model(settings: WorldModelSettings, precision: str) -> WorldModel:
+    return WorldModel(LATENTS, ACTIONS, replace(settings, precision=precision), torch.Generator().manual_seed(0))
+
+
+def _batch(rows: int, draws: torch.Generator) -> Batch:
+    return Batch(
+        z=torch.randn(rows, LATENTS, generator=draws),
+        action=torch.randint(ACTIONS, (rows,), generator=draws),
+        reward=torch.randn(rows, generator=draws),
+        next_z=torch.randn(rows, LATENTS, generator=draws),
+        terminated=(torch.rand(rows, generator=draws) < 0.3).float(),
+    )
+
+
+def _flops(model: WorldModel, rows: int) -> float:
+    """Two a weight and row forward, four backward, but that no gradient of the inputs is wanted."""
+    weights = [[weight.numel() for weight in network.weights] for network in model.networks]
+    return 2.0 * rows * sum(3 * sum(sizes) - sizes[0] for sizes in weights)
+
+
+def _least_cpu_s(actions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Least CPU seconds of each action: noise on a shared machine only ever adds."""
+    least = dict.fromkeys(actions, float("inf"))
+    for _ in range(rounds):
+        for name, action in actions.items():
+            start = time.process_time()
+            action()
+            least[name] = min(least[name], time.process_time() - start)
+    return least
