@@ -43,7 +43,7 @@ class ModelSpeed:
     peak_gflops: float
 
 
-def measure(rounds: int = 40) -> ModelSpeed:
+def measure(rounds: int = 25) -> ModelSpeed:
     """Measure at the thesis' settings, on one thread with denormals flushed; the least of ``rounds`` readings counts.
 
     Args:

@@ -1,0 +1,23 @@
+"""Let the C library keep the memory that tensors free, for the next ones."""
+
+from __future__ import annotations
+
+import ctypes
+
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
+"""Parameters of ``mallopt`` (glibc, malloc.h)."""
+_MIB = 2**20
+
+
+def keep_freed_memory() -> None:
+    """Ask glibc not to give blocks below 32 MiB back to the system at once; elsewhere do nothing.
+
+    An update of the world model frees and takes a few megabytes dozens of times. Given back, each page of them costs
+    a fault when it is taken again: 1,500 to 2,200 an update at the thesis' settings, a fifth of its time.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):  # no glibc: macOS, musl, Windows
+        return
+    for parameter, size in ((_MMAP_THRESHOLD, 32 * _MIB), (_TRIM_THRESHOLD, 512 * _MIB), (_TOP_PAD, 64 * _MIB)):
+        mallopt(parameter, size)
