@@ -100,6 +100,21 @@ def test_every_seed_in_the_page_is_the_one_in_the_csv(folder: Path, page: Cells)
     assert len(set(shown.values())) > 10  # not all alike, so that a mix-up would show
 
 
+def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, folder: Path) -> None:
+    found = rows(folder / "open_loop.csv")
+    loops = {
+        (run.agent, str(run.seed), str(point.episodes)): point.open_loop
+        for run in result.runs
+        for point in run.checkpoints
+        if point.open_loop is not None
+    }
+    assert loops and len(found) == sum(len(loop.count) for loop in loops.values())
+    for row in found:
+        loop, index = loops[row["agent"], row["seed"], row["episodes"]], int(row["depth"]) - 1
+        assert float(row["termination_error"]) == loop.termination_error[index]
+        assert float(row["correct"]) == loop.correct[index]
+
+
 def test_scores_in_the_page_are_those_in_the_summary(folder: Path, page: Cells) -> None:
     expected = {
         (row["agent"], row["episodes"]): [percent(float(row[name])) for name in ("success_iqm", "low_95", "high_95")]

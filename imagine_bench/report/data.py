@@ -185,6 +185,20 @@ def results_csv(result: BenchResult) -> str:
     return _csv(rows)
 
 
+def open_loop_csv(result: BenchResult) -> str:
+    """One row an imagining agent, seed, budget and imagined depth, with and without the filter."""
+    names = list(OpenLoop.__dataclass_fields__)
+    rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *names]]
+    for agent in result.protocol.agents:
+        for run in result.of(agent):
+            for checkpoint in run.checkpoints:
+                loop = checkpoint.open_loop
+                for index in range(0 if loop is None else len(loop.count)):
+                    values = [getattr(loop, name)[index] for name in names]
+                    rows.append([agent, run.seed, checkpoint.episodes, index + 1, *values])
+    return _csv(rows)
+
+
 def summary_csv(data: ReportData) -> str:
     """One row an agent and budget: score, interval, thesis, difference to DQN, gain."""
     rows: list[list[object]] = [list(_SUMMARY_COLUMNS)]

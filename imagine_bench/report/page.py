@@ -15,7 +15,7 @@ from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.pictures import first_cut, png, rollout_strip
 from imagine_bench.report import plots, words
-from imagine_bench.report.data import ReportData, collect, futures_csv, results_csv, summary_csv
+from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_view
 from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
@@ -47,7 +47,7 @@ class Strip:
 
 
 def write_report(result: BenchResult) -> Path:
-    """Write ``result.folder / "report"``: index.html, report.md, results.csv, summary.csv and the pictures.
+    """Write ``result.folder / "report"``: index.html, report.md, the CSV files and the pictures.
 
     Everything comes from ``result`` (and the bundled encoder's card), so writing it again gives the same report.
 
@@ -75,6 +75,8 @@ def write_report(result: BenchResult) -> Path:
     if picture:
         files["encoder.png"] = picture
     files["results.csv"] = results_csv(result).encode()
+    if data.open_loop:
+        files["open_loop.csv"] = open_loop_csv(result).encode()
     files["summary.csv"] = summary_csv(data).encode()
     if data.futures:
         files["futures.csv"] = futures_csv(data).encode()
