@@ -16,6 +16,7 @@ LEVELS = {
     "dqn": (0.1, 0.6),
     "imagination": (0.1, 0.55),
     "imagination_uncertainty": (0.15, 0.85),
+    "imagination_only": (0.1, 0.8),
 }
 DEPTH = 10
 

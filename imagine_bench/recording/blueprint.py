@@ -70,7 +70,7 @@ def _imagined_now() -> rrb.Horizontal:
 def _courses() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin="/imagined/courses",
-        name="Several futures imagined from the current frame: blue words are possible, orange ones are not",
+        name="Several futures from the current frame",
         background=[255, 255, 255],
     )
 
