@@ -33,7 +33,7 @@ def futures(spec: TaskSpec, rng: np.random.Generator) -> Futures:
         actions=np.tile(np.arange(spec.n_actions), len(states)),
         samples=np.array(400),
         total_variation=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
-        floor=np.full((DEPTH, PAIRS), 0.01),
+        floor=np.where(np.arange(PAIRS) == 2, 0.01, 0.0) * np.ones((DEPTH, 1)),
         missing=missing,
         invented=np.zeros((DEPTH, PAIRS)),
         reward_error=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
@@ -75,6 +75,7 @@ def test_the_summary_is_the_mean_over_pairs_and_seeds(result: BenchResult) -> No
     last = [run.checkpoints[-1].futures for run in result.of("imagination_only")]
     tables = np.stack([each.total_variation for each in last if each is not None])  # [seeds, D, P]
     assert summary.total_variation == pytest.approx(tables.mean(axis=(0, 2)))
+    assert summary.by_chance == pytest.approx(tables[:, :, 2].mean(axis=0))
     assert summary.going_on[0] == pytest.approx(summary.total_variation[0])
     assert summary.going_on[1:] == pytest.approx(tables[:, 1:, 1::2].mean(axis=(0, 2)))
     assert summary.missing.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0]

@@ -93,6 +93,7 @@ class FuturesSummary:
         pairs: Macrostates of play times macro-actions.
         samples: Futures of each pair.
         total_variation: Distance of imagined and exact distributions of macrostates.
+        by_chance: The same over the pairs after which several macrostates are possible; the others dilute it.
         going_on: The same where the episode goes on until this macro-action, weighted by how likely that is.
         floor: What as many samples of the exact distribution would show.
         missing: Possible outcomes that are not imagined, all pairs together.
@@ -105,6 +106,7 @@ class FuturesSummary:
     pairs: int
     samples: int
     total_variation: np.ndarray
+    by_chance: np.ndarray
     going_on: np.ndarray
     floor: np.ndarray
     missing: np.ndarray
@@ -323,6 +325,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 
     weight = np.stack([each.going_on for each in found])  # [runs, D, P]
     distance = np.stack([each.total_variation for each in found])
+    uncertain = np.stack([each.floor for each in found]) > 0.0  # no sample of a certain outcome can deviate from it
     by_budget: dict[int, list[tuple[float, float]]] = {}
     for run in runs:
         for checkpoint in run.checkpoints:
@@ -333,6 +336,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
         pairs=len(found[0].actions),
         samples=int(found[0].samples),
         total_variation=mean("total_variation"),
+        by_chance=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
         going_on=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
         floor=mean("floor"),
         missing=total("missing"),

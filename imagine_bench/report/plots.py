@@ -179,6 +179,7 @@ def futures_figure(data: ReportData) -> Figure:
         style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
         title = agent_words(agent).title
         panels[0].plot(depth, found.total_variation, label=title, **style)
+        panels[0].plot(depth, found.by_chance, linestyle="--", **style)
         budgets = list(found.by_budget)
         panels[1].plot(budgets, [first for first, _ in found.by_budget.values()], label=title, **style)
         deepest = [last for _, last in found.by_budget.values()]
@@ -186,6 +187,7 @@ def futures_figure(data: ReportData) -> Figure:
         panels[2].plot(depth, found.missing / found.pairs, label=title, **style)
         panels[3].plot(depth, found.invented / found.pairs, label=title, **style)
     floor = next(iter(data.futures.values())).floor
+    panels[0].plot([], [], linestyle="--", color=_INK, label="where several are possible")
     panels[0].plot(np.arange(1, len(floor) + 1), floor, label="samples of the truth", **_REFERENCE_LINE)
     panels[1].plot([], [], linestyle="--", color=_INK, label=f"depth {len(floor)}")
     panels[0].set(title="Distance from the exact distribution", ylabel="total variation", ylim=(0, None))
