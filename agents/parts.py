@@ -210,7 +210,9 @@ def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
         Cloud of each point, numbered by size from 0; -1 for none. Shape (N,).
     """
     count = len(points)
-    distance, near = scipy.spatial.cKDTree(points).query(points, min(_NEIGHBOURS + 1, count))
+    # Away from 0: the tree splits just above a coordinate, and with denormals flushed nothing is just above 0.
+    shifted = points - points.min(axis=0) + 1.0
+    distance, near = scipy.spatial.cKDTree(shifted).query(shifted, min(_NEIGHBOURS + 1, count))
     rows = np.repeat(np.arange(count), near.shape[1])
     links = scipy.sparse.csr_matrix((np.ones(near.size), (rows, near.ravel())), shape=(count, count))
     crowded = distance[:, -1] <= np.quantile(distance[:, -1], 1.0 - _LONELY)

@@ -71,7 +71,9 @@ def test_dependence_sees_what_correlation_does_not() -> None:
     assert np.array_equal(table, table.T)
 
 
-def test_clouds_are_counted_whatever_their_shape_and_equal_points_hang_together() -> None:
+@pytest.mark.parametrize("flushed", [False, True])
+def test_clouds_are_counted_whatever_their_shape_and_equal_points_hang_together(flushed: bool) -> None:
+    torch.set_flush_denormal(flushed)  # as every learner of the suite runs; the tree of neighbours must not mind
     rng = np.random.default_rng(0)
     angle = rng.uniform(0, 2 * np.pi, size=2000)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) + 0.02 * rng.normal(size=(2000, 2))
