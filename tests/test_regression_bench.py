@@ -28,8 +28,8 @@ _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2),
 
 def tiny(task: str, agent: str = "mc_dropout", **changes: Any) -> RunSpec:
     values = {"networks": 2, "test_points": 30, "overrides": _overrides(agent), "agents": (agent,), **changes}
-    protocol, encoder = plan(task, "smoke", **values)
-    assert encoder is None
+    protocol, encoders = plan(task, "smoke", **values)
+    assert encoders == {}
     return RunSpec(protocol=protocol, agent=agent, seed=0, checkpoint_every_s=0.0)
 
 
