@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .macro_env import Reading
-from .motion.executor import REST_OPENING_M, MacroResult
+from .motion.executor import MacroResult, at_rest
 from .scenes import constants as c
 from .scenes.appearance import Appearance, Looks
-from .scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from .scenes.arrow_scene import compile_arrow_scene
 
 if TYPE_CHECKING:
@@ -52,18 +51,8 @@ class ArrowWorld:
         self._cube_qpos = (np.array(starts)[:, None] + np.arange(7)).ravel()
         self._hand = int(self.model.body("hand").mocapid[0])
         self._pointed = 0
-        self._rest_qpos, self._rest_ctrl = self._arm_at_rest()
+        self._rest_qpos, self._rest_ctrl = at_rest(self.model)
         self._executor: TurnExecutor | None = None
-
-    def _arm_at_rest(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions and controls of the whole scene with the arm at its observation pose."""
-        qpos, ctrl = self.model.qpos0.copy(), np.zeros(self.model.nu)
-        targets = [*zip(ARM_JOINTS, c.OBSERVATION_QPOS_RAD, strict=True)]
-        targets += [(name, REST_OPENING_M) for name in FINGER_JOINTS]
-        for name, value in targets:
-            qpos[self.model.joint(name).qposadr[0]] = value
-            ctrl[self.model.actuator(name.replace("_slide", "") + "_servo").id] = value
-        return qpos, ctrl
 
     # --- putting -------------------------------------------------------------------------------------------------
 

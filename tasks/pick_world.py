@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .macro_env import Reading
-from .motion.executor import REST_OPENING_M, MacroResult
+from .motion.executor import REST_OPENING_M, MacroResult, at_rest
 from .pick_place_rules import HAND_OVER, HANDED_OVER, N_OBJECTS, OPEN_PALM, PICKED, PLACED, WITHDRAWN, held_object
 from .scenes import constants as c
 from .scenes.appearance import Appearance, Looks
-from .scenes.arm import ARM_JOINTS, FINGER_JOINTS, TCP_SITE
+from .scenes.arm import FINGER_JOINTS, TCP_SITE
 from .scenes.objects import MATERIALS, THINGS, standing_m
 from .scenes.open_hand import PALM_REACH_M
 from .scenes.pick_scene import IDLE_FINGERTIP_M, IDLE_PALM_M, PALM_M, compile_pick_scene, fingertip_m
@@ -67,19 +67,9 @@ class PickWorld:
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
-        self._rest_qpos, self._rest_ctrl = self._arm_at_rest()
+        self._rest_qpos, self._rest_ctrl = at_rest(self.model)
         self._tcp_at_rest_m = self._tcp_of(self._rest_qpos)
         self._executor: CarryExecutor | None = None
-
-    def _arm_at_rest(self) -> tuple[Floats, Floats]:
-        """Positions and controls of the whole scene with the arm at its observation pose, fingers open."""
-        qpos, ctrl = self.model.qpos0.copy(), np.zeros(self.model.nu)
-        targets = [*zip(ARM_JOINTS, c.OBSERVATION_QPOS_RAD, strict=True)]
-        targets += [(name, REST_OPENING_M) for name in FINGER_JOINTS]
-        for name, value in targets:
-            qpos[self.model.joint(name).qposadr[0]] = value
-            ctrl[self.model.actuator(name.replace("_slide", "") + "_servo").id] = value
-        return qpos, ctrl
 
     def _tcp_of(self, qpos: Floats) -> Floats:
         """The tool centre point in the world. Shape (3,)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import gymnasium
 import mujoco
@@ -15,9 +14,7 @@ from imagine_bench.tasks.pick_place_rules import HAND_OVER, OPEN_PALM, PICKED, W
 from imagine_bench.tasks.pick_world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
-from imagine_bench.tasks.scenes import objects, open_hand
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
-from imagine_bench.tasks.scenes.meshes import arch, box, signed_volume_m3, turned_profile
 from imagine_bench.tasks.scenes.objects import THINGS, standing_m
 from imagine_bench.tasks.scenes.pick_scene import PALM_M, TIMESTEP_S
 
@@ -50,32 +47,6 @@ def world():
 
 def rng():
     return np.random.default_rng(0)
-
-
-# --- parts -------------------------------------------------------------------------------------------------------
-
-
-PARTS = [
-    open_hand.open_hand_mesh, open_hand.open_wrist_mesh, open_hand.open_sleeve_mesh,
-    objects._car_body, objects._car_trim, objects._cup_body, objects._cup_inside,
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.__name__)
-def test_meshes_are_closed_and_face_outward(part):
-    mesh = part()
-    edges = Counter(tuple(edge) for face in mesh.faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True))
-    assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
-    assert signed_volume_m3(mesh) > 0
-
-
-def test_mesh_volumes_approach_the_solids():
-    assert signed_volume_m3(box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
-    assert signed_volume_m3(box((0, 0, 0), (1, 1, 1), taper=0.5)) == pytest.approx((1 + 0.25 + 0.5) / 3)
-    assert signed_volume_m3(turned_profile([(1.0, 0.0), (1.0, 2.0)], sides=96)) == pytest.approx(2 * np.pi, rel=1e-2)
-    rod = arch((0, 0, 0), radius=1.0, thickness=0.05, corners=48, sides=48)
-    assert signed_volume_m3(rod) == pytest.approx(np.pi * (np.pi * 0.05**2), rel=0.05)
-    assert rod.vertices[:, 0].min() == pytest.approx(-1.05, abs=1e-2)
 
 
 def test_objects_stand_still_on_the_table(world):

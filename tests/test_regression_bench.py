@@ -16,8 +16,8 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.kinds import KINDS
 from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext
-from imagine_bench.regression_results import RegressionRun
-from imagine_bench.regression_runner import run
+from imagine_bench.regression.results import RegressionRun
+from imagine_bench.regression.runner import run
 from imagine_bench.report import regression as page
 from imagine_bench.report import robot_ik, toy_regression
 from imagine_bench.runs import Progress, RunSpec

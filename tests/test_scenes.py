@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import mujoco
 import numpy as np
 import pytest
@@ -14,9 +12,6 @@ from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
 from imagine_bench.tasks.scenes.arrow_scene import compile_arrow_scene
-from imagine_bench.tasks.scenes.cubes import arrow_outline
-from imagine_bench.tasks.scenes.hand import hand_mesh, sleeve_mesh, wrist_mesh
-from imagine_bench.tasks.scenes.meshes import ellipsoid, limb, merge, prism, signed_volume_m3
 
 from imagine_bench.errors import UnknownNameError
 from imagine_bench.preprocessing import STRIP_WIDTH
@@ -39,30 +34,6 @@ def eye(world):
 
 def rng():
     return np.random.default_rng(0)
-
-
-# --- meshes ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("part", [hand_mesh, wrist_mesh, sleeve_mesh, lambda: prism(arrow_outline(), 0.0, 0.001)])
-def test_meshes_are_closed_and_face_outward(part):
-    mesh = part()
-    edges = Counter(tuple(edge) for face in mesh.faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True))
-    assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
-    assert signed_volume_m3(mesh) > 0
-
-
-def test_mesh_volumes_approach_the_solids():
-    outline = arrow_outline()
-    x, y = outline.T
-    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    assert signed_volume_m3(prism(outline, -0.1, 0.2)) == pytest.approx(0.3 * area)
-    fine = ellipsoid((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), sides=96, rings=95)
-    assert signed_volume_m3(fine) == pytest.approx(4 / 3 * np.pi * 0.006, rel=5e-3)
-    tube = limb([(0, 0, 0, 0.1), (0, 0, 5, 0.1), (0, 0, 10, 0.1)], sides=96)
-    assert signed_volume_m3(tube) == pytest.approx(np.pi * 0.01 * 10, rel=0.02)
-    both = merge([fine, tube])
-    assert signed_volume_m3(both) == pytest.approx(signed_volume_m3(fine) + signed_volume_m3(tube))
 
 
 # --- compiled model ----------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +16,12 @@ from imagine_bench.pictures import first_cut, png, rollout_strip
 from imagine_bench.report import plots, words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_view
+from imagine_bench.report.sections import Picture
 from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
 
 SHOWN_ROLLOUTS = 3
 """Rollouts shown of each imagining agent: the first ones of its first seed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Strip:
-    """A picture strip with its words.
-
-    Attributes:
-        name: File name without ending.
-        png: The picture.
-        alt: What a reader who does not see it should know.
-        caption: What stands below it.
-    """
-
-    name: str
-    png: bytes
-    alt: str
-    caption: str
-
-    @property
-    def base64(self) -> str:
-        """The picture for a data URL."""
-        return base64.b64encode(self.png).decode()
 
 
 def write_report(result: BenchResult) -> Path:
@@ -193,7 +171,7 @@ def flat(prefix: str, value: Any) -> list[tuple[str, str]]:
     return [(prefix, str(value))]
 
 
-def _strips(data: ReportData) -> list[Strip]:
+def _strips(data: ReportData) -> list[Picture]:
     strips = []
     for agent in data.result.protocol.agents:
         run = data.result.of(agent)[0]
@@ -202,7 +180,7 @@ def _strips(data: ReportData) -> list[Strip]:
     return strips
 
 
-def _strip(data: ReportData, agent: str, seed: int, index: int, compared: ComparedRollout) -> Strip:
+def _strip(data: ReportData, agent: str, seed: int, index: int, compared: ComparedRollout) -> Picture:
     title = agent_words(agent).title
     alive = np.concatenate([[True], ~compared.real_terminated[:-1]])  # imagined after the real end: nothing to match
     matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1) & alive
@@ -212,7 +190,7 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
         f"{title[:1].upper()}{title[1:]}, seed {seed}, start {index + 1}: {int(matches.sum())} of {depth} imagined "
         f"macrostates are what the rules say; {kept}."
     )
-    return Strip(
+    return Picture(
         name=f"rollout_{agent}_{index + 1}",
         png=png(rollout_strip(compared, data.spec.action_names)),
         alt=f"Real frames above, imagined frames below. {caption}",
@@ -220,7 +198,7 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
     )
 
 
-def _courses(data: ReportData) -> list[Strip]:
+def _courses(data: ReportData) -> list[Picture]:
     """One sheet an agent: several imagined courses of one beginning, of its first seed."""
     sheets = []
     for agent in data.result.protocol.agents:
@@ -230,7 +208,7 @@ def _courses(data: ReportData) -> list[Strip]:
             caption = f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.courses)} times."
             sheet = png(courses_sheet(run.courses, data.spec))
             alt = f"Only the first picture is real. {caption}"
-            sheets.append(Strip(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
+            sheets.append(Picture(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
     return sheets
 
 

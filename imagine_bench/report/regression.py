@@ -15,7 +15,7 @@ from imagine_bench import registry
 from imagine_bench.calibration import LEVELS
 from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.regression import SCORES
-from imagine_bench.regression_results import RegressionResult, rows_csv
+from imagine_bench.regression.results import RegressionResult, rows_csv
 from imagine_bench.report.page import aligned, facts, flat
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
 

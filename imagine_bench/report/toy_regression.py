@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from imagine_bench import registry
-from imagine_bench.regression_results import RegressionResult
+from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.sections import Picture, Section, Table, number, picture
 
 _REGION, _EDGE = (-10.0, 10.0), 30.0

@@ -31,6 +31,16 @@ _INPUTS = int(
 _BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
+def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
+    """Positions (nq,) and controls (nu,) of a whole scene, its arm at the observation pose with open fingers."""
+    qpos, ctrl = model.qpos0.copy(), np.zeros(model.nu)
+    targets = [*zip(ARM_JOINTS, OBSERVATION_QPOS_RAD, strict=True), *((name, REST_OPENING_M) for name in FINGER_JOINTS)]
+    for name, value in targets:
+        qpos[model.joint(name).qposadr[0]] = value
+        ctrl[model.actuator(name.replace("_slide", "") + "_servo").id] = value
+    return qpos, ctrl
+
+
 @dataclass(frozen=True, kw_only=True)
 class MacroResult:
     """What became of one macro-action.

@@ -16,8 +16,8 @@ from imagine_bench.checkpointing import Snapshot, load_newest, save_snapshot
 from imagine_bench.errors import DivergedError
 from imagine_bench.files import lock, make_folder
 from imagine_bench.regression import Assessment, Dataset, Floats, Regressor, RegressorContext
-from imagine_bench.regression_calibration import calibrate
-from imagine_bench.regression_results import Arrays, RegressionRun, Row, finish, load_run, write_rows
+from imagine_bench.regression.calibration import calibrate
+from imagine_bench.regression.results import Arrays, RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree
 

@@ -14,7 +14,7 @@ from imagine_bench.calibration import (
     transform_distance,
 )
 from imagine_bench.regression import SCORES, Floats, Mixtures, RegressionSpec, Regressor
-from imagine_bench.regression_results import Arrays, Row
+from imagine_bench.regression.results import Arrays, Row
 from imagine_bench.seeding import SeedTree
 
 POOLED_CRPS_POINTS = 50

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import write_bytes
-from imagine_bench.regression_protocol import RegressionProtocol
+from imagine_bench.regression.protocol import RegressionProtocol
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
 
