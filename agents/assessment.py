@@ -14,6 +14,7 @@ from imagine_bench.errors import require_known
 from .layers import Masks, MemberMLP
 from .precision import hidden_dtype
 from .settings import WorldModelSettings
+from .weight_samples import sample_outputs
 
 INPUTS = ("next_state", "transition")
 """What reward and termination may be read from: z', or z, one-hot a and z'."""
@@ -58,11 +59,24 @@ class Assessment(nn.Module):
         """Fresh dropout masks for ``rows`` transitions, one entry a network."""
         return [network.draw_masks(rows, dropout) for network in self.networks]
 
+    @property
+    def reward_network(self) -> MemberMLP:
+        """The network whose first output is the reward."""
+        return self.networks[0]  # type: ignore[return-value]
+
+    def sample_rewards(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
+        """Rewards of N transitions under each of T weight samples, masks (1, T, H) that all rows share: (T, N)."""
+        masks = [mask.squeeze(0) for mask in weights]
+        return sample_outputs(self.reward_network, self._read(z, action, next_z), masks)[..., 0]
+
+    def _read(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        return torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._transition else next_z
+
     def forward(
         self, z: Tensor, action: Tensor, next_z: Tensor, masks: list[Masks | None] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Rewards and termination logits of N transitions, without ``masks`` deterministic. Two of shape (N,)."""
-        read = torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._transition else next_z
+        read = self._read(z, action, next_z)
         drawn = [None] * len(self.networks) if masks is None else masks
         outputs = [
             network(read.unsqueeze(0), mask).squeeze(0) for network, mask in zip(self.networks, drawn, strict=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 from imagine_bench.interfaces import Follow, Frame, SampledFutures
 
 from .encoder import Encoder
-from .imagination import TERMINAL, Imagination, imagine_step
+from .imagination import TERMINAL, Imagination
 
 _PREDICTIONS = 20_000
 """Mixtures predicted at once, over weight samples and rows, to bound memory."""
@@ -70,13 +70,11 @@ def _predict(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Next latents (N, Z), rewards (N,) and P(terminal) (N,), under one draw of weight samples for all rows."""
     model, settings = imagination.model, imagination.settings
-    weights = model.draw_weights(settings.weight_samples, generator)
-    drawn = model.members * (1 if weights is None else settings.weight_samples)
+    weights = imagination.draw_weights(generator)
+    drawn = model.members * (1 if weights.dynamics is None else settings.weight_samples)
     size = max(1, _PREDICTIONS // drawn)
     parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)
-    steps = [
-        imagine_step(model, *part, weights, temperature=settings.temperature, generator=generator) for part in parts
-    ]
+    steps = [imagination.step(*part, weights, generator) for part in parts]
     next_z, reward, p_terminated = (
         torch.cat([getattr(step, name) for step in steps]) for name in ("next_z", "reward", "p_terminated")
     )

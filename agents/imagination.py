@@ -2,6 +2,8 @@
 
 From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
 dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
+Dynamics may be sure of a place where nobody has been and no reward was ever seen, so the filter can also read how much
+T weight samples of the reward network disagree there.
 """
 
 from __future__ import annotations
@@ -32,6 +34,19 @@ _CALIBRATION = 64
 
 
 @dataclass(frozen=True, slots=True)
+class Weights:
+    """Weight samples that all steps of a call share.
+
+    Attributes:
+        dynamics: Masks of the dynamics, (E, T, H); None drops nothing.
+        reward: Masks of the reward network, (1, T, H); None where the filter does not read it.
+    """
+
+    dynamics: Masks | None
+    reward: Masks | None
+
+
+@dataclass(frozen=True, slots=True)
 class Imagined:
     """One imagined step of N rollouts.
 
@@ -40,12 +55,15 @@ class Imagined:
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).
+        reward_doubt: Standard deviation of the reward over its network's weight samples, in units of reward; None where
+            the filter does not read it. Shape (N,).
     """
 
     next_z: Tensor
     reward: Tensor
     p_terminated: Tensor
     samples: Mixture
+    reward_doubt: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,22 +75,6 @@ class Counts:
     accepted: int
 
 
-def imagine_step(
-    model: WorldModel,
-    z: Tensor,
-    action: Tensor,
-    weights: Masks | None,
-    *,
-    temperature: float,
-    generator: torch.Generator,
-) -> Imagined:
-    """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
-    samples = model.predict(z, action, weights)  # [E T, N, ...]
-    next_z = mdn.sample(mdn.average(samples, model.members), temperature, generator)
-    reward, p_terminated = model.assess(z, action, next_z)
-    return Imagined(next_z, reward, p_terminated, samples)
-
-
 class Imagination:
     """A world model, what it imagines, and the filter between the two.
 
@@ -80,7 +82,7 @@ class Imagination:
         latent_size: Z.
         n_actions: A.
         settings: All hyperparameters of the learner.
-        filtered: Whether epistemic variance above the threshold discards a transition and the rest of its rollout.
+        filtered: Whether epistemic uncertainty above a threshold discards a transition and the rest of its rollout.
         seeds: This imagination's node of the seed tree.
         device: Where networks and memory lie.
 
@@ -103,6 +105,12 @@ class Imagination:
                 "The filter compares what several networks say, and with model.dropout 0 and model.members 1 there is "
                 "one. Set model.dropout above 0 or model.members above 1, or choose the agent without the filter."
             )
+        self._reads_reward = filtered and settings.imagination.reward_threshold is not None
+        if self._reads_reward and settings.model.dropout == 0.0:
+            raise InvalidValueError(
+                "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
+                "there is one. Set model.dropout above 0, or imagination.reward_threshold to null."
+            )
         self.settings, self.filtered = settings.imagination, filtered
         self._generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
@@ -120,6 +128,21 @@ class Imagination:
         parts = zip(*(getattr(drawn, field.name).split(size) for field in fields(Batch)), strict=True)
         return [self.model.update(Batch(*part), self._generators["dropout"]) for part in parts]
 
+    def draw_weights(self, generator: torch.Generator) -> Weights:
+        """T weight samples of what the filter reads."""
+        count = self.settings.weight_samples
+        dynamics = self.model.draw_weights(count, generator)
+        return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self._reads_reward else None)
+
+    def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
+        model = self.model
+        samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
+        next_z = mdn.sample(mdn.average(samples, model.members), self.settings.temperature, generator)
+        reward, p_terminated = model.assess(z, action, next_z)
+        doubt = None if weights.reward is None else model.reward_doubt(z, action, next_z, weights.reward)
+        return Imagined(next_z, reward, p_terminated, samples, doubt)
+
     def score(self, variances: Tensor) -> Tensor:
         """Reduce variances (..., Z) as the filter does. Shape (...)."""
         return self._reduce(variances)
@@ -128,7 +151,9 @@ class Imagination:
         """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
         if not self.filtered:
             return torch.ones_like(step.reward, dtype=torch.bool)
-        return self.score(decompose(step.samples).epistemic) <= self.threshold
+        known = self.score(decompose(step.samples).epistemic) <= self.threshold
+        limit = self.settings.reward_threshold
+        return known if limit is None or step.reward_doubt is None else known & (step.reward_doubt <= limit)
 
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts and store what the filter keeps.
@@ -142,12 +167,12 @@ class Imagination:
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
         settings, generator = self.settings, self._generators["rollouts"]
-        weights = self.model.draw_weights(settings.weight_samples, self._generators["dropout"])
+        weights = self.draw_weights(self._generators["dropout"])
         self.move_threshold(real, weights, self._generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):
             action = self.act(controller, z, max(epsilon, settings.exploration), generator)
-            step = imagine_step(self.model, z, action, weights, temperature=settings.temperature, generator=generator)
+            step = self.step(z, action, weights, generator)
             terminated = step.p_terminated > TERMINAL
             keep = self.keeps(step)
             kept = int(keep.sum())
@@ -166,12 +191,12 @@ class Imagination:
             return current.expand(self.settings.breadth, -1)
         return real.sample(self.settings.breadth, self._generators["replay"]).z
 
-    def move_threshold(self, real: RealMemory, weights: Masks | None, generator: torch.Generator) -> None:
+    def move_threshold(self, real: RealMemory, weights: Weights, generator: torch.Generator) -> None:
         """Let the threshold follow the model's doubt about what really happened, where the settings want that."""
         quantile = self.settings.threshold_quantile
         if self.filtered and quantile is not None:
             known = real.sample(_CALIBRATION, generator)
-            doubts = self.score(decompose(self.model.predict(known.z, known.action, weights)).epistemic)
+            doubts = self.score(decompose(self.model.predict(known.z, known.action, weights.dynamics)).epistemic)
             self.threshold = float(doubts.quantile(quantile))
 
     @staticmethod

@@ -14,7 +14,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Follow, Frame, ImaginedRollout, SampledFutures
 
 from .futures import sample_futures
-from .imagination import TERMINAL, Imagination, Imagined, imagine_step
+from .imagination import TERMINAL, Imagination, Imagined
 from .learner import Learner
 from .perception import load_perception, prepare_torch
 from .presets import settings_of
@@ -66,12 +66,11 @@ class ImaginingLearner(Learner):
     ) -> Iterator[tuple[Tensor, Tensor, Imagined]]:
         """Values before, action and result of each imagined step, one rollout."""
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
-        model, settings = self.imagination.model, self.imagination.settings
-        weights = model.draw_weights(settings.weight_samples, generator)
+        weights = self.imagination.draw_weights(generator)
         for index in range(depth if planned is None else len(planned)):
             values = self.tested.values(z)  # [1, A]
             action = values.argmax(dim=-1) if planned is None else torch.tensor([planned[index]], device=z.device)
-            step = imagine_step(model, z, action, weights, temperature=settings.temperature, generator=generator)
+            step = self.imagination.step(z, action, weights, generator)
             yield values, action, step
             if planned is None and float(step.p_terminated) > TERMINAL:
                 return

@@ -63,6 +63,7 @@ _RANGES = {
     "imagination.exploration": _PROBABILITY,
     "imagination.threshold": _NOT_NEGATIVE,
     "imagination.threshold_quantile": _PROBABILITY,
+    "imagination.reward_threshold": _NOT_NEGATIVE,
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 

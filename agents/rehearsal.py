@@ -12,7 +12,7 @@ from imagine_bench.seeding import SeedTree
 
 from . import snapshot
 from .controller import Controller, epsilon
-from .imagination import TERMINAL, Imagination, imagine_step
+from .imagination import TERMINAL, Imagination
 from .memory import Batch, ImaginedMemory, RealMemory, StartMemory
 from .meters import Meters
 from .settings import Settings
@@ -62,15 +62,13 @@ class Rehearsal:
             DivergedError: The controller's loss is no longer finite.
         """
         imagination, settings, generator = self._imagination, self._settings.imagination, self._generator
-        weights = imagination.model.draw_weights(settings.weight_samples, generator)
+        weights = imagination.draw_weights(generator)
         imagination.move_threshold(real, weights, generator)
         z, predicted, kept = starts.sample(1, generator), 0, 0
         while kept < settings.depth:
             chance = max(epsilon(self.steps, self._settings.controller), settings.exploration)
             action = imagination.act(self.controller, z, chance, generator)
-            step = imagine_step(
-                imagination.model, z, action, weights, temperature=settings.temperature, generator=generator
-            )
+            step = imagination.step(z, action, weights, generator)
             predicted += 1
             if not bool(imagination.keeps(step)):
                 break

@@ -107,6 +107,8 @@ class ImaginationSettings:
         threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
         threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
             epistemic variance of transitions that really happened, a batch of them a real step.
+        reward_threshold: If given, the filter reads the reward network too: the largest standard deviation of a reward
+            over T of its dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
     """
 
     start_episode: int = 1000
@@ -121,6 +123,7 @@ class ImaginationSettings:
     reduction: str = "max"
     threshold: float = 0.3
     threshold_quantile: float | None = None
+    reward_threshold: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -112,6 +112,10 @@ class WorldModel(nn.Module):
         """Draw T weight samples of each member: masks (E, T, H) that every state of a prediction shares."""
         return self.dynamics.draw_masks(count, dropout)
 
+    def draw_reward_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
+        """Draw T weight samples of the reward network: masks (1, T, H)."""
+        return self.assessment.reward_network.draw_masks(count, dropout)
+
     @torch.no_grad()
     def predict(self, z: Tensor, action: Tensor, weights: Masks | None) -> Mixture:
         """``p(z' | z, a)`` under every weight sample of every member, in one batched pass.
@@ -140,3 +144,16 @@ class WorldModel(nn.Module):
         """Predicted rewards and termination probabilities of N transitions, without dropout: two of shape (N,)."""
         reward, logit = self.assessment(z, action, next_z)
         return reward * self.settings.reward_scale, logit.sigmoid()
+
+    @torch.no_grad()
+    def reward_doubt(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
+        """Standard deviation of the rewards of N transitions over T weight samples, in units of reward: (N,).
+
+        Args:
+            z: Shape (N, Z).
+            action: Shape (N,).
+            next_z: Shape (N, Z).
+            weights: From :meth:`draw_reward_weights`.
+        """
+        samples = self.assessment.sample_rewards(z, action, next_z, weights)  # [T, N]
+        return samples.std(dim=0, correction=0) * self.settings.reward_scale

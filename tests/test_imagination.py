@@ -10,8 +10,9 @@ from imagine_bench.agents.controller import Controller
 from imagine_bench.agents.imagination import Imagination
 from imagine_bench.agents.memory import RealMemory
 from imagine_bench.agents.mixture import Mixture
-from imagine_bench.agents.settings import ImaginationSettings, Settings
+from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -27,11 +28,19 @@ class CountingModel:
 
     members = 1
 
-    def __init__(self, *, doubt_at: int = -1, end_at: int = -1) -> None:
-        self.doubt_at, self.end_at = doubt_at, end_at
+    def __init__(self, *, doubt_at: int = -1, end_at: int = -1, spurious_at: int = -1) -> None:
+        self.doubt_at, self.end_at, self.spurious_at = doubt_at, end_at, spurious_at
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> None:
         return None
+
+    def draw_reward_weights(self, count: int, dropout: torch.Generator) -> tuple[torch.Tensor, ...]:
+        return ()
+
+    def reward_doubt(
+        self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor, weights: tuple[torch.Tensor, ...]
+    ) -> torch.Tensor:
+        return 2.0 * (next_z[:, 1] == self.spurious_at)
 
     def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
         following = z + torch.tensor([0.0, 1.0])
@@ -87,6 +96,28 @@ def test_without_the_filter_doubt_is_kept() -> None:
     imagination, controller = make(filtered=False, model=CountingModel(doubt_at=5))
     counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert counts.accepted == counts.predicted == 30
+
+
+@pytest.mark.parametrize(("limit", "kept"), [(1.9, 4), (2.1, 10), (None, 10)])
+def test_a_reward_that_its_network_doubts_is_refused_with_the_rest_of_its_rollout(
+    limit: float | None, kept: int
+) -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(spurious_at=5), reward_threshold=limit)
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 3 * kept
+    assert stored_counts(imagination) == sorted(3 * [float(count) for count in range(1, kept + 1)])
+
+
+def test_without_the_filter_a_doubtful_reward_is_kept() -> None:
+    imagination, controller = make(filtered=False, model=CountingModel(spurious_at=5), reward_threshold=0.1)
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 30
+
+
+def test_a_reward_threshold_without_dropout_is_refused() -> None:
+    settings = Settings(
+        model=WorldModelSettings(dropout=0.0, members=3), imagination=ImaginationSettings(reward_threshold=1.0)
+    )
+    with pytest.raises(InvalidValueError, match=r"dropout samples of the reward network.*model\.dropout above 0"):
+        Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
 
 
 @pytest.mark.parametrize(("reduction", "accepted"), [("max", 12), ("mean", 30)])

@@ -116,6 +116,37 @@ def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
     assert torch.equal(repeated.means, together.means)
 
 
+@pytest.mark.parametrize("changes", [{}, {"shared_hidden": (16, 8)}, {"assessment_input": "transition"}])
+def test_the_doubt_about_a_reward_is_the_spread_of_a_loop_over_weight_samples(changes: dict[str, object]) -> None:
+    model = make(reward_scale=10.0, **changes)
+    weights = model.draw_reward_weights(7, torch.Generator().manual_seed(1))
+    assert weights is not None
+    z, action, next_z = CODES[:4], torch.tensor([0, 1, 0, 1]), CODES[1:5]
+    rewards = []
+    for sample in range(7):  # one dropped-out network after the other
+        one = tuple(mask[:, sample : sample + 1].expand(-1, 4, -1) for mask in weights)
+        rest = [None] * (len(model.assessment.networks) - 1)
+        with torch.no_grad():  # gradients would be computed in bfloat16
+            rewards.append(10.0 * model.assessment(z, action, next_z, [one, *rest])[0])
+    expected = torch.stack(rewards).std(dim=0, correction=0)  # [4]
+    assert expected.min() > 0.0, "weight samples must disagree"
+    torch.testing.assert_close(model.reward_doubt(z, action, next_z, weights), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_rewards_are_doubted_where_none_was_seen() -> None:
+    """Between two known states whose rewards differ the samples disagree; at the known ones they hardly do."""
+    model = make(dropout=0.25, learning_rate=5e-3)
+    draws, dropout = torch.Generator().manual_seed(1), torch.Generator().manual_seed(2)
+    for _ in range(600):
+        model.update(chain_batch(64, draws), dropout)
+    weights = model.draw_reward_weights(50, dropout)
+    assert weights is not None
+    known, action = CODES[:3], torch.zeros(3, dtype=torch.int64)
+    elsewhere = 3.0 * CODES[4] - 2.0 * CODES[:3]  # past the rewarded state, where nothing was seen
+    doubts = [model.reward_doubt(known, action, places, weights) for places in (known, elsewhere)]
+    assert doubts[1].min() > 2.0 * doubts[0].max()
+
+
 def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
     model = make()
     z, action = CODES[:4], torch.zeros(4, dtype=torch.int64)
