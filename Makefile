@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench plan generalise study view report encoder film doctor test test-slow lint speed clean
+.PHONY: help setup bench peers plan generalise study view report encoder film doctor test test-slow lint speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -25,6 +25,9 @@ setup: $(READY)  ## Install everything into .venv and stop
 
 bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
 	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) $(ARGS)
+
+peers: $(READY)  ## Train a library's agents on TASK, with the budgets and tests of our own
+	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) --agents sb3_dqn sb3_qrdqn sb3_dqn_latents --seeds 0 1 2 3 4 --budgets 100 250 500 1000 2000 $(ARGS)
 
 plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
 	@$(BIN)/imagine-bench plan --task $(TASK) $(ARGS)

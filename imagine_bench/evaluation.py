@@ -56,6 +56,25 @@ def play(
         before, over = after, terminated or truncated
 
 
+class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for.
+
+    Args:
+        env: The task's environment.
+        seed: The run's seed.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
+        super().__init__(env)
+        self._seed, self._episode = seed, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+        """Start the next training episode; ``seed`` changes nothing."""
+        start = episode_seed("training", self._seed, self._episode)
+        self._episode += 1
+        return self.env.reset(seed=start, options=options)
+
+
 @dataclass
 class Tally:
     """Counts over test episodes; a checkpoint may carry them half way.

@@ -332,6 +332,29 @@ class Rehearser(Protocol):
         """
 
 
+OnEpisode = Callable[[bool, int], bool]
+"""Told whether a training episode succeeded and its macro-actions; answers whether training goes on."""
+
+
+@runtime_checkable
+class SelfTrainer(Protocol):
+    """An agent whose training loop is its own, as a library's is; the bench only watches and tests it.
+
+    It cannot be stopped and taken up again: an interrupted run of it starts anew.
+    """
+
+    def train(self, env: Any, *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
+        """Train in ``env``, from nothing.
+
+        Args:
+            env: The task's Gymnasium environment; every reset is the next training episode of the run.
+            episodes: Real training episodes there will be.
+            horizon: Most macro-actions of one.
+            on_episode: To be told of each episode as it ends, before the next macro-action; it may ask the agent to
+                act. Training ends when it answers False.
+        """
+
+
 @runtime_checkable
 class Imaginer(Protocol):
     """An agent that can show what it imagines; it changes nothing in the agent."""

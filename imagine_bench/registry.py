@@ -84,6 +84,15 @@ AGENTS: dict[str, AgentEntry] = {
         encoder_kind="codes",
         settings="imagine_bench.agents.imagine.settings",
     ),
+    "sb3_dqn": AgentEntry(
+        make="imagine_bench.agents.peers:make_dqn", needs_encoder=False, settings="imagine_bench.agents.peer_settings"
+    ),
+    "sb3_qrdqn": AgentEntry(
+        make="imagine_bench.agents.peers:make_qrdqn", needs_encoder=False, settings="imagine_bench.agents.peer_settings"
+    ),
+    "sb3_dqn_latents": AgentEntry(
+        make="imagine_bench.agents.peers:make_dqn", settings="imagine_bench.agents.peer_settings"
+    ),
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
     "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),
 }

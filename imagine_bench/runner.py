@@ -19,11 +19,11 @@ import gymnasium
 from imagine_bench import registry, run_folder
 from imagine_bench.checkpointing import load_newest, save_snapshot
 from imagine_bench.errors import DivergedError
-from imagine_bench.evaluation import Tally, play
+from imagine_bench.evaluation import Tally, TrainingStarts, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
 from imagine_bench.imagination_quality import Question, ask, examples, imagine_courses, open_loop
-from imagine_bench.interfaces import FutureSampler, Imaginer, Rehearser
+from imagine_bench.interfaces import FutureSampler, Imaginer, Rehearser, SelfTrainer
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam
@@ -55,17 +55,19 @@ def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult | None:
     make_folder(folder)
     with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):  # a killed parent's child may be dying
         if not run_folder.is_done(folder):
-            protocol = spec.protocol
-            entry = registry.task_entry(protocol.task)
-            env = gymnasium.make(
-                entry.env_id,
-                execution=protocol.execution,
-                appearance=protocol.appearance,
-                disable_env_checker=True,  # the tests run it; here it would only cost time
-            )
-            with closing(env):
+            with closing(_make_env(spec)) as env:
                 _Run(spec, folder, on_progress, env).go_on()
     return run_folder.load_run(folder) if run_folder.is_done(folder) else None
+
+
+def _make_env(spec: RunSpec) -> gymnasium.Env[Any, Any]:
+    protocol = spec.protocol
+    return gymnasium.make(
+        registry.task_entry(protocol.task).env_id,
+        execution=protocol.execution,
+        appearance=protocol.appearance,
+        disable_env_checker=True,  # the tests run it; here it would only cost time
+    )
 
 
 class _Run:
@@ -77,7 +79,8 @@ class _Run:
         self.agent = registry.make_agent(spec.agent, spec.context())
         self.counters = Counters()
         run_folder.check_config(folder, self._config())
-        snapshot = load_newest(folder / "checkpoints")
+        by_itself = isinstance(self.agent, SelfTrainer)
+        snapshot = None if by_itself else load_newest(folder / "checkpoints")
         if snapshot is not None:
             self.agent.restore(snapshot.agent)
             self.counters = Counters.of(snapshot)
@@ -86,16 +89,40 @@ class _Run:
     def go_on(self) -> None:
         """Train and test at every budget that is wanted now; after the last one of all, finish."""
         try:
-            for budget in self.spec.budgets[len(self.counters.rows) :]:
-                if self.entry.learns:
-                    self._train(budget)
-                self._test(budget)
+            if isinstance(self.agent, SelfTrainer):
+                self._watch(self.agent)
+            else:
+                self._train_and_test()
         except DivergedError as error:
             where = save_snapshot(self.folder / "diverged", self.counters.snapshot(self.agent.state()))
             raise DivergedError(f"{error} The agent's state lies in {where}.") from error
         if len(self.counters.rows) == len(self.spec.protocol.budgets):
             self._finish()
         self._tell("done", at_once=True)
+
+    def _train_and_test(self) -> None:
+        for budget in self.spec.budgets[len(self.counters.rows) :]:
+            if self.entry.learns:
+                self._train(budget)
+            self._test(budget)
+
+    def _watch(self, agent: SelfTrainer) -> None:
+        """Let the agent train itself through all budgets, and test it, in an environment apart, at each of them."""
+        budgets, start_s = self.spec.protocol.budgets, time.process_time()
+
+        def on_episode(success: bool, length: int) -> bool:
+            nonlocal start_s
+            self.counters.add_episode(success, length)
+            self.counters.train_cpu_s += time.process_time() - start_s
+            self._tell("training")
+            if self.counters.episode in budgets:
+                self._test(self.counters.episode)
+            start_s = time.process_time()
+            return self.counters.episode < budgets[-1]
+
+        with closing(_make_env(self.spec)) as own:
+            starts = TrainingStarts(own, self.spec.seed)
+            agent.train(starts, episodes=budgets[-1], horizon=self.task.horizon, on_episode=on_episode)
 
     def _finish(self) -> None:
         """Look at the imagination, record, and mark the run as done."""
@@ -123,10 +150,7 @@ class _Run:
         for transition, info in play(self.env, self.agent, seed=seed, explore=True, privileged=self.entry.privileged):
             self.agent.observe(transition, episode=counters.episode)
             length, success = length + 1, bool(info["is_success"])
-        counters.episode += 1
-        counters.env_steps += length
-        counters.success.append(success)
-        counters.length.append(length)
+        counters.add_episode(success, length)
 
     def _test(self, budget: int) -> None:
         """Test at ``budget``; an agent that does not learn is tested once, and its row stands at every budget."""

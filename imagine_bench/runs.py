@@ -121,6 +121,13 @@ class Counters:
     length: list[int] = field(default_factory=list)
     test: Tally | None = None
 
+    def add_episode(self, success: bool, length: int) -> None:
+        """Count a training episode of so many macro-actions."""
+        self.episode += 1
+        self.env_steps += length
+        self.success.append(success)
+        self.length.append(length)
+
     def training(self) -> dict[str, NDArray[Any]]:
         """``success`` and ``length`` of every training episode. Each of shape (episodes,)."""
         return {

@@ -257,9 +257,9 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "imagination helped"),
-        ([50, 52, 54], "imagination did not help: it did worse"),
-        ([80, 100, 140], "which includes zero, so at this budget no help is shown"),
+        ([150, 152, 154], "so at this budget it is ahead"),
+        ([50, 52, 54], "so at this budget it is behind"),
+        ([80, 100, 140], "which includes zero, so at this budget no difference is shown"),
     ],
 )
 def test_the_answer_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:

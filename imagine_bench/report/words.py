@@ -47,6 +47,15 @@ _AGENTS = {
         "Sees discrete parts, learns which of them an action changes and what is rewarded, imagines every future "
         "within reach, goes where it is in doubt while it trains, and plans in its model when it is tested.",
     ),
+    "sb3_dqn": AgentWords(
+        "SB3 DQN (pixels)", "Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop."
+    ),
+    "sb3_qrdqn": AgentWords(
+        "SB3 QR-DQN (pixels)", "The same library's QR-DQN, which learns the distribution of the return, on pixels."
+    ),
+    "sb3_dqn_latents": AgentWords(
+        "SB3 DQN (latents)", "The same library's DQN on the latents that the suite's own DQN sees."
+    ),
     "imagination_only": AgentWords(
         "imagination only",
         "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world "
@@ -150,11 +159,11 @@ def _verdict(data: ReportData, agent: str) -> str:
         return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
     if difference.low > 0:
-        verdict = "so at this budget imagination helped"
+        verdict = "so at this budget it is ahead"
     elif difference.high < 0:
-        verdict = "so at this budget imagination did not help: it did worse"
+        verdict = "so at this budget it is behind"
     else:
-        verdict = "which includes zero, so at this budget no help is shown"
+        verdict = "which includes zero, so at this budget no difference is shown"
     return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons)}"
 
 

@@ -1,0 +1,40 @@
+"""Frames to latents for any Gymnasium learner: what the suite's own DQN sees, for a library's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame
+
+from .encoder import Encoder, bundled_encoder
+
+
+class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Any, Frame]):
+    """Replace each camera frame by the mean of its latents, float32 of shape (Z,).
+
+    Args:
+        env: An environment that gives frames (64, 64, 3), uint8.
+        encoder: An encoder, its file, or the name of a bundled one, such as ``"arrow_puzzle-clean"``.
+
+    Raises:
+        ArtefactError: There is no such encoder, or its file is damaged.
+    """
+
+    def __init__(self, env: gymnasium.Env[Frame, Any], encoder: Encoder | Path | str) -> None:
+        super().__init__(env)
+        self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.encoder.latent_size,), np.float32)
+
+    def observation(self, observation: Frame) -> NDArray[np.float32]:
+        """Latents (Z,) of one frame (64, 64, 3)."""
+        latents: NDArray[np.float32] = self.encoder.encode(observation[None])[0][0].cpu().numpy()
+        return latents
+
+
+def _path(encoder: Path | str) -> Path:
+    return encoder if isinstance(encoder, Path) else bundled_encoder(encoder)

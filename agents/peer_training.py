@@ -1,0 +1,31 @@
+"""The one place that speaks to the training loop of Stable-Baselines3: it is told of episodes, and told to stop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from imagine_bench.interfaces import OnEpisode
+
+
+class _EpisodeCounter(BaseCallback):
+    """Tells ``on_episode`` of each finished episode; training ends when it returns False."""
+
+    def __init__(self, on_episode: OnEpisode) -> None:
+        super().__init__()
+        self._on_episode = on_episode
+        self._length = 0
+
+    def _on_step(self) -> bool:
+        self._length += 1
+        (done,), (info,) = self.locals["dones"], self.locals["infos"]
+        if not done:
+            return True
+        length, self._length = self._length, 0
+        return self._on_episode(bool(info["is_success"]), length)
+
+
+def learn(model: Any, steps: int, on_episode: OnEpisode) -> None:
+    """Train for at most ``steps`` macro-actions, until ``on_episode`` says that it is enough."""
+    model.learn(steps, callback=_EpisodeCounter(on_episode), log_interval=None)
