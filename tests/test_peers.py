@@ -1,4 +1,4 @@
-"""Agents from Stable-Baselines3: they learn, the same way each time, from the starts that every agent of a seed meets."""
+"""Agents from Stable-Baselines3: they learn, the same each time, from the starts that every agent of a seed meets."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: P
 def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = do(tmp_path / "whole")
 
-    def killed(*arguments: Any) -> None:
+    def killed(*arguments: Any, **names: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -101,9 +101,10 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(f"No module named {name!r}")
 
+    context = spec("sb3_qrdqn").context()
     monkeypatch.setattr(peers.importlib, "import_module", missing)
     with pytest.raises(SetupError, match=r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"):
-        peers.make_qrdqn(spec("sb3_qrdqn").context())
+        peers.make_qrdqn(context)
 
 
 @pytest.mark.parametrize(
