@@ -27,6 +27,7 @@ from imagine_bench.store import newest_bench, newest_recording, read_protocol
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
+_TOGETHER = "imagine_bench.together:load_together"
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
@@ -90,12 +91,14 @@ class Report:
 
     folder: Annotated[Path | None, tyro.conf.Positional] = None
     """The bench's folder; by default the newest."""
+    beside: tuple[Path, ...] = ()
+    """Folders of other benches whose agents are shown beside it; all else in their protocols must be the same."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
     def __call__(self) -> None:
         """Load and write."""
-        _show(self.folder or newest_bench(self.out))
+        _show(self.folder or newest_bench(self.out), self.beside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -370,10 +373,11 @@ def _value(text: str) -> Any:
         return text
 
 
-def _show(folder: Path) -> None:
+def _show(folder: Path, beside: Sequence[Path] = ()) -> None:
     """Write a bench's report, and print its table and where everything lies."""
     kind = kind_of(read_protocol(folder).task)
-    result = registry.load(kind.load_so_far)(folder)
+    load = registry.load(kind.load_so_far)
+    result = registry.load(_TOGETHER)([folder, *beside]) if beside else load(folder)
     page = registry.load(kind.write_report)(result)
     print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")

@@ -67,11 +67,16 @@ def _largest_table(whole: Protocol, reached: dict[tuple[str, int], int]) -> Prot
 
 
 def _load(folder: Path, part: Protocol) -> RunResult:
-    result = run_folder.load_run(folder) if run_folder.is_done(folder) else _unfinished(folder)
-    episodes, whole = part.budgets[-1], len(result.checkpoints) == len(part.budgets)
+    return cut(run_folder.load_run(folder) if run_folder.is_done(folder) else _unfinished(folder), part)
+
+
+def cut(result: RunResult, part: Protocol) -> RunResult:
+    """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
+    kept = tuple(row for row in result.checkpoints if row.episodes in part.budgets)
+    episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
     return dataclasses.replace(
         result,
-        checkpoints=result.checkpoints[: len(part.budgets)],
+        checkpoints=kept,
         training_success=result.training_success[:episodes],
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),

@@ -97,6 +97,34 @@ def first_lasting(budgets: Sequence[int], scores: ArrayLike, level: float) -> in
     return budgets[first] if first < len(budgets) else None
 
 
+def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> NDArray[np.float64]:
+    """Area under each curve up to each budget, divided by the budget: the mean score of all episodes until then.
+
+    Curves are straight between tests, and from episode 0 to the first test.
+
+    Args:
+        budgets: Episodes at which there was a test, ascending. Length B.
+        scores: Shape (runs, B).
+        at_zero: Score before the first episode.
+
+    Returns:
+        Shape (runs, B).
+
+    Raises:
+        InvalidValueError: Not one score a budget.
+    """
+    table = _finite("scores", scores)
+    if table.ndim != 2 or table.shape[1] != len(budgets):
+        raise InvalidValueError(
+            f"{len(budgets)} budgets need scores of shape (runs, {len(budgets)}), not {table.shape}."
+        )
+    episodes = np.array([0, *budgets], dtype=np.float64)
+    values = np.concatenate([np.full((len(table), 1), at_zero), table], axis=1)  # [runs, B + 1]
+    pieces = np.diff(episodes) * (values[:, 1:] + values[:, :-1]) / 2.0
+    means: NDArray[np.float64] = pieces.cumsum(axis=1) / episodes[1:]
+    return means
+
+
 def probability_of_improvement(
     ours: ArrayLike, theirs: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
 ) -> Estimate:

@@ -146,6 +146,23 @@ def test_differences_and_gains_are_those_in_the_summary(folder: Path, page: Cell
     assert checked == 2 * 2 * 3
 
 
+def test_areas_in_the_page_are_those_in_the_summary_and_in_the_markdown(folder: Path, page: Cells) -> None:
+    summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv") if row["area"]}
+    shown = {
+        (data["data-agent"], data["data-area"]): re.findall(r"\d+\.\d", text)
+        for data, text in page.cells
+        if "data-area" in data
+    }
+    assert {agent for agent, _ in shown} == {"dqn", "imagination", "imagination_uncertainty"}
+    assert shown == {
+        key: [percent(float(row[name])) for name in ("area", "area_low_95", "area_high_95")]
+        for key, row in summary.items()
+    }
+    markdown = (folder / "report.md").read_text(encoding="utf-8")
+    for value, low, high in shown.values():
+        assert f"{value} [{low}, {high}]" in markdown
+
+
 def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
     by_cell = {
         (data["data-agent"], data["data-episodes"]): text

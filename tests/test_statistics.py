@@ -50,6 +50,22 @@ def test_bootstrap_resamples_within_strata() -> None:
     assert spread[1] - spread[0] > 3.0
 
 
+def test_running_means_by_hand() -> None:
+    # 0.1 at episode 0, 0.3 at 10, 0.5 at 30: areas 2 and 2 + 8.
+    means = statistics.running_means((10, 30), [[0.3, 0.5], [0.1, 0.1]], 0.1)
+    assert means == pytest.approx(np.array([[0.2, 10.0 / 30.0], [0.1, 0.1]]), abs=1e-12)
+
+
+def test_who_learns_earlier_has_the_larger_running_mean() -> None:
+    early, late = statistics.running_means((100, 250, 1000), [[0.9, 0.9, 0.9], [0.1, 0.1, 0.9]], 0.05)
+    assert (early > late).all()
+
+
+def test_running_means_need_one_score_a_budget() -> None:
+    with pytest.raises(InvalidValueError, match=r"2 budgets need scores of shape \(runs, 2\), not \(1, 3\)"):
+        statistics.running_means((10, 30), [[0.1, 0.2, 0.3]], 0.0)
+
+
 def test_bootstrap_repeats_and_brackets_the_point() -> None:
     scores = [0.2, 0.5, 0.55, 0.6, 0.9]
     first = statistics.bootstrap_interval(scores, rng())

@@ -22,7 +22,7 @@ BASE_AGENT = "dqn"
 _SUMMARY_COLUMNS = (
     *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
     *("difference_to_dqn", "difference_low_95", "difference_high_95", "gain", "gain_low_95", "gain_high_95"),
-    "thesis_gain",
+    *("thesis_gain", "area", "area_low_95", "area_high_95"),
 )
 
 
@@ -121,6 +121,8 @@ class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
 
     ``reached`` holds for each seed the first budget from which on success never falls below ``REACHED``, or None.
+    ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
+    budget, divided by the budget: the mean success until then, with its interval over seeds.
     """
 
     result: BenchResult
@@ -132,6 +134,7 @@ class ReportData:
     open_loop: dict[str, OpenLoop]
     futures: dict[str, FuturesSummary]
     reached: dict[str, tuple[int | None, ...]]
+    areas: dict[str, dict[int, statistics.Estimate]]
     timing: dict[str, Timing]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_source: str
@@ -151,19 +154,21 @@ class ReportData:
 def collect(result: BenchResult) -> ReportData:
     """Compute a report's numbers. The same result gives the same bits: the bootstrap's seed is the protocol's hash."""
     spec = registry.task(result.protocol.task)
-    agents = result.protocol.agents
+    facts, agents = spec.facts(), result.protocol.agents
+    learners = [agent for agent in agents if registry.agent_entry(agent).learns]
     thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in agents}
     open_loops = {agent: _open_loop(result.of(agent)) for agent in agents}
     return ReportData(
         result=result,
         spec=spec,
-        facts=spec.facts(),
+        facts=facts,
         scores={agent: _scores(result, agent, thesis[agent]) for agent in agents},
         comparisons=_comparisons(result, spec.reference),
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
-        reached={agent: _reached(result.of(agent)) for agent in agents if registry.agent_entry(agent).learns},
+        reached={agent: _reached(result.of(agent)) for agent in learners},
+        areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
@@ -214,7 +219,7 @@ def summary_csv(data: ReportData) -> str:
                 row.append("" if comparison.thesis_gain is None else comparison.thesis_gain)
             else:
                 row += [""] * 7
-            rows.append(row)
+            rows.append(row + list(data.areas.get(agent, {}).get(budget, [""] * 3)))
     return _csv(rows)
 
 
@@ -362,6 +367,18 @@ def _reached(runs: tuple[RunResult, ...]) -> tuple[int | None, ...]:
         return statistics.first_lasting([row.episodes for row in rows], [row.success_rate for row in rows], REACHED)
 
     return tuple(first(run) for run in runs)
+
+
+def _areas(result: BenchResult, agent: str, chance_level: float) -> dict[int, statistics.Estimate]:
+    budgets = result.protocol.budgets
+    means = statistics.running_means(budgets, result.success_rates(agent), chance_level)  # [seeds, B]
+    return {
+        budget: statistics.Estimate(
+            statistics.iqm(means[:, index]),
+            *statistics.bootstrap_interval(means[:, index], _rng(result, agent, budget, "area")),
+        )
+        for index, budget in enumerate(budgets)
+    }
 
 
 def _timing(runs: tuple[RunResult, ...]) -> Timing:

@@ -231,6 +231,7 @@ def _render(template: str, context: dict[str, Any]) -> str:
         thesis_text=_thesis_text,
         seconds=_seconds,
         lasting=words.lasting,
+        area_text=words.area_text,
         words=agent_words,
         color=plots.color,
     )

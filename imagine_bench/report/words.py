@@ -126,6 +126,8 @@ def answers(data: ReportData) -> list[str]:
             f"(chance {percent(data.facts.chance_level)}\u00a0%, optimum {percent(data.facts.optimum)}\u00a0%)."
         )
     sentences += [_verdict(data, agent) for agent in data.comparisons]
+    if len(data.areas) > 1:
+        sentences.append(_largest_area(data))
     if not data.comparisons:
         sentences.append(
             "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
@@ -136,6 +138,19 @@ def answers(data: ReportData) -> list[str]:
             "seeds: read it as a hint. The presets thesis (5 seeds) and full (20) settle more."
         )
     return sentences
+
+
+def _largest_area(data: ReportData) -> str:
+    budget = data.budgets[-1]
+    ranked = sorted(data.areas, key=lambda agent: data.areas[agent][budget].value, reverse=True)[:2]
+    first, second = (f"“{agent_words(agent).title}” ({area_text(data.areas[agent][budget])} %)" for agent in ranked)
+    return f"Over all episodes up to {budget:,} the mean success is highest for {first}; next is {second}."
+
+
+def area_text(area: Estimate) -> str:
+    """``61.3 [55.0, 67.2]``, or without the brackets where one seed allows no interval."""
+    interval = "" if math.isnan(area.low) else f" [{percent(area.low)}, {percent(area.high)}]"
+    return f"{percent(area.value)}{interval}"
 
 
 def _unfinished(data: ReportData) -> str:

@@ -1,0 +1,88 @@
+"""Several benches as one: different agents on the same test, each measured by its own command."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.partial import cut, load_so_far
+from imagine_bench.protocol import Protocol
+from imagine_bench.results import BenchResult
+
+_OWN = ("agents", "encoder", "codes")
+"""Fields in which such benches may differ; their encoders must agree where both have one."""
+
+
+def load_together(folders: Sequence[Path]) -> BenchResult:
+    """Read several benches, finished or not, that differ only in their agents.
+
+    Seeds and budgets are those that all of them have. The result's folder is a new one beside the first bench's, named
+    by what was compared.
+
+    Raises:
+        InvalidValueError: They differ in more, an agent is in two of them, or no seed or budget is in all.
+        ArtefactError: One is no bench of control, has nothing to show, or is damaged.
+    """
+    results = [load_so_far(folder) for folder in folders]
+    for result in results:
+        if not isinstance(result, BenchResult):
+            raise ArtefactError(f"{result.folder} is no bench of agents; only those can be shown together.")
+    protocol = _joined([result.protocol for result in results], folders)
+    folder = folders[0].parent / f"together-{protocol.hash}"
+    return BenchResult(
+        protocol=protocol,
+        runs=tuple(cut(run, protocol) for result in results for run in result.runs if run.seed in protocol.seeds),
+        environment=_environment(results),
+        folder=folder,
+        wall_s=sum(result.wall_s for result in results),
+    )
+
+
+def _joined(protocols: Sequence[Protocol], folders: Sequence[Path]) -> Protocol:
+    agents = tuple(agent for protocol in protocols for agent in protocol.agents)
+    if len(set(agents)) < len(agents):
+        raise InvalidValueError(f"The benches have an agent in common ({', '.join(agents)}); give each agent once.")
+    first = protocols[0]
+    for protocol, folder in zip(protocols, folders, strict=True):
+        for field in dataclasses.fields(Protocol):
+            ours, theirs = getattr(first, field.name), getattr(protocol, field.name)
+            if field.name not in (*_OWN, "seeds", "budgets") and ours != theirs:
+                raise InvalidValueError(
+                    f"{folder} has {field.name} {theirs!r} where {folders[0]} has {ours!r}; benches that are shown "
+                    "together differ in their agents only."
+                )
+    return dataclasses.replace(
+        first,
+        agents=agents,
+        seeds=_common([protocol.seeds for protocol in protocols], "seeds"),
+        budgets=_common([protocol.budgets for protocol in protocols], "budgets"),
+        encoder=_one([protocol.encoder for protocol in protocols]),
+        codes=_one([protocol.codes for protocol in protocols]),
+    )
+
+
+def _one(encoders: Sequence[str | None]) -> str | None:
+    found = sorted({encoder for encoder in encoders if encoder is not None})
+    if len(found) > 1:
+        raise InvalidValueError(f"The benches see through different encoders ({', '.join(found)}); give those of one.")
+    return found[0] if found else None
+
+
+def _common(values: Sequence[tuple[int, ...]], name: str) -> tuple[int, ...]:
+    kept = tuple(value for value in values[0] if all(value in other for other in values))
+    if not kept:
+        raise InvalidValueError(f"The benches have no {name} in common: {values}.")
+    return kept
+
+
+def _environment(results: Sequence[BenchResult]) -> dict[str, Any]:
+    benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
+    unfinished = [sentence for result in results for sentence in result.missing]
+    return {
+        "command": "; ".join(str(result.environment.get("command", "")) for result in results),
+        **({"unfinished": unfinished} if unfinished else {}),
+        **benches,
+    }

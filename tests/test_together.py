@@ -1,0 +1,72 @@
+"""Benches of different agents, shown as one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import bench_fakes
+import numpy as np
+import pytest
+from test_runner import small
+
+from imagine_bench.bench import bench
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.launchers import launcher
+from imagine_bench.results import BenchResult
+from imagine_bench.store import load_bench
+from imagine_bench.together import load_together
+
+
+def do(root: Path, *agents: str, **changes: Any) -> Path:
+    assert set(agents) <= set(bench_fakes.AGENTS)
+    result: BenchResult = bench(
+        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=launcher("local", 1), bars=1
+    )
+    return result.folder
+
+
+def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
+    first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
+    second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
+    joined = load_together([first, second])
+    assert (joined.protocol.agents, joined.protocol.seeds, joined.protocol.budgets) == (
+        ("oracle", "random"),
+        (1,),
+        (4, 9),
+    )
+    own = load_bench(second)
+    assert np.array_equal(joined.success_rates("random")[0], own.success_rates("random")[0, 1:])
+    assert joined.environment["bench 2"]["command"] == own.environment["command"]
+    assert joined.folder not in (first, second) and joined.folder.name.startswith("together-")
+    assert dataclasses.asdict(joined.protocol)["evaluation_episodes"] == 3
+
+
+@pytest.mark.parametrize(
+    ("agents", "changes", "words"),
+    [
+        (("oracle",), {}, "an agent in common"),
+        (("random",), {"appearance": "mild"}, "has appearance 'mild' where .* has 'clean'"),
+        (("random",), {"seeds": (5,)}, "have no seeds in common"),
+        (("random",), {"budgets": (3,)}, "have no budgets in common"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(
+    tmp_path: Path, agents: tuple[str, ...], changes: dict[str, Any], words: str
+) -> None:
+    first = do(tmp_path, "oracle")
+    other = do(tmp_path / "other", *agents, **changes)
+    with pytest.raises(InvalidValueError, match=words):
+        load_together([first, other])
+
+
+def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
+    assert main(["report", str(first), "--beside", str(second)]) == 0
+    shown = capsys.readouterr().out
+    assert "oracle" in shown and "random" in shown
+    (page,) = tmp_path.glob("*/together-*/report/index.html")
+    assert str(page) in shown
+    assert not (second / "report").exists()
