@@ -15,7 +15,7 @@ from imagine_bench.launchers import Failure, Job, Launcher
 from imagine_bench.progress import ProgressBars
 from imagine_bench.protocol import Protocol, protocol
 from imagine_bench.runs import Observer, Progress, RunSpec
-from imagine_bench.store import BenchStore, load_bench
+from imagine_bench.store import BenchStore, bench_folder, load_bench
 
 _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
 _NOTE_EVERY_S = 10.0
@@ -125,7 +125,7 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher, bars:
         SetupError: The folder cannot be written, or there is no GL.
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
-    store = BenchStore(root, wanted)
+    store = BenchStore(bench_folder(root, wanted), wanted)
     store.open()
     with store.lock():
         missing = len(store.missing())

@@ -25,7 +25,7 @@ def load_so_far(folder: Path) -> BenchResult:
         ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
     """
     whole = read_protocol(folder)
-    store = BenchStore(folder.parent.parent, whole)
+    store = BenchStore(folder, whole)
     if not store.missing():
         return load_bench(folder)
     reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}

@@ -27,13 +27,12 @@ class BenchStore:
     """The folder of one protocol.
 
     Args:
-        root: Folder of all benches, such as ``runs``.
+        folder: The folder itself: that of :func:`bench_folder`, or wherever somebody has moved it to.
         protocol: What is compared, of any kind.
     """
 
-    def __init__(self, root: Path, protocol: Any) -> None:
-        self.protocol = protocol
-        self.folder = root / protocol.task / f"{protocol.preset}-{protocol.hash}"
+    def __init__(self, folder: Path, protocol: Any) -> None:
+        self.protocol, self.folder = protocol, folder
         self._began_s = time.monotonic()
         self._sittings: list[dict[str, Any]] = []
 
@@ -99,6 +98,11 @@ class BenchStore:
         """Note how long this sitting has lasted, so that a kill loses little of the count."""
         self._sittings[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
         write_json(self.folder / _SITTINGS, self._sittings)
+
+
+def bench_folder(root: Path, protocol: Any) -> Path:
+    """Where the bench of a protocol belongs below ``root``, the folder of all benches, such as ``runs``."""
+    return Path(root / protocol.task / f"{protocol.preset}-{protocol.hash}")
 
 
 def load_bench(folder: Path) -> Any:

@@ -12,13 +12,14 @@ from test_runner import do, same_but_for_time, small
 from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.results import OpenLoop
-from imagine_bench.store import BenchStore, load_bench, newest_bench, newest_recording
+from imagine_bench.store import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
 
 def opened(root: Path, **changes: object) -> BenchStore:
-    store = BenchStore(root, small(**changes))
+    protocol = small(**changes)
+    store = BenchStore(bench_folder(root, protocol), protocol)
     store.open()
     return store
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -98,6 +99,8 @@ def test_an_unfinished_bench_shows_its_largest_complete_table(
     assert result.protocol.seeds == seeds
     assert result.protocol.budgets == budgets
     assert folder.name == f"smoke-{result.protocol_hash}"
+    elsewhere = shutil.copytree(folder, tmp_path / "carried elsewhere")
+    assert load_so_far(elsewhere).protocol == result.protocol
     assert len(result.runs) == 2 * len(seeds)
     assert all(len(run.training_length) == budgets[-1] for run in result.runs)
     done = sum(

@@ -88,7 +88,7 @@ def all_plots(data: ReportData) -> list[Plot]:
     if data.acceptance:
         alt = "Share of imagined transitions kept, by real training episodes."
         plots.append(_render("acceptance", acceptance_figure, data, alt))
-    if data.open_loop:
+    if any(len(loop.correct) > 1 for loop in data.open_loop.values()):  # one depth is a table, not a curve
         alt = "Open-loop quality of imagination by depth: correct share, errors, uncertainties."
         plots.append(_render("open_loop", open_loop_figure, data, alt))
     if data.futures:
