@@ -121,6 +121,14 @@ class Imagination:
         self._reduce = reduction(self.settings.reduction)
         self.threshold = self.settings.threshold
 
+    def carry_over(self) -> None:
+        """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
+        known, model = self.model.dynamics.state_dict(), self.model
+        self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self._generators["weights"])
+        self.model.dynamics.load_state_dict(known)
+        self.memory.clear()
+        self.threshold = self.settings.threshold
+
     def learn(self, real: RealMemory) -> list[ModelLosses]:
         """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
         updates, size = self.model.settings.updates_per_step, self.model.settings.batch_size

@@ -13,6 +13,7 @@ from torch import Tensor
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Follow, Frame, ImaginedRollout, SampledFutures
 
+from .controller import Controller
 from .futures import sample_futures
 from .imagination import TERMINAL, Imagination, Imagined
 from .learner import Learner
@@ -27,6 +28,17 @@ class ImaginingLearner(Learner):
     """A learner whose imagination can be looked at."""
 
     imagination: Imagination
+
+    def carry_over(self) -> None:
+        """Keep the network of the dynamics; see :class:`imagine_bench.interfaces.Transferable`.
+
+        Reward, termination, controller, memories and the schedule of exploration begin anew.
+        """
+        self.imagination.carry_over()
+        size, settings = self.perception.latent_size, self.settings.controller
+        self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
+        self.real.clear()
+        self.steps = 0
 
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator

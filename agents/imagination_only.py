@@ -67,6 +67,13 @@ class ImaginationOnly(ImaginingLearner):
         super().observe(transition, episode=episode)
         self.meters.count("time/rehearsal_s")
 
+    def carry_over(self) -> None:
+        """As every imagining learner; starts and rehearsal begin anew too."""
+        super().carry_over()
+        self._starts.clear()
+        self._episode = -1
+        self.rehearsal.begin(0)
+
     def rehearse(self) -> bool:
         """One imagined episode; see :class:`imagine_bench.interfaces.Rehearser`. Real steps call for a new rehearsal.
 

@@ -47,6 +47,10 @@ class _Ring:
     def __len__(self) -> int:
         return min(self.added, self.capacity)
 
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.added = 0
+
     def _write(self, rows: dict[str, Tensor]) -> None:
         count = len(next(iter(rows.values())))
         device = next(iter(self._columns.values())).device

@@ -16,6 +16,7 @@ from imagine_bench.progress import ProgressBars
 from imagine_bench.protocol import Protocol, protocol
 from imagine_bench.runs import Observer, Progress, RunSpec
 from imagine_bench.store import BenchStore, bench_folder, load_bench
+from imagine_bench.teaching import require_able
 
 _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
 _NOTE_EVERY_S = 10.0
@@ -57,7 +58,7 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
 
     Raises:
         UnknownNameError: Any name that does not exist; the message lists those that do.
-        InvalidValueError: A value out of its range.
+        InvalidValueError: A value out of its range, or something that an agent cannot do.
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
     """
@@ -68,7 +69,20 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
     paths = _encoders(wanted, encoder)
     names = {"encoder": "latents", "codes": "codes"}
     identities = {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
-    return protocol(task, preset, **{**changes, **identities}), paths
+    whole = protocol(task, preset, **{**changes, **identities})
+    if whole.after or whole.demonstrations or whole.questions:
+        _check_abilities(whole, paths)
+    return whole, paths
+
+
+def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
+    """Build every learner once, to see whether it can do what only some can."""
+    for agent in wanted.agents:
+        entry = registry.agent_entry(agent)
+        if entry.learns:
+            encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
+            spec = RunSpec(protocol=wanted, agent=agent, seed=wanted.seeds[0], encoder=encoder)
+            require_able(registry.make_agent(agent, spec.context()), agent, wanted)
 
 
 def check_overrides(wanted: Protocol) -> None:

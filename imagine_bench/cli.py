@@ -60,6 +60,14 @@ class Bench:
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
     ] = None
     """Another encoder: a bundled name or a .safetensors file."""
+    after: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: none)")] = ()
+    """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
+    after_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
+    """Real training episodes on each of them."""
+    demonstrations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    """First training episodes that the oracle plays and learners watch; budgets count them."""
+    questions: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    """Most questions to a teacher in a training episode."""
     set: tuple[str, ...] = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
@@ -75,7 +83,7 @@ class Bench:
         """Plan, run, report."""
         names = (
             "agents", "seeds", "budgets", "evaluation_episodes", "execution", "appearance", "variants", "networks",
-            "encoder",
+            "encoder", "after", "after_episodes", "demonstrations", "questions",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) not in ((), None)}
         wanted, encoder = plan(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,13 @@ def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
 
 
 def play(
-    env: gymnasium.Env[Any, Any], agent: Agent, *, seed: int, explore: bool, privileged: bool
+    env: gymnasium.Env[Any, Any],
+    agent: Agent,
+    *,
+    seed: int,
+    explore: bool,
+    privileged: bool,
+    before_acting: Callable[[Observation, Info], None] | None = None,
 ) -> Iterator[tuple[Transition, Info]]:
     """One episode, a real transition at a time; the agent learns nothing here.
 
@@ -32,6 +38,7 @@ def play(
         seed: Decides the whole episode but for the agent: the environment carries nothing over from the one before.
         explore: Whether the agent explores.
         privileged: Whether it is shown the macrostate.
+        before_acting: Called with what the agent sees and the ``info`` that it does not, before each macro-action.
 
     Yields:
         Each transition with the ``info`` that followed it.
@@ -39,6 +46,8 @@ def play(
     frame, info = env.reset(seed=seed)
     before, over = observation(frame, info, privileged=privileged), False
     while not over:
+        if before_acting is not None:
+            before_acting(before, info)
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
         after = observation(frame, info, privileged=privileged)

@@ -356,6 +356,45 @@ class SelfTrainer(Protocol):
 
 
 @runtime_checkable
+class Transferable(Protocol):
+    """An agent that can take what it knows of a world into another task in the same world."""
+
+    def carry_over(self) -> None:
+        """Keep what was learned of how the world moves; forget what is rewarded and what ends an episode.
+
+        The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a teacher says of an action that was only imagined: the reward it would bring, and whether it would end
+    the episode.
+    """
+
+    reward: float
+    terminated: bool
+
+
+@runtime_checkable
+class Questioner(Protocol):
+    """An agent that can ask a teacher what actions which it only imagines would bring."""
+
+    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+        """Before it acts: the macro-actions whose last one is asked about, from the frame seen, or None to ask nothing.
+
+        It changes nothing but the agent's measurements.
+
+        Returns:
+            Macro-actions (D,) with D of at least 1. The scene is imagined to go on through ends of episodes, so the
+            answer concerns the last one alone.
+        """
+
+    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+        """Take in the answer to :meth:`question`; None says that it is a matter of chance, so that there is none."""
+
+
+@runtime_checkable
 class Imaginer(Protocol):
     """An agent that can show what it imagines; it changes nothing in the agent."""
 

@@ -18,6 +18,7 @@ _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
+_AFTER_EPISODES = 100
 _FIRST_WAVE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
 
@@ -73,6 +74,12 @@ class Protocol(ProtocolData):
         encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
         codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
         device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
+        after: Tasks of the same world that learners are trained on before, in this order; what they know of the
+            world is carried over, what is rewarded is forgotten. Budgets count episodes of ``task`` alone.
+        after_episodes: Real training episodes on each of them.
+        demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
+            observe; they are real episodes as any, and budgets count them.
+        questions: Most questions that learners may ask a teacher in a training episode.
     """
 
     task: str
@@ -91,6 +98,10 @@ class Protocol(ProtocolData):
     encoder: str | None = None
     codes: str | None = None
     device: str = "cpu"
+    after: tuple[str, ...] = ()
+    after_episodes: int = _AFTER_EPISODES
+    demonstrations: int = 0
+    questions: int = 0
 
     def __post_init__(self) -> None:
         task_entry(self.task)
@@ -106,12 +117,26 @@ class Protocol(ProtocolData):
             raise InvalidValueError(f"agents {self.agents} must be at least one name, none of them twice.")
         if self.evaluation_episodes < 1:
             raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
+        require_same_world(self.task, self.after)
+        if self.after_episodes < 1 or (not self.after and self.after_episodes != _AFTER_EPISODES):
+            raise InvalidValueError(
+                f"after_episodes is {self.after_episodes} with after {self.after}; give at least 1, and the tasks."
+            )
+        if self.demonstrations < 0:
+            raise InvalidValueError(f"demonstrations is {self.demonstrations}; give at least 0 episodes.")
+        if self.questions < 0:
+            raise InvalidValueError(f"questions is {self.questions}; give at least 0, the most in one episode.")
 
     def work(self, agent: str, until: int | None = None) -> int:
         """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
         budgets = [budget for budget in self.budgets if until is None or budget <= until]
         tests = self.evaluation_episodes
-        return budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+        return self.episodes_before + budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+
+    @property
+    def episodes_before(self) -> int:
+        """Real training episodes on earlier tasks."""
+        return len(self.after) * self.after_episodes
 
     @property
     def waves(self) -> tuple[int | None, ...]:
@@ -119,9 +144,12 @@ class Protocol(ProtocolData):
         return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_WAVE), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy; without ``codes`` where there are none, as in the protocols from before them."""
-        data = super().as_dict()
-        return data if self.codes is not None else {key: value for key, value in data.items() if key != "codes"}
+        """A JSON-serialisable copy; without the younger fields where they are at rest, as in protocols from before."""
+        resting = {
+            *(name for name in ("codes", "after", "demonstrations", "questions") if not getattr(self, name)),
+            *(() if self.after else ("after_episodes",)),
+        }
+        return {name: value for name, value in super().as_dict().items() if name not in resting}
 
     def encoder_of(self, kind: str) -> str | None:
         """Identity of the encoder for the agents that take this kind."""
@@ -178,6 +206,23 @@ def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> N
         raise InvalidValueError(
             f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
         )
+
+
+def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
+    """Raise InvalidValueError for an earlier task that is not of the world of task ``name``, or UnknownNameError.
+
+    Tasks are of one world if their frames are preprocessed and encoded alike and their macro-actions have one meaning.
+    """
+    for other in earlier:
+        task_entry(other)
+        for field in ("encoder", "preprocessing", "action_names"):
+            here, there = getattr(task(name), field), getattr(task(other), field)
+            if here != there:
+                raise InvalidValueError(
+                    f"{name} cannot come after {other}: what is known of one world is of no use in another ({field} is "
+                    f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
+                    "arrow_puzzle_hard."
+                )
 
 
 def require_unmixed(seeds: tuple[int, ...]) -> None:

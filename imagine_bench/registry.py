@@ -63,6 +63,18 @@ TASKS: dict[str, TaskEntry] = {
         env="imagine_bench.tasks.arrow_puzzle:make_hard_env",
         horizon=10,
     ),
+    "arrow_puzzle_toward": TaskEntry(
+        spec="imagine_bench.tasks.arrow_puzzle:TOWARD_SPEC",
+        env_id="imagine_bench/ArrowPuzzleToward-v0",
+        env="imagine_bench.tasks.arrow_puzzle:make_toward_env",
+        horizon=10,
+    ),
+    "arrow_puzzle_clockwise": TaskEntry(
+        spec="imagine_bench.tasks.arrow_puzzle:CLOCKWISE_SPEC",
+        env_id="imagine_bench/ArrowPuzzleClockwise-v0",
+        env="imagine_bench.tasks.arrow_puzzle:make_clockwise_env",
+        horizon=10,
+    ),
     "pick_place": TaskEntry(
         spec="imagine_bench.tasks.pick_place:SPEC",
         env_id="imagine_bench/PickPlace-v0",
@@ -96,6 +108,10 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
     "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),
 }
+
+
+DEMONSTRATOR = "oracle"
+"""The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,10 +23,11 @@ from imagine_bench.evaluation import Tally, TrainingStarts, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
 from imagine_bench.imagination_quality import Question, ask, examples, imagine_courses, open_loop
-from imagine_bench.interfaces import FutureSampler, Imaginer, Rehearser, SelfTrainer
+from imagine_bench.interfaces import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam
+from imagine_bench.teaching import Lesson, Teacher, as_seen, demonstrator, require_able
 
 IMAGINED_DEPTH = 10
 """Steps of the open-loop comparison, the thesis' I_D."""
@@ -60,10 +61,11 @@ def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RunResult | None:
     return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 
-def _make_env(spec: RunSpec) -> gymnasium.Env[Any, Any]:
+def _make_env(spec: RunSpec, task: str | None = None) -> gymnasium.Env[Any, Any]:
+    """The environment of a run's own task, or of another one as the run has it."""
     protocol = spec.protocol
     return gymnasium.make(
-        registry.task_entry(protocol.task).env_id,
+        registry.task_entry(task or protocol.task).env_id,
         execution=protocol.execution,
         appearance=protocol.appearance,
         disable_env_checker=True,  # the tests run it; here it would only cost time
@@ -77,6 +79,8 @@ class _Run:
         self.entry = registry.agent_entry(spec.agent)
         self.seeds = SeedTree(spec.seed)
         self.agent = registry.make_agent(spec.agent, spec.context())
+        if self.entry.learns:
+            require_able(self.agent, spec.agent, spec.protocol)
         self.counters = Counters()
         run_folder.check_config(folder, self._config())
         by_itself = isinstance(self.agent, SelfTrainer)
@@ -101,6 +105,8 @@ class _Run:
         self._tell("done", at_once=True)
 
     def _train_and_test(self) -> None:
+        if isinstance(self.agent, Transferable):
+            self._train_before(self.agent)
         for budget in self.spec.budgets[len(self.counters.rows) :]:
             if self.entry.learns:
                 self._train(budget)
@@ -144,13 +150,48 @@ class _Run:
             self._tell("training")
             self._save_now_and_then()
 
+    def _train_before(self, agent: Transferable) -> None:
+        """Train on the tasks that come before; after the last episode of each, carry over to the next."""
+        protocol, counters = self.spec.protocol, self.counters
+        for index, task in enumerate(protocol.after):
+            end = (index + 1) * protocol.after_episodes
+            if counters.before >= end:
+                continue
+            with closing(_make_env(self.spec, task)) as env:
+                while counters.before < end:
+                    start_s = time.process_time()
+                    self._earlier_episode(env, counters.before % protocol.after_episodes)
+                    if counters.before == end:
+                        agent.carry_over()
+                    counters.train_cpu_s += time.process_time() - start_s
+                    self._tell("training")
+                    self._save_now_and_then()
+
+    def _earlier_episode(self, env: gymnasium.Env[Any, Any], episode: int) -> None:
+        seed = episode_seed("earlier_training", self.spec.seed, self.counters.before)
+        for transition, _ in play(env, self.agent, seed=seed, explore=True, privileged=False):
+            self.agent.observe(transition, episode=episode)
+        self.counters.before += 1
+
     def _training_episode(self) -> None:
         counters, length, success = self.counters, 0, False
         seed = episode_seed("training", self.spec.seed, counters.episode)
-        for transition, info in play(self.env, self.agent, seed=seed, explore=True, privileged=self.entry.privileged):
-            self.agent.observe(transition, episode=counters.episode)
+        if counters.episode < self.spec.protocol.demonstrations:
+            lesson, actor, privileged = None, demonstrator(self.spec), True
+        else:
+            lesson, actor, privileged = self._lesson(), self.agent, self.entry.privileged
+        episode = play(self.env, actor, seed=seed, explore=True, privileged=privileged, before_acting=lesson)
+        for transition, info in episode:
+            seen = transition if self.entry.privileged else as_seen(transition)
+            self.agent.observe(seen, episode=counters.episode)
             length, success = length + 1, bool(info["is_success"])
-        counters.add_episode(success, length)
+        counters.add_episode(success, length, questions=0 if lesson is None else lesson.asked)
+
+    def _lesson(self) -> Lesson | None:
+        questions = self.spec.protocol.questions
+        if not questions or not isinstance(self.agent, Questioner):
+            return None
+        return Lesson(self.agent, Teacher(self.task.rules), questions)
 
     def _test(self, budget: int) -> None:
         """Test at ``budget``; an agent that does not learn is tested once, and its row stands at every budget."""
@@ -289,7 +330,12 @@ class _Run:
         self.reported_s = now_s
         counters, test = self.counters, self.counters.test
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
-        done = counters.episode + tested * self.spec.protocol.evaluation_episodes + (test.episodes if test else 0)
+        done = (
+            counters.before
+            + counters.episode
+            + tested * self.spec.protocol.evaluation_episodes
+            + (test.episodes if test else 0)
+        )
         recent = counters.success[-_RECENT:]
         if test is not None and test.episodes:
             success: float | None = test.successes / test.episodes

@@ -104,40 +104,47 @@ class Counters:
     """The runner's own state, all of it in every checkpoint.
 
     Attributes:
+        before: Training episodes on earlier tasks done.
         episode: Training episodes done.
         env_steps: Macro-actions in them.
         train_cpu_s: CPU seconds of training.
         rows: One a budget done.
         success: Whether each training episode succeeded.
         length: Macro-actions of each training episode.
+        questions: Questions asked in each training episode.
         test: The test that is going on, if one is.
     """
 
+    before: int = 0
     episode: int = 0
     env_steps: int = 0
     train_cpu_s: float = 0.0
     rows: list[Checkpoint] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
     length: list[int] = field(default_factory=list)
+    questions: list[int] = field(default_factory=list)
     test: Tally | None = None
 
-    def add_episode(self, success: bool, length: int) -> None:
-        """Count a training episode of so many macro-actions."""
+    def add_episode(self, success: bool, length: int, questions: int = 0) -> None:
+        """Count a training episode of so many macro-actions, and questions asked in it."""
         self.episode += 1
         self.env_steps += length
         self.success.append(success)
         self.length.append(length)
+        self.questions.append(questions)
 
     def training(self) -> dict[str, NDArray[Any]]:
-        """``success`` and ``length`` of every training episode. Each of shape (episodes,)."""
+        """``success``, ``length`` and ``questions`` of every training episode. Each of shape (episodes,)."""
         return {
             "success": np.array(self.success, dtype=np.bool_),
             "length": np.array(self.length, dtype=np.int64),
+            "questions": np.array(self.questions, dtype=np.int64),
         }
 
     def snapshot(self, agent: AgentState) -> Snapshot:
         """Everything, with the agent's state, as a checkpoint."""
         values = {
+            "before": self.before,
             "env_steps": self.env_steps,
             "train_cpu_s": self.train_cpu_s,
             "rows": [run_folder.checkpoint_to_json(row) for row in self.rows],
@@ -154,12 +161,15 @@ class Counters:
             name.removeprefix(_FUTURES): array for name, array in snapshot.arrays.items() if name.startswith(_FUTURES)
         }
         rows = [run_folder.checkpoint_from_json(row) for row in values["rows"]]
+        length = snapshot.arrays["length"].tolist()
         return cls(
+            before=values.get("before", 0),  # absent, as are questions, in snapshots from before there were any
             episode=snapshot.episode,
             env_steps=values["env_steps"],
             train_cpu_s=values["train_cpu_s"],
             rows=list(run_folder.with_futures(rows, futures)),
             success=snapshot.arrays["success"].tolist(),
-            length=snapshot.arrays["length"].tolist(),
+            length=length,
+            questions=snapshot.arrays["questions"].tolist() if "questions" in snapshot.arrays else [0] * len(length),
             test=None if values["test"] is None else Tally(**values["test"]),
         )

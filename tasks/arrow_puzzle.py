@@ -1,4 +1,7 @@
-"""The arrow puzzle (thesis, chapter 5) and its hard variant: what the bench needs to know, and the environments.
+"""The arrow puzzle (thesis, chapter 5) and its family: what the bench needs to know, and the environments.
+
+The members of the family share scene, macro-actions and the illegal rule, and so encoders and everything that moves;
+they differ in the goal alone: what has been learned of the world in one of them is true in every other.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """
@@ -13,7 +16,15 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Promises, TaskSpec
 
-from .arrow_rules import N_CUBES, ArrowPuzzleRules
+from .arrow_rules import (
+    N_CUBES,
+    ArrowPuzzleRules,
+    Goal,
+    left_and_clear_clockwise,
+    toward_agent,
+    toward_human,
+    toward_human_alone,
+)
 from .rules import facts
 
 if TYPE_CHECKING:
@@ -24,8 +35,7 @@ _DIRECTIONS = ("toward the human", "right", "toward the agent", "left")
 _CUBES = ("left", "middle", "right")
 _PLAY = (
     "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a time. "
-    "The arrow of the cube pointed at must come to point toward the human{extra}, and no two arrows may ever point "
-    "the same way."
+    "{wanted}, and no two arrows may ever point the same way."
 )
 
 
@@ -49,13 +59,15 @@ def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.
     return frames_of(ArrowWorld, SPEC.rules, macrostates, appearance, rng)
 
 
-def _spec(*, hard: bool) -> TaskSpec:
-    rules = ArrowPuzzleRules(hard=hard)
+def _spec(
+    name: str, title: str, env_id: str, goal: Goal, wanted: str, *, reference: str | None, promises: Promises | None
+) -> TaskSpec:
+    rules = ArrowPuzzleRules(goal)
     return TaskSpec(
-        id="arrow_puzzle_hard" if hard else "arrow_puzzle",
-        title="Arrow puzzle, hard" if hard else "Arrow puzzle",
-        description=_PLAY.format(extra=", no arrow toward the agent" if hard else ""),
-        env_id="imagine_bench/ArrowPuzzleHard-v0" if hard else "imagine_bench/ArrowPuzzle-v0",
+        id=name,
+        title=title,
+        description=_PLAY.format(wanted=wanted),
+        env_id=env_id,
         horizon=HORIZON,
         action_names=tuple(
             f"turn the {cube} cube {way}" for cube in _CUBES for way in ("clockwise", "counter-clockwise")
@@ -67,13 +79,47 @@ def _spec(*, hard: bool) -> TaskSpec:
         rules=rules,
         facts=functools.partial(facts, rules, HORIZON),
         render_macrostates=render_macrostates,
-        reference="arrow_puzzle_hard" if hard else "arrow_puzzle",
-        promises=None if hard else _PROMISES,
+        reference=reference,
+        promises=promises,
     )
 
 
-SPEC = _spec(hard=False)
-HARD_SPEC = _spec(hard=True)
+SPEC = _spec(
+    "arrow_puzzle",
+    "Arrow puzzle",
+    "imagine_bench/ArrowPuzzle-v0",
+    toward_human,
+    "The arrow of the cube pointed at must come to point toward the human",
+    reference="arrow_puzzle",
+    promises=_PROMISES,
+)
+HARD_SPEC = _spec(
+    "arrow_puzzle_hard",
+    "Arrow puzzle, hard",
+    "imagine_bench/ArrowPuzzleHard-v0",
+    toward_human_alone,
+    "The arrow of the cube pointed at must come to point toward the human, no arrow toward the agent",
+    reference="arrow_puzzle_hard",
+    promises=None,
+)
+TOWARD_SPEC = _spec(
+    "arrow_puzzle_toward",
+    "Arrow puzzle, toward the agent",
+    "imagine_bench/ArrowPuzzleToward-v0",
+    toward_agent,
+    "The arrow of the cube pointed at must come to point toward the agent",
+    reference=None,
+    promises=None,
+)
+CLOCKWISE_SPEC = _spec(
+    "arrow_puzzle_clockwise",
+    "Arrow puzzle, clockwise",
+    "imagine_bench/ArrowPuzzleClockwise-v0",
+    left_and_clear_clockwise,
+    "The arrow of the cube pointed at must come to point left, with no arrow a quarter turn clockwise of it",
+    reference=None,
+    promises=None,
+)
 
 
 def _make(spec: TaskSpec, options: dict[str, Any]) -> MacroEnv:
@@ -91,3 +137,13 @@ def make_env(**options: Any) -> MacroEnv:
 def make_hard_env(**options: Any) -> MacroEnv:
     """The hard variant; ``options`` are the keyword arguments of MacroEnv."""
     return _make(HARD_SPEC, options)
+
+
+def make_toward_env(**options: Any) -> MacroEnv:
+    """The arrow pointed at toward the agent; ``options`` are the keyword arguments of MacroEnv."""
+    return _make(TOWARD_SPEC, options)
+
+
+def make_clockwise_env(**options: Any) -> MacroEnv:
+    """The arrow pointed at to the left, nothing clockwise of it; ``options`` are the keyword arguments of MacroEnv."""
+    return _make(CLOCKWISE_SPEC, options)

@@ -1,11 +1,13 @@
-"""The rules of the arrow puzzle (thesis, chapter 5) and of its hard variant: no physics, no pixels, exact.
+"""The rules of the arrow puzzle (thesis, chapter 5) and of its family: no physics, no pixels, exact.
 
 A macrostate is ``(d0, d1, d2, pointed)``: the arrow directions of the cubes, left to right in the agent's frame, and
 the cube the human points at. Directions: 0 toward the human (up in the frame), 1 right, 2 toward the agent, 3 left.
+What a turn does and what is illegal is the same for the whole family; a goal is a predicate on legal macrostates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -23,6 +25,29 @@ GOAL_REWARD = 50.0
 ILLEGAL_REWARD = -5.0
 STEP_REWARD = -1.0
 
+Goal = Callable[[tuple[int, ...]], bool]
+"""Whether a macrostate that is legal is a goal."""
+
+
+def toward_human(macrostate: tuple[int, ...]) -> bool:
+    """The arrow pointed at points toward the human (thesis 5.3.1)."""
+    return macrostate[macrostate[N_CUBES]] == TOWARD_HUMAN
+
+
+def toward_human_alone(macrostate: tuple[int, ...]) -> bool:
+    """The same, and no arrow points toward the agent (thesis 5.4, the hard variant)."""
+    return toward_human(macrostate) and TOWARD_AGENT not in macrostate[:N_CUBES]
+
+
+def toward_agent(macrostate: tuple[int, ...]) -> bool:
+    """The arrow pointed at points toward the agent."""
+    return macrostate[macrostate[N_CUBES]] == TOWARD_AGENT
+
+
+def left_and_clear_clockwise(macrostate: tuple[int, ...]) -> bool:
+    """The arrow pointed at points left, and none points a quarter turn clockwise of it."""
+    return macrostate[macrostate[N_CUBES]] == LEFT and TOWARD_HUMAN not in macrostate[:N_CUBES]
+
 
 @dataclass(frozen=True)
 class ArrowPuzzleRules:
@@ -31,10 +56,10 @@ class ArrowPuzzleRules:
     Action ``2i`` turns cube i a quarter turn clockwise as seen in the frame, ``2i + 1`` counter-clockwise.
 
     Args:
-        hard: Whether the goal also wants no arrow to point toward the agent.
+        goal: Which of the legal macrostates are goals.
     """
 
-    hard: bool = False
+    goal: Goal = toward_human
 
     @property
     def n_actions(self) -> int:
@@ -48,7 +73,7 @@ class ArrowPuzzleRules:
 
     @cached_property
     def start_states(self) -> tuple[tuple[int, ...], ...]:
-        """The macrostates that are not terminal: 54, hard 66."""
+        """The macrostates that are not terminal: of 72 legal ones, those that are no goal."""
         return tuple(state for state in self.states if not self.is_terminal(state))
 
     def is_legal(self, macrostate: tuple[int, ...]) -> bool:
@@ -56,10 +81,8 @@ class ArrowPuzzleRules:
         return len(set(macrostate[:N_CUBES])) == N_CUBES
 
     def is_goal(self, macrostate: tuple[int, ...]) -> bool:
-        """Whether the macrostate is legal and the arrow pointed at (in the hard variant: and no arrow at the agent)."""
-        toward_human = macrostate[macrostate[N_CUBES]] == TOWARD_HUMAN
-        spoiled = self.hard and TOWARD_AGENT in macrostate[:N_CUBES]
-        return self.is_legal(macrostate) and toward_human and not spoiled
+        """Whether the macrostate is legal and a goal."""
+        return self.is_legal(macrostate) and self.goal(macrostate)
 
     def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether the macrostate is a goal or illegal."""

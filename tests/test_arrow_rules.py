@@ -7,27 +7,61 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_rules import ArrowPuzzleRules
+from imagine_bench.tasks.arrow_rules import (
+    LEFT,
+    TOWARD_AGENT,
+    TOWARD_HUMAN,
+    ArrowPuzzleRules,
+    left_and_clear_clockwise,
+    toward_agent,
+    toward_human_alone,
+)
 from imagine_bench.tasks.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 
-EASY, HARD = ArrowPuzzleRules(), ArrowPuzzleRules(hard=True)
-BOTH = pytest.mark.parametrize("rules", [EASY, HARD], ids=["easy", "hard"])
+EASY, HARD = ArrowPuzzleRules(), ArrowPuzzleRules(toward_human_alone)
+TOWARD, CLOCKWISE = ArrowPuzzleRules(toward_agent), ArrowPuzzleRules(left_and_clear_clockwise)
+FAMILY = (EASY, HARD, TOWARD, CLOCKWISE)
+NAMES = ["easy", "hard", "toward", "clockwise"]
+ALL = pytest.mark.parametrize("rules", FAMILY, ids=NAMES)
 
 
 def test_counts_of_macrostates():
     assert len(EASY.states) == len(set(EASY.states)) == 192
     legal = [state for state in EASY.states if EASY.is_legal(state)]
     assert len(legal) == 72
-    assert sum(map(EASY.is_goal, EASY.states)) == 18
-    assert sum(map(HARD.is_goal, HARD.states)) == 6
-    assert len(EASY.start_states) == 54
-    assert len(HARD.start_states) == 66
+    assert [sum(map(rules.is_goal, rules.states)) for rules in FAMILY] == [18, 6, 18, 6]
+    assert [len(rules.start_states) for rules in FAMILY] == [54, 66, 54, 66]
 
 
-@BOTH
+def test_goals_are_what_their_tasks_say():
+    """The directions of the pointed and of all arrows in every goal, written out."""
+
+    def goals(rules):
+        return {(state[state[3]], frozenset(state[:3])) for state in filter(rules.is_goal, rules.states)}
+
+    with_human, with_agent = ({0, 1, 2}, {0, 2, 3}, {0, 1, 3}), ({0, 1, 2}, {0, 2, 3}, {1, 2, 3})
+    assert goals(EASY) == {(TOWARD_HUMAN, frozenset(arrows)) for arrows in with_human}
+    assert goals(HARD) == {(TOWARD_HUMAN, frozenset({0, 1, 3}))}
+    assert goals(TOWARD) == {(TOWARD_AGENT, frozenset(arrows)) for arrows in with_agent}
+    assert goals(CLOCKWISE) == {(LEFT, frozenset({1, 2, 3}))}
+
+
+def test_the_family_shares_everything_but_the_goal():
+    for rules in FAMILY[1:]:
+        assert rules.states == EASY.states
+        for state in EASY.states:
+            assert rules.is_legal(state) == EASY.is_legal(state)
+            for action in range(6):
+                assert rules.turned(state, action) == EASY.turned(state, action)
+                (own,), (other,) = rules.outcomes(state, action), EASY.outcomes(state, action)
+                if not rules.is_goal(own.macrostate) and not EASY.is_goal(own.macrostate):
+                    assert own == other
+
+
+@ALL
 def test_exactly_two_actions_are_legal_in_every_legal_macrostate(rules):
     for state in filter(rules.is_legal, rules.states):
         assert sum(rules.is_legal(rules.turned(state, action)) for action in range(6)) == 2
@@ -35,8 +69,13 @@ def test_exactly_two_actions_are_legal_in_every_legal_macrostate(rules):
 
 @pytest.mark.parametrize(
     ("rules", "chance", "optimal_return", "mean_length"),
-    [(EASY, 0.04602, 48.222, 2.778), (HARD, 0.03766, 47.727, 3.273)],
-    ids=["easy", "hard"],
+    [
+        (EASY, 0.04602, 48.222, 2.778),
+        (HARD, 0.03766, 47.727, 3.273),
+        (TOWARD, 0.04602, 48.222, 2.778),
+        (CLOCKWISE, 0.03766, 47.727, 3.273),
+    ],
+    ids=NAMES,
 )
 def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
     known = facts(rules, 10)
@@ -59,7 +98,7 @@ def _shortest_by_search(rules, start):
     raise AssertionError("no plan")
 
 
-@BOTH
+@ALL
 def test_plan_lengths_agree_with_breadth_first_search_and_the_optimal_actions_follow_them(rules):
     lengths = Counter()
     for start in rules.start_states:
@@ -72,7 +111,7 @@ def test_plan_lengths_agree_with_breadth_first_search_and_the_optimal_actions_fo
         assert steps == shortest
         assert total == 50.0 - (steps - 1)
         lengths[steps] += 1
-    assert set(lengths) == set(range(1, 7 if rules.hard else 6))
+    assert set(lengths) == set(range(1, 7 if len(rules.start_states) == 66 else 6))
 
 
 def test_chance_level_agrees_with_play():
@@ -91,7 +130,7 @@ def test_chance_level_agrees_with_play():
     assert wins / n == pytest.approx(0.04602, abs=4 * np.sqrt(0.046 * 0.954 / n))
 
 
-@BOTH
+@ALL
 def test_turning_there_and_back_and_four_times_changes_nothing(rules):
     for state in rules.states:
         for cube in range(3):

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, ImaginedRollout, Observation, Transition
+from imagine_bench.interfaces import (
+    AgentContext,
+    AgentState,
+    Answer,
+    Frame,
+    ImaginedRollout,
+    Observation,
+    Transition,
+)
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -20,6 +28,7 @@ from .memory import CodeMemory, CodeTransition
 from .model import StructuredModel, as_codes
 from .pictures import Imagined, picture
 from .planner import Planner
+from .questions import last_step, question
 from .settings import ImagineSettings, resolve
 
 _SURE = 0.9
@@ -55,6 +64,11 @@ class ImagineAgent:
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
 
+    @property
+    def _ready(self) -> bool:
+        """Whether anything is known of what this task rewards, so that there is something to plan for."""
+        return self.model.outcomes.causes is not None
+
     def code(self, frame: Frame) -> tuple[int, ...]:
         """The code of a frame, one value a part; remembers the last one, which often is asked for twice."""
         key = frame.tobytes()
@@ -76,7 +90,7 @@ class ImagineAgent:
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The action of the largest worth; exploring, that which leads to the most unknown as long as there is any."""
-        if not len(self.memory):
+        if not self._ready:
             return int(self.rng.integers(self.n_actions)) if explore else 0
         code = self._modelled(self.code(observation.frame))
         if not explore:
@@ -123,9 +137,36 @@ class ImagineAgent:
         self.planner.forget()
         self.learned = upto
 
+    def carry_over(self) -> None:
+        """Keep the dynamics, forget the outcomes; see :class:`imagine_bench.interfaces.Transferable`."""
+        self.memory.carry_over()
+        self._start_anew()
+        self._learn(len(self.memory))
+
+    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+        """What to ask; see :class:`imagine_bench.interfaces.Questioner` and :mod:`.questions`."""
+        planning = self.settings.planning
+        return question(
+            self.model,
+            self._modelled(self.code(observation.frame)),
+            depth=planning.depth,
+            codes=planning.states,
+            least=planning.boredom,
+            without=self.memory.in_vain,
+        )
+
+    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no answer."""
+        code, action, following = last_step(self.model, self._modelled(self.code(observation.frame)), actions)
+        reward, terminated = (0.0, False) if answer is None else (answer.reward, answer.terminated)
+        self.memory.add(
+            CodeTransition(code, action, following, reward, terminated, moves=False, pays=answer is not None)
+        )
+        self._learn(len(self.memory))
+
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Worth of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
-        if not len(self.memory):
+        if not self._ready:
             return np.zeros(self.n_actions, dtype=np.float32)
         return self.planner.worth(self._modelled(self.code(observation.frame))).astype(np.float32)
 
@@ -157,9 +198,9 @@ class ImagineAgent:
 
     def _imagined(self, code: tuple[int, ...], action: int | None, rng: np.random.Generator) -> Imagined:
         """One imagined step of ``action``, or of the greedy one."""
-        worth = self.planner.worth(code) if len(self.memory) else np.zeros(self.n_actions)
+        worth = self.planner.worth(code) if self._ready else np.zeros(self.n_actions)
         chosen = int(worth.argmax()) if action is None else action
-        if not len(self.memory):
+        if not self._ready:
             return Imagined(
                 action=chosen,
                 code=self._observed(code),
@@ -183,7 +224,8 @@ class ImagineAgent:
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         counters = {
-            "real_transitions": len(self.memory),
+            "real_transitions": self.memory.real,
+            "teacher/answers": self.memory.told,
             "model/outcomes": len(self.model.outcomes.kinds),
             "planning/imagined_codes": self.planner.imagined,
         }

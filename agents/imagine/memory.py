@@ -1,4 +1,4 @@
-"""Every real transition between codes, in the order it happened."""
+"""Every transition between codes that was lived through or asked about, in that order."""
 
 from __future__ import annotations
 
@@ -11,17 +11,30 @@ from ..snapshot import Arrays
 
 
 class CodeTransition(NamedTuple):
-    """One real transition between codes, one value a part each."""
+    """One transition between codes, one value a part each.
+
+    Attributes:
+        code: Before.
+        action: The macro-action.
+        following: After.
+        reward: Of this task.
+        terminated: Whether the episode ended.
+        moves: Whether it happened, and so shows what follows what; not if it was only asked about.
+        pays: Whether reward and end are those of the present task; not if it was lived through in an earlier one, and
+            not if a question about it had no answer.
+    """
 
     code: tuple[int, ...]
     action: int
     following: tuple[int, ...]
     reward: float
     terminated: bool
+    moves: bool = True
+    pays: bool = True
 
 
 class CodeMemory:
-    """Transitions between codes of P parts; a few integers each, so none is ever forgotten.
+    """Transitions between codes of P parts; a few integers each, so none need ever be forgotten.
 
     Args:
         parts: P.
@@ -42,6 +55,25 @@ class CodeMemory:
         """The transitions from index ``first`` on."""
         return iter(self._rows[first:])
 
+    def carry_over(self) -> None:
+        """Keep what happened without what it brought; forget what was only asked about."""
+        self._rows = [row._replace(pays=False) for row in self._rows if row.moves]
+
+    @property
+    def real(self) -> int:
+        """How many of them happened."""
+        return sum(row.moves for row in self._rows)
+
+    @property
+    def told(self) -> int:
+        """How many of them are answers."""
+        return sum(row.pays and not row.moves for row in self._rows)
+
+    @property
+    def in_vain(self) -> frozenset[tuple[tuple[int, ...], int]]:
+        """Codes and actions that were asked about without an answer."""
+        return frozenset((row.code, row.action) for row in self._rows if not row.moves and not row.pays)
+
     def arrays(self) -> Arrays:
         """Copies of all rows, by column."""
         return {
@@ -49,13 +81,16 @@ class CodeMemory:
             "action": np.array([row.action for row in self._rows], dtype=np.int64),
             "following": np.array([row.following for row in self._rows], dtype=np.int64).reshape(-1, self._parts),
             "reward": np.array([row.reward for row in self._rows], dtype=np.float64),
-            "terminated": np.array([row.terminated for row in self._rows], dtype=np.bool_),
+            **{
+                name: np.array([getattr(row, name) for row in self._rows], dtype=np.bool_)
+                for name in ("terminated", "moves", "pays")
+            },
         }
 
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""
         columns = (arrays[name].tolist() for name in CodeTransition._fields)
         self._rows = [
-            CodeTransition(tuple(code), action, tuple(following), reward, terminated)
-            for code, action, following, reward, terminated in zip(*columns, strict=True)
+            CodeTransition(tuple(code), action, tuple(following), *rest)
+            for code, action, following, *rest in zip(*columns, strict=True)
         ]

@@ -47,9 +47,11 @@ class StructuredModel:
         self.outcomes = Outcomes(sizes, n_actions, settings.outcomes)
 
     def add(self, row: CodeTransition) -> None:
-        """Take in one transition."""
-        self.dynamics.add(as_codes(row.code), row.action, as_codes(row.following))
-        self.outcomes.add(row)
+        """Take in one transition, as far as it shows what follows what and what it brings."""
+        if row.moves:
+            self.dynamics.add(as_codes(row.code), row.action, as_codes(row.following))
+        if row.pays:
+            self.outcomes.add(row)
 
     def expected(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""

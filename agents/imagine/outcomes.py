@@ -141,6 +141,8 @@ class Outcomes:
 
     def fit(self) -> None:
         """Learn the causes anew from everything seen; whichever outcome explains it best is the usual one."""
+        if not self._seen:
+            return
         codes, actions, following, outcome = (np.array(column) for column in zip(*self._seen, strict=True))
         active = self.conjunctions.active(codes, actions, following)
         seen = _Seen(active, outcome, np.array(list(self._seen.values()), dtype=np.float64))
