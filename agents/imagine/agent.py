@@ -63,6 +63,8 @@ class ImagineAgent:
         self.model = StructuredModel(self.sizes, self.n_actions, self.settings)
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
+        self.tasks: list[int] = []
+        """How much was remembered when each later task began."""
 
     @property
     def _ready(self) -> bool:
@@ -138,10 +140,14 @@ class ImagineAgent:
         self.learned = upto
 
     def carry_over(self) -> None:
-        """Keep the dynamics, forget the outcomes; see :class:`imagine_bench.interfaces.Transferable`."""
-        self.memory.carry_over()
-        self._start_anew()
+        """Keep the dynamics, and of what was rewarded no more than hints; see :meth:`.outcomes.Outcomes.carry_over`."""
         self._learn(len(self.memory))
+        self._begin_task()
+
+    def _begin_task(self) -> None:
+        self.tasks.append(self.learned)
+        self.model.carry_over()
+        self.planner.forget()
 
     def question(self, observation: Observation) -> NDArray[np.int64] | None:
         """What to ask; see :class:`imagine_bench.interfaces.Questioner` and :mod:`.questions`."""
@@ -235,6 +241,7 @@ class ImagineAgent:
         """A snapshot: what is remembered, how much of it is learned, the generator, measurements."""
         values = {
             "learned": self.learned,
+            "tasks": list(self.tasks),
             "exploration": self.rng.bit_generator.state,
             "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
@@ -250,7 +257,10 @@ class ImagineAgent:
         snapshot.require_fit(state, self.state(), equal=("settings",))
         self.memory.load(snapshot.below("memory", state.arrays))
         self._start_anew()
-        if state.values["learned"]:
+        for began in state.values["tasks"]:
+            self._learn(began)
+            self._begin_task()
+        if state.values["learned"] > self.learned:
             self._learn(state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]

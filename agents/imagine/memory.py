@@ -20,8 +20,7 @@ class CodeTransition(NamedTuple):
         reward: Of this task.
         terminated: Whether the episode ended.
         moves: Whether it happened, and so shows what follows what; not if it was only asked about.
-        pays: Whether reward and end are those of the present task; not if it was lived through in an earlier one, and
-            not if a question about it had no answer.
+        pays: Whether reward and end are known; not if a question about it had no answer.
     """
 
     code: tuple[int, ...]
@@ -54,10 +53,6 @@ class CodeMemory:
     def since(self, first: int) -> Iterator[CodeTransition]:
         """The transitions from index ``first`` on."""
         return iter(self._rows[first:])
-
-    def carry_over(self) -> None:
-        """Keep what happened without what it brought; forget what was only asked about."""
-        self._rows = [row._replace(pays=False) for row in self._rows if row.moves]
 
     @property
     def real(self) -> int:

@@ -53,6 +53,10 @@ class StructuredModel:
         if row.pays:
             self.outcomes.add(row)
 
+    def carry_over(self) -> None:
+        """Keep the dynamics; begin the outcomes anew, with hints."""
+        self.outcomes.carry_over()
+
     def expected(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""
         code, action, following = as_codes(row.code), row.action, as_codes(row.following)

@@ -128,6 +128,7 @@ class Outcomes:
         self.settings = settings
         self.conjunctions = Conjunctions(sizes, n_actions, settings)
         self.kinds: list[tuple[float, bool]] = []
+        self._hints: dict[tuple[float, bool], Floats] = {}
         self._seen: dict[tuple[tuple[int, ...], int, tuple[int, ...], int], int] = {}
         self.causes: Causes | None = None
 
@@ -148,6 +149,25 @@ class Outcomes:
         seen = _Seen(active, outcome, np.array(list(self._seen.values()), dtype=np.float64))
         candidates = [self._explain(seen, usual) for usual in range(len(self.kinds))]
         self.causes = max(candidates, key=lambda causes: causes.log_posterior)
+
+    def carry_over(self) -> None:
+        """Forget all that was seen; what were causes is believed, as a hint, until a test of this task refutes it.
+
+        A cause of an earlier task that no test refuted is still a hint in the one after the next. What was *not* a
+        cause earlier is no hint: goals change, and a task's own are to be found.
+        """
+        causes = self.causes
+        if causes is not None:
+            order = [causes.usual, *(kind for kind in range(len(causes.kinds)) if kind != causes.usual)]
+            self.kinds = [causes.kinds[kind] for kind in order] if self.settings.carried else []
+            self._hints = {causes.kinds[kind]: self.settings.carried * causes.strength[kind] for kind in order}
+        self._seen, self.causes = {}, None
+
+    def _believed(self, kind: int, prior: Floats) -> Floats:
+        """Prior probability of each conjunction to be a cause of ``kind``: its group's (G,), or the hint's. (J,)."""
+        hint = self._hints.get(self.kinds[kind])
+        own = prior[self.conjunctions.group]
+        return own if hint is None else np.maximum(own, hint)
 
     @property
     def rewards(self) -> Floats:
@@ -186,8 +206,9 @@ class Outcomes:
         promise = 0.5 * settings.pseudo_conjunctions * self.conjunctions.prior / (settings.pseudo_conjunctions + tried)
         for kind in others:
             strength[kind], prior = self._causes_of(kind, seen, usual, met, tried, len(others))
-            extra = np.maximum(strength[kind] - prior[group], 0.0)
-            cost -= float((extra * np.log(prior[group]))[met].sum())
+            believed = self._believed(kind, prior)
+            extra = np.maximum(strength[kind] - believed, 0.0)
+            cost -= float((extra * np.log(believed))[met].sum())
             promise = promise + prior
         chance = _chance(strength, seen.active, usual, settings.leak)
         right = chance[seen.outcome, np.arange(len(seen.outcome))] / chance.sum(axis=0)
@@ -205,14 +226,14 @@ class Outcomes:
         tests = _spread(seen.active, weight, len(group))
         active, often = seen.active[positive], seen.often[positive]
         base = self.conjunctions.prior / rivals
-        prior, strength = base, base[group]
+        prior, strength = base, self._believed(kind, base)
         for _ in range(settings.sweeps):
             blame = _blame(strength, active, often, settings.leak, len(group))
-            hits = settings.pseudo_tests * prior[group] + blame
+            hits = settings.pseudo_tests * self._believed(kind, prior) + blame
             strength = np.minimum(hits / (settings.pseudo_tests + tests), _CERTAIN)
             found = np.bincount(group[met], strength[met], len(base))
             prior = (settings.pseudo_conjunctions * base + found) / (settings.pseudo_conjunctions + tried)
-        return np.where(met, strength, prior[group]), prior
+        return np.where(met, strength, self._believed(kind, prior)), prior
 
     def _tests(self, strength: Floats, seen: _Seen, usual: int) -> Floats:
         """Tests of each conjunction: where nothing happened, and where it was itself what decided. Shape (J,)."""

@@ -16,19 +16,18 @@ from .dynamics import Codes
 from .model import StructuredModel, as_codes
 from .outcomes import Floats
 
-_SURE = 0.9
-"""Probability with which all macro-actions of a question must lead where they are imagined to."""
+_SURE = 0.5
+"""Probability with which each macro-action of a question must lead where it is imagined to."""
 
 Code = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class _Reached:
-    """A code, the actions that lead to it, and how sure that is."""
+    """A code, and the actions that lead to it."""
 
     code: Code
     actions: tuple[int, ...]
-    sure: float
 
 
 def question(
@@ -50,22 +49,21 @@ def question(
     if model.outcomes.causes is None:
         return None
     best, chosen = least, None
-    front, seen = [_Reached(start, (), 1.0)], {start}
+    front, seen = [_Reached(start, ())], {start}
     while front and len(front[0].actions) < depth and len(seen) <= codes:
         following, sure = likeliest(model, np.array([each.code for each in front], dtype=np.int64))
         doubt = _doubt(model, front, following)
         further: list[_Reached] = []
         for row, each in enumerate(front):
             for action in range(model.n_actions):
-                certain = each.sure * float(sure[row, action])
-                if certain < _SURE:
+                if sure[row, action] < _SURE:
                     continue
                 after = tuple(following[row, action].tolist())
                 if doubt[row, action] > best and (each.code, action) not in without:
                     best, chosen = float(doubt[row, action]), (*each.actions, action)
                 if after not in seen:
                     seen.add(after)
-                    further.append(_Reached(after, (*each.actions, action), certain))
+                    further.append(_Reached(after, (*each.actions, action)))
         front = further
     return None if chosen is None else np.array(chosen, dtype=np.int64)
 

@@ -47,6 +47,7 @@ class OutcomeSettings:
         leak: Probability of an outcome without a cause.
         masked_weight: Weight of a test in which some other cause decided.
         sweeps: Steps of expectation maximisation.
+        carried: How much a cause of an earlier task is believed to be one of the next, untested; 0 forgets it.
     """
 
     order: int = 3
@@ -57,6 +58,7 @@ class OutcomeSettings:
     leak: float = 1e-3
     masked_weight: float = 0.1
     sweeps: int = 25
+    carried: float = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
