@@ -360,7 +360,7 @@ class Transferable(Protocol):
     """An agent that can take what it knows of a world into another task in the same world."""
 
     def carry_over(self) -> None:
-        """Keep what was learned of how the world moves; forget what is rewarded and what ends an episode.
+        """Keep what was learned of how the world moves; what was rewarded and what ended episodes is a hint at most.
 
         The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
         """

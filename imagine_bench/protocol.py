@@ -75,7 +75,7 @@ class Protocol(ProtocolData):
         codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
         device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
         after: Tasks of the same world that learners are trained on before, in this order; what they know of the
-            world is carried over, what is rewarded is forgotten. Budgets count episodes of ``task`` alone.
+            world is carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
         after_episodes: Real training episodes on each of them.
         demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
             observe; they are real episodes as any, and budgets count them.
