@@ -100,13 +100,15 @@ class Report:
     folder: Annotated[Path | None, tyro.conf.Positional] = None
     """The bench's folder; by default the newest."""
     beside: tuple[Path, ...] = ()
-    """Folders of other benches whose agents are shown beside it; all else in their protocols must be the same."""
+    """Folders of other benches, or of results that were kept, whose agents are shown beside it; all else in their
+    protocols must be the same."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
     def __call__(self) -> None:
         """Load and write."""
-        _show(self.folder or newest_bench(self.out), self.beside)
+        folder = self.folder or newest_bench(self.out)
+        _show(folder, registry.load(_TOGETHER)([folder, *self.beside], self.out) if self.beside else None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,11 +383,10 @@ def _value(text: str) -> Any:
         return text
 
 
-def _show(folder: Path, beside: Sequence[Path] = ()) -> None:
-    """Write a bench's report, and print its table and where everything lies."""
+def _show(folder: Path, result: Any = None) -> None:
+    """Write a bench's report, or that of another result of its kind, and print its table and where everything lies."""
     kind = kind_of(read_protocol(folder).task)
-    load = registry.load(kind.load_so_far)
-    result = registry.load(_TOGETHER)([folder, *beside]) if beside else load(folder)
+    result = result or registry.load(kind.load_so_far)(folder)
     page = registry.load(kind.write_report)(result)
     print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")

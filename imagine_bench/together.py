@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from imagine_bench.archive import is_archive, load_archive
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.partial import cut, load_so_far
 from imagine_bench.protocol import Protocol
@@ -16,27 +17,29 @@ _OWN = ("agents", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
-def load_together(folders: Sequence[Path]) -> BenchResult:
-    """Read several benches, finished or not, that differ only in their agents.
+def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
+    """Read several benches, finished or not or in the form they are kept in, that differ only in their agents.
 
-    Seeds and budgets are those that all of them have. The result's folder is a new one beside the first bench's, named
-    by what was compared.
+    Seeds and budgets are those that all of them have.
+
+    Args:
+        folders: Theirs.
+        root: Folder of all benches; the result's own is a new one in it, named by what was compared.
 
     Raises:
         InvalidValueError: They differ in more, an agent is in two of them, or no seed or budget is in all.
         ArtefactError: One is no bench of control, has nothing to show, or is damaged.
     """
-    results = [load_so_far(folder) for folder in folders]
+    results = [load_archive(folder) if is_archive(folder) else load_so_far(folder) for folder in folders]
     for result in results:
         if not isinstance(result, BenchResult):
             raise ArtefactError(f"{result.folder} is no bench of agents; only those can be shown together.")
     protocol = _joined([result.protocol for result in results], folders)
-    folder = folders[0].parent / f"together-{protocol.hash}"
     return BenchResult(
         protocol=protocol,
         runs=tuple(cut(run, protocol) for result in results for run in result.runs if run.seed in protocol.seeds),
         environment=_environment(results),
-        folder=folder,
+        folder=root / protocol.task / f"together-{protocol.hash}",
         wall_s=sum(result.wall_s for result in results),
     )
 

@@ -6,22 +6,21 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import bench_fakes
 import numpy as np
 import pytest
 from test_runner import small
 
 from imagine_bench.bench import bench
 from imagine_bench.cli import main
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.launchers import launcher
+from imagine_bench.report import write_report
 from imagine_bench.results import BenchResult
 from imagine_bench.store import load_bench
 from imagine_bench.together import load_together
 
 
 def do(root: Path, *agents: str, **changes: Any) -> Path:
-    assert set(agents) <= set(bench_fakes.AGENTS)
     result: BenchResult = bench(
         small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=launcher("local", 1), bars=1
     )
@@ -31,7 +30,7 @@ def do(root: Path, *agents: str, **changes: Any) -> Path:
 def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
-    joined = load_together([first, second])
+    joined = load_together([first, second], tmp_path)
     assert (joined.protocol.agents, joined.protocol.seeds, joined.protocol.budgets) == (
         ("oracle", "random"),
         (1,),
@@ -59,14 +58,36 @@ def test_what_cannot_be_compared_is_refused(
     first = do(tmp_path, "oracle")
     other = do(tmp_path / "other", *agents, **changes)
     with pytest.raises(InvalidValueError, match=words):
-        load_together([first, other])
+        load_together([first, other], tmp_path)
 
 
 def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
-    assert main(["report", str(first), "--beside", str(second)]) == 0
+    assert main(["report", str(first), "--beside", str(second), "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "oracle" in shown and "random" in shown
     (page,) = tmp_path.glob("*/together-*/report/index.html")
     assert str(page) in shown
     assert not (second / "report").exists()
+
+
+def test_kept_results_say_what_their_run_folders_said(tmp_path: Path) -> None:
+    first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
+    assert main(["report", str(second)]) == 0
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    names = ("protocol.json", "environment.json", "sittings.json", "report/results.csv")
+    for name in names:
+        (kept / Path(name).name).write_bytes((second / name).read_bytes())
+    with_runs, without = (load_together([first, other], tmp_path / "joined") for other in (second, kept))
+    assert with_runs.protocol == without.protocol and with_runs.folder == without.folder
+    for mine, theirs in zip(with_runs.of("random"), without.of("random"), strict=True):
+        assert mine.checkpoints == theirs.checkpoints
+    assert write_report(without).is_file()
+
+
+def test_a_damaged_table_is_named(tmp_path: Path) -> None:
+    first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
+    (second / "results.csv").write_text("agent,seed,episodes\nrandom,0,many\n")
+    with pytest.raises(ArtefactError, match=r"results\.csv is not the table of a bench of agents"):
+        load_together([first, second], tmp_path)

@@ -1,0 +1,69 @@
+"""A bench as it is kept for good: ``protocol.json``, ``environment.json``, ``sittings.json`` and the report's
+``results.csv``, without run folders. Every success rate, length and cost is in it; pictures and imaginations are not.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.results import BenchResult, Checkpoint, RunResult
+from imagine_bench.store import bench_facts, read_protocol
+
+_RESULTS = "results.csv"
+_COUNTS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
+_NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
+_COMPUTED = ("agent", "seed", "success_rate", "wilson_low", "wilson_high")
+
+
+def is_archive(folder: Path) -> bool:
+    """Whether a folder holds a bench in this form."""
+    return (folder / _RESULTS).is_file()
+
+
+def load_archive(folder: Path) -> BenchResult:
+    """Read such a folder.
+
+    Raises:
+        ArtefactError: It is damaged, or not of agents; the message names the file.
+    """
+    path = folder / _RESULTS
+    protocol = read_protocol(folder)
+    rows: dict[tuple[str, int], list[Checkpoint]] = {}
+    try:
+        for row in csv.DictReader(io.StringIO(path.read_text())):
+            rows.setdefault((row["agent"], int(row["seed"])), []).append(_checkpoint(row))
+    except (KeyError, ValueError, TypeError, OSError) as error:
+        raise ArtefactError(
+            f"{path} is not the table of a bench of agents: {error!r}. It was left untouched."
+        ) from error
+    runs = tuple(_run(folder, agent, seed, tuple(points)) for (agent, seed), points in rows.items())
+    return BenchResult(protocol=protocol, runs=runs, **bench_facts(folder))
+
+
+def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
+    known = (*_COUNTS, *_NUMBERS, *_COMPUTED)
+    return Checkpoint(
+        **{name: int(row[name]) for name in _COUNTS},
+        **{name: float(row[name]) for name in _NUMBERS},
+        diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},
+    )
+
+
+def _run(folder: Path, agent: str, seed: int, checkpoints: tuple[Checkpoint, ...]) -> RunResult:
+    return RunResult(
+        agent=agent,
+        seed=seed,
+        checkpoints=checkpoints,
+        settings={},
+        training_success=np.zeros(0, dtype=np.bool_),
+        training_length=np.zeros(0, dtype=np.int64),
+        imagined=(),
+        folder=folder,
+        recording=None,
+    )
