@@ -31,12 +31,12 @@ class LibrarySettings:
     learning_rate: float = 5e-4
     buffer_size: int = 50_000
     learning_starts: int = 100
-    batch_size: int = 64
+    batch_size: int = 32
     gamma: float = 0.95
     train_freq: int = 1
-    gradient_steps: int = 1
+    gradient_steps: int = 4
     target_update_interval: int = 250
-    exploration_steps: int = 2_000
+    exploration_steps: int = 600
     exploration_final_eps: float = 0.02
 
 

@@ -41,12 +41,17 @@ _FACTORS = (
     _variant("reward", "reward counted in tens", {"model.reward_scale": 10.0}),
     _variant("reward", "reward and end from the transition", {"model.assessment_input": "transition"}),
     _variant("filter", "max below 0.3", {}, _FILTERED),
+    _variant("filter", "dynamics only", {"imagination.reward_threshold": None}, _FILTERED),
     _variant("filter", "sum below 0.3", {"imagination.reduction": "sum"}, _FILTERED),
     _variant("filter", "mean below 0.3", {"imagination.reduction": "mean"}, _FILTERED),
     _variant("filter", "below the 90 % quantile", {"imagination.threshold_quantile": 0.9}, _FILTERED),
     _variant(
         "filter", "five networks, below the 90 % quantile",
-        {"model.members": 5, "model.dropout": 0.0, "imagination.threshold_quantile": 0.9}, _FILTERED,
+        {
+            "model.members": 5, "model.dropout": 0.0, "imagination.threshold_quantile": 0.9,
+            "imagination.reward_threshold": None,
+        },
+        _FILTERED,
     ),
     *_pair("targets", "target network", {"controller.target_rate": 0.02}),
     *_pair("augmentation", "latents spread five times", {"memory.spread": 5.0}),
