@@ -179,6 +179,7 @@ class TaskSpec:
         reference: Name of the thesis' table in :mod:`imagine_bench.reference`, or None.
         settings: Family of settings that learners take: the thesis' chapter that the task is from.
         presets: What each protocol preset changes for this task: fields of the protocol by preset.
+        mastery: Success rate, in (0, 1], at which the task counts as learned.
         promises: What ``make speed`` measures it against; None for a task whose scene another one measures.
     """
 
@@ -198,6 +199,7 @@ class TaskSpec:
     reference: str | None = None
     settings: str = "chapter_5"
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    mastery: float = 0.95
     promises: Promises | None = None
 
     @property

@@ -165,7 +165,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sampled_futures": 4,
         "recorded_episodes": 2,
     },
-    "quick": {},
+    "quick": {"agents": (*_ALL_AGENTS, "imagine")},
     "thesis": {
         "agents": _THESIS_AGENTS,
         "seeds": tuple(range(5)),
@@ -176,7 +176,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "sample_efficiency": {
         "agents": ("imagine",),
         "seeds": tuple(range(5)),
-        "budgets": (20, 40, 60, 80, 100, 120, 200),
+        "budgets": tuple(range(20, 201, 20)),
         "evaluation_episodes": 1000,
         "recorded_episodes": 2,
     },

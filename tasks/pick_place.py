@@ -37,7 +37,7 @@ _CHAPTER_3 = ("dqn", "imagination_only")
 _COMPARED = ("random", "oracle", *_CHAPTER_3, "imagination_only_uncertainty")
 _PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"agents": _COMPARED},
-    "quick": {"agents": _COMPARED, "evaluation_episodes": 100, "sampled_futures": 400},
+    "quick": {"agents": (*_COMPARED, "imagine"), "evaluation_episodes": 100, "sampled_futures": 400},
     "thesis": {  # section 3.2.3: 10 runs of 1000 episodes, each tested on 100
         "agents": _CHAPTER_3,
         "seeds": tuple(range(10)),
@@ -81,6 +81,7 @@ SPEC = TaskSpec(
         encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
     ),
     presets=_PRESETS,
+    mastery=0.98,
 )
 
 

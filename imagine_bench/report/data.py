@@ -14,8 +14,6 @@ from imagine_bench.interfaces import RuleFacts, TaskSpec
 from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
 
-REACHED = 0.95
-"""Success that an agent is asked to reach, and keep, in as few real episodes as possible."""
 BASE_AGENT = "dqn"
 """What gains are measured against, as in the thesis."""
 
@@ -120,7 +118,8 @@ class FuturesSummary:
 class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
 
-    ``reached`` holds for each seed the first budget from which on success never falls below ``REACHED``, or None.
+    ``reached`` holds for each seed the first budget from which on success never falls below the task's ``mastery``, or
+    None.
     ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
     budget, divided by the budget: the mean success until then, with its interval over seeds.
     """
@@ -167,7 +166,7 @@ def collect(result: BenchResult) -> ReportData:
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
-        reached={agent: _reached(result.of(agent)) for agent in learners},
+        reached={agent: _reached(result.of(agent), spec.mastery) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
@@ -361,10 +360,10 @@ def _nan_mean(table: np.ndarray) -> np.ndarray:
     return mean
 
 
-def _reached(runs: tuple[RunResult, ...]) -> tuple[int | None, ...]:
+def _reached(runs: tuple[RunResult, ...], mastery: float) -> tuple[int | None, ...]:
     def first(run: RunResult) -> int | None:
         rows = run.checkpoints
-        return statistics.first_lasting([row.episodes for row in rows], [row.success_rate for row in rows], REACHED)
+        return statistics.first_lasting([row.episodes for row in rows], [row.success_rate for row in rows], mastery)
 
     return tuple(first(run) for run in runs)
 
