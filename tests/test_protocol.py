@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from imagine_bench.bench import plan_control
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocol import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
 from imagine_bench.results import BenchResult, Checkpoint, RunResult
@@ -18,6 +20,19 @@ def test_every_preset_survives_json_with_its_hash(task, preset):
     original = protocol(task, preset)
     copy = Protocol.from_dict(original.as_dict())
     assert copy == original and copy.hash == original.hash
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_what_counts_as_learned_lies_between_chance_and_the_optimum(name):
+    facts, mastery = task(name).facts(), task(name).mastery
+    assert facts.chance_level < 0.5 < mastery <= facts.optimum
+
+
+@pytest.mark.parametrize("appearance", APPEARANCES)
+@pytest.mark.parametrize("name", TASKS)
+def test_the_quick_bench_finds_an_encoder_of_each_kind_at_every_appearance(name, appearance):
+    wanted, paths = plan_control(name, "quick", appearance=appearance)
+    assert set(paths) == {"latents", "codes"} and wanted.codes is not None
 
 
 def test_any_change_changes_the_hash():

@@ -333,3 +333,18 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     left, top = pictures._left(0), pictures._HEADER
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
+
+
+def test_episodes_to_mastery_ask_for_what_the_task_calls_mastered(
+    result: BenchResult, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = collect(result).spec
+    assert f"Real episodes to {100 * spec.mastery:g}&nbsp;%" in (folder / "index.html").read_text(encoding="utf-8")
+    agent = result.protocol.agents[-1]
+    lowest = min(row.success_rate for run in result.of(agent) for row in run.checkpoints)
+    assert 0.0 < lowest < 1.0
+    first, seeds = result.protocol.budgets[0], len(result.protocol.seeds)
+    for mastery, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
+        demanding = dataclasses.replace(spec, mastery=mastery)
+        monkeypatch.setattr("imagine_bench.report.data.registry.task", lambda _, spec=demanding: spec)
+        assert collect(result).reached[agent] == reached
