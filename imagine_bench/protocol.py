@@ -180,10 +180,20 @@ PRESETS: dict[str, dict[str, Any]] = {
         "evaluation_episodes": 1000,
         "recorded_episodes": 2,
     },
+    "lessons": {
+        "agents": ("imagine",),
+        "seeds": tuple(range(5)),
+        "budgets": (10, 20, 30, 40, 60, 80, 100),
+        "evaluation_episodes": 100,
+        "execution": "kinematic",
+        "open_loop_starts": 0,
+        "sampled_futures": 0,
+        "recorded_episodes": 0,
+    },
 }
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
-thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few."""
+thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``lessons`` does so in little time, to compare many ways of being taught."""
 
 
 def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
