@@ -193,7 +193,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
-thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``lessons`` does so in little time, to compare many ways of being taught."""
+thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``lessons`` does so
+in little time, to compare many ways of being taught."""
 
 
 def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
