@@ -61,7 +61,7 @@ def _imagined_now() -> rrb.Horizontal:
     )
     bars = rrb.BarChartView(
         origin="/imagined/uncertainty",
-        name="Variance by depth: epistemic pink, aleatoric blue, modal green",
+        name="Uncertainty by depth: epistemic pink, aleatoric blue, modal green",
         plot_legend=rrb.PlotLegend(visible=False),
     )
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
