@@ -28,7 +28,7 @@ class LibrarySettings:
         exploration_final_eps: Where it ends.
     """
 
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     buffer_size: int = 50_000
     learning_starts: int = 100
     batch_size: int = 32
