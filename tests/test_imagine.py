@@ -124,6 +124,8 @@ def test_a_bounded_plan_does_not_depend_on_what_was_asked_before() -> None:
     for code in starts():
         used.novelty(code)
         assert np.array_equal(used.worth(code), Planner(model, planning).worth(code))
+        for ask in (Planner.reward, Planner.unknown, Planner.terminates):  # whichever is asked first imagines
+            assert np.array_equal(ask(Planner(model, planning), code), ask(used, code))
     assert used.imagined < len(starts()), "the bound must bind here"
 
 

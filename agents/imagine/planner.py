@@ -62,15 +62,18 @@ class Planner:
 
     def unknown(self, code: tuple[int, ...]) -> Floats:
         """How much of what each action does at once is unknown. Shape (A,)."""
-        return np.asarray(self._unknown[self._known(code)])
+        row = self._known(code)
+        return np.asarray(self._unknown[row])
 
     def reward(self, code: tuple[int, ...]) -> Floats:
         """Expected reward of each action. Shape (A,)."""
-        return np.asarray(self._reward[self._known(code)])
+        row = self._known(code)
+        return np.asarray(self._reward[row])
 
     def terminates(self, code: tuple[int, ...]) -> Floats:
         """Probability that each action ends the episode. Shape (A,)."""
-        return np.asarray(self._ends[self._known(code)])
+        row = self._known(code)
+        return np.asarray(self._ends[row])
 
     def _value(self, kind: str, code: tuple[int, ...]) -> Floats:
         row = self._known(code)
