@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_results import bench_result
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from test_recording import rerun
@@ -22,8 +24,9 @@ from imagine_bench.plans import Plan, carry_out, fewest_actions, make_env, make_
 from imagine_bench.protocol import protocol
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.plans import plan_table, summarise, write_plans
+from imagine_bench.results import RunResult
 from imagine_bench.runs import RunSpec
-from imagine_bench.trained import Trained
+from imagine_bench.trained import Trained, best_run
 
 TASK = registry.task("arrow_puzzle")
 State = tuple[int, ...]
@@ -197,6 +200,26 @@ def test_the_recording_shows_the_same_plans_with_the_arm_moving(
     for path_ in ("/real/frame", "/imagined/frame", "/imagined/strip", "/real/story"):
         assert timelines[path_] >= {"sim_time", "env_step", "plan"} and rows[path_] == steps + 2
     assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
+
+
+def test_of_runs_that_end_alike_the_one_that_was_there_first_is_asked(tmp_path: Path) -> None:
+    quick = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1))
+    result = bench_result(tmp_path, protocol=quick)
+
+    def solving(run: RunResult, shares: tuple[float, ...]) -> RunResult:
+        tests = [
+            dataclasses.replace(test, successes=round(share * test.test_episodes))
+            for test, share in zip(run.checkpoints, shares, strict=True)
+        ]
+        return dataclasses.replace(run, checkpoints=tuple(tests))
+
+    for first, second, best in (
+        ((0.9, 0.9, 0.9, 1.0), (0.1, 0.1, 1.0, 1.0), 1),
+        ((0.1, 0.1, 0.1, 1.0), (0.9, 0.9, 0.9, 0.9), 0),
+        ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.5), 0),
+    ):
+        runs = tuple(map(solving, result.runs, (first, second)))
+        assert best_run(dataclasses.replace(result, runs=runs)).seed == best
 
 
 def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
