@@ -19,6 +19,8 @@ EPSILON = 1e-3
 """Added to every variance, the default of Keras."""
 MOMENTUM = 0.99
 """Share of the running statistics that one batch leaves (the default of Keras), once there have been 100 batches."""
+_REACH = 3.0**0.5
+"""Half the width of a uniform distribution, in standard deviations: how far first units' bends are spread."""
 
 
 class NormedMLP(nn.Module):
@@ -29,7 +31,8 @@ class NormedMLP(nn.Module):
 
     Args:
         sizes: Units of input, hidden and output layers. Length at least 2.
-        generators: One a member; each draws its member's initial weights (Glorot uniform, zero biases), so that a
+        generators: One a member; each draws its member's initial weights (Glorot uniform; biases of the first layer
+            uniform too, so that its units bend all over the data and not all at its centre; other biases 0), so that a
             member is the same network alone and among others.
         dropout: Probability of dropping a hidden unit, in [0, 1).
         precision: Type of the products between hidden layers while training. Parameters, statistics, first and last
@@ -53,7 +56,9 @@ class NormedMLP(nn.Module):
             bound = (6.0 / (n_in + n_out)) ** 0.5
             uniform = torch.stack([torch.rand(n_out, n_in, generator=g, device=g.device) for g in generators])
             self.weights.append(nn.Parameter((2.0 * uniform - 1.0) * bound))  # [E, out, in]
-            self.biases.append(nn.Parameter(torch.zeros(self.members, n_out, 1, device=device)))  # [E, out, 1]
+            reach = 0.0 if layer else _REACH * bound
+            uniform = torch.stack([torch.rand(n_out, 1, generator=g, device=g.device) for g in generators])
+            self.biases.append(nn.Parameter((2.0 * uniform - 1.0) * reach))  # [E, out, 1]
             self.register_buffer(f"mean_{layer}", torch.zeros(self.members, n_in, 1, device=device))
             self.register_buffer(f"variance_{layer}", torch.ones(self.members, n_in, 1, device=device))
 
