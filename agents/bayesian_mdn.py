@@ -32,8 +32,8 @@ class MDNSettings:
     Attributes:
         hidden: Units a hidden layer.
         components: Gaussians in the mixture, K.
-        dropout: Probability of dropping a hidden unit; [0, 1).
-        weight_decay: Of the hidden layers, decoupled from Adam, a step in units of the learning rate.
+        dropout: Probability of dropping a unit of a hidden layer that another one follows; [0, 1).
+        weight_decay: Of the hidden layers, added to the gradient: the term ``weight_decay / 2 * |w|^2`` of the loss.
         learning_rate: Of Adam.
         gradient_clip: Largest gradient norm of each network.
         sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.

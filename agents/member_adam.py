@@ -1,4 +1,4 @@
-"""Adam for networks with a leading member axis: decoupled weight decay, and gradients clipped a member at a time."""
+"""Adam for networks with a leading member axis: weight decay in the gradient, which is clipped a member at a time."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from .flat_adam import FlatAdam, require_finite
 
 
 class MemberAdam(FlatAdam):
-    """AdamW (Loshchilov & Hutter 2019) on a module all of whose parameters begin with the member axis.
+    """Adam on a module all of whose parameters begin with the member axis; decay is that of :class:`torch.optim.Adam`.
 
-    Nothing that happens to one member changes another: each has a gradient norm of its own.
+    Nothing that happens to one member changes another: each has a gradient norm of its own. Decay is part of the
+    gradient, as with an L2 term in the loss, and comes after clipping.
 
     Args:
         module: E networks.
         decayed: Those of its parameters that decay.
         learning_rate: Step size.
-        weight_decay: Decay a step, in units of the learning rate.
+        weight_decay: How many times a decayed parameter is added to its gradient.
         gradient_clip: Largest gradient norm of each member; None clips nothing.
     """
 
@@ -33,20 +34,12 @@ class MemberAdam(FlatAdam):
         gradient_clip: float | None,
     ) -> None:
         super().__init__([module], learning_rate=learning_rate, gradient_clip=gradient_clip)
-        self._members, self._decayed, self._weight_decay = len(self._parameters[0]), decayed, weight_decay
+        self._members, self._weight_decay = len(self._parameters[0]), weight_decay
         sizes = [parameter.numel() for parameter in self._parameters]
         self._by_member = [part.view(self._members, -1) for part in self._gradient.split(sizes)]
-
-    def step(self, loss: Tensor) -> None:
-        """Descend the gradient of the sum of all members' losses once.
-
-        Raises:
-            DivergedError: A gradient is NaN or infinite; the parameters are left as they were.
-        """
-        super().step(loss)
-        with torch.no_grad():
-            for parameter in self._decayed:
-                parameter.mul_(1.0 - self._rate * self._weight_decay)
+        chosen = {id(parameter) for parameter in decayed}
+        pairs = zip(self._gradient.split(sizes), self._parameters, strict=True)
+        self._decayed = [(part.view_as(p), p) for part, p in pairs if id(p) in chosen]
 
     def _clip_gradients(self) -> None:
         norms = torch.stack([part.square().sum(dim=1) for part in self._by_member]).sum(dim=0).sqrt()  # [E]
@@ -55,3 +48,6 @@ class MemberAdam(FlatAdam):
             scale = (self._clip / norms.clamp_min(1e-30)).clamp_max(1.0)[:, None]
             for part in self._by_member:
                 part.mul_(scale)
+        with torch.no_grad():
+            for part, parameter in self._decayed:
+                part.add_(parameter, alpha=self._weight_decay)

@@ -34,7 +34,8 @@ class NormedMLP(nn.Module):
         generators: One a member; each draws its member's initial weights (Glorot uniform; biases of the first layer
             uniform too, so that its units bend all over the data and not all at its centre; other biases 0), so that a
             member is the same network alone and among others.
-        dropout: Probability of dropping a hidden unit, in [0, 1).
+        dropout: Probability of dropping a unit of a hidden layer that another one follows, in [0, 1). Units right
+            before the output stay: their noise is noise of the outputs, which a mixture would take for the data's.
         precision: Type of the products between hidden layers while training. Parameters, statistics, first and last
             layer and all predictions are float32 whatever it is.
     """
@@ -63,10 +64,10 @@ class NormedMLP(nn.Module):
             self.register_buffer(f"variance_{layer}", torch.ones(self.members, n_in, 1, device=device))
 
     def draw_masks(self, rows: int, generators: Sequence[torch.Generator]) -> tuple[Tensor, ...] | None:
-        """Dropout factors of every hidden layer, each (E, H, N), a member's from its own generator; None for none."""
-        if self.dropout == 0.0:
+        """Factors of the hidden layers but the last, each (E, H, N), from its member's generator; None for none."""
+        hidden = self.sizes[1:-2]
+        if self.dropout == 0.0 or not hidden:
             return None
-        hidden = self.sizes[1:-1]
         masks = torch.empty(self.members, sum(hidden), rows, dtype=self.precision, device=generators[0].device)
         for mask, generator in zip(masks, generators, strict=True):
             mask.copy_(dropout_mask(mask.shape, self.dropout, generator))
@@ -87,7 +88,7 @@ class NormedMLP(nn.Module):
                 x = self._outputs(weight, bias, x)
             if layer < last:
                 x = x.to(self.precision).relu()
-                x = x if masks is None else x * masks[layer]
+                x = x if masks is None or layer >= len(masks) else x * masks[layer]
         self._note(statistics)
         return x
 

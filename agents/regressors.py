@@ -164,7 +164,8 @@ class MixtureRegressor:
         part, masks = self._trained.member(network * settings.members, settings.members), None
         if settings.dropout > 0.0:
             generator = self._generator(self._samples[network].integer())
-            masks = [dropout_mask((settings.weight_samples, h), settings.dropout, generator) for h in settings.hidden]
+            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
+            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
         samples = self._trained.weight_samples(part, x, masks)
         return rescaled(samples, self._shift[network], self._scale[network])
 

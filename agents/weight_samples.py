@@ -28,8 +28,8 @@ def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None
     Args:
         network: One member, with masks, or the T members of an ensemble, without.
         x: Shape (N, in).
-        masks: One a hidden layer, each (T, H), as :func:`~.layers.dropout_mask` draws them; None makes every member a
-            sample.
+        masks: One a hidden layer, from the first on, each (T, H), as :func:`~.layers.dropout_mask` draws them; layers
+            beyond drop nothing. None makes every member a sample.
 
     Returns:
         Shape (T, N, out).
@@ -55,6 +55,7 @@ def _masked(network: MemberMLP, x: Tensor, factors: Sequence[Tensor]) -> Tensor:
         x = affine(x.unsqueeze(0), weight, bias).squeeze(0)  # [N, H], from the second layer on [T N, H]
         if layer < last:
             x = x.relu_().view(samples if layer else 1, -1, x.shape[-1])
-            x = x.mul_(factors[layer]) if layer else x * factors[layer]
+            if layer < len(factors):
+                x = x.mul_(factors[layer]) if layer else x * factors[layer]
             x = x.view(-1, x.shape[-1])  # [T N, H]
     return x.view(samples, -1, x.shape[-1])

@@ -10,12 +10,14 @@ import torch
 from imagine_bench.agents import mixture as mdn
 from imagine_bench.agents.bayesian_mdn import BayesianMDN, MDNSettings
 from imagine_bench.agents.layers import MemberMLP, dropout_mask
+from imagine_bench.agents.member_adam import MemberAdam
 from imagine_bench.agents.mixture import Mixture
 from imagine_bench.agents.normed_layers import NormedMLP
 from imagine_bench.agents.stationarity import jensen_shannon
 from imagine_bench.agents.uncertainty import decompose
 from imagine_bench.agents.weight_samples import sample_outputs
 from scipy import integrate, stats
+from torch import nn
 
 from imagine_bench.errors import DivergedError
 
@@ -70,6 +72,22 @@ def test_clipping_one_member_leaves_the_others() -> None:
         torch.testing.assert_close(mine, theirs)
 
 
+def test_steps_are_those_of_torch_adam_with_its_weight_decay() -> None:
+    """One member with a parameter that decays and one that does not."""
+    kept, decayed = torch.randn(1, 4, generator=generator(0)), torch.randn(1, 5, generator=generator(1))
+    ours, theirs = nn.ParameterList([kept.clone(), decayed.clone()]), nn.ParameterList([kept.clone(), decayed.clone()])
+    mine = MemberAdam(ours, [ours[1]], learning_rate=0.01, weight_decay=0.5, gradient_clip=None)
+    reference = torch.optim.Adam([{"params": [theirs[0]]}, {"params": [theirs[1]], "weight_decay": 0.5}], lr=0.01)
+    for _ in range(20):
+        mine.step(ours[0].square().sum() + (ours[1] - 1.0).square().sum())
+        reference.zero_grad()
+        (theirs[0].square().sum() + (theirs[1] - 1.0).square().sum()).backward()
+        reference.step()
+    for found, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(found, expected)
+    assert not torch.allclose(ours[1], decayed)
+
+
 def test_folding_gives_what_the_normed_network_gives_on_a_batch_of_the_noted_statistics() -> None:
     network = NormedMLP((2, 16, 16, 3), generators=[generator(0), generator(1)], dropout=0.0)
     x, _ = data(2, rows=300)
@@ -99,6 +117,37 @@ def test_weight_samples_in_one_pass_are_those_of_a_loop(rows: int) -> None:
     torch.testing.assert_close(sample_outputs(network, x, masks), torch.stack(loop), rtol=1e-4, atol=1e-5)
     ensemble = MemberMLP((2, 32, 9), members=5, dropout=0.0, generator=generator())
     torch.testing.assert_close(sample_outputs(ensemble, x, None), ensemble(x.expand(5, -1, -1)), rtol=1e-4, atol=1e-5)
+
+
+def test_weight_samples_keep_the_layers_that_have_no_mask() -> None:
+    """Masks of the first two of three hidden layers, against the formula written out for every sample."""
+    network = MemberMLP((2, 32, 32, 32, 9), members=1, dropout=0.25, generator=generator())
+    x = torch.randn(7, 2, generator=generator(1))
+    masks = [dropout_mask((5, 32), 0.25, generator(2 + layer)) for layer in range(2)]
+    layers = [(w[0], b[0]) for w, b in zip(network.weights, network.biases, strict=True)]
+    for t, found in enumerate(sample_outputs(network, x, masks)):
+        h = x
+        for layer, (weight, bias) in enumerate(layers[:-1]):
+            h = (h @ weight + bias).relu()
+            h = h * (masks[layer][t] != 0) / 0.75 if layer < 2 else h
+        torch.testing.assert_close(found, h @ layers[-1][0] + layers[-1][1], rtol=1e-4, atol=1e-5)
+
+
+def test_units_right_before_the_output_are_never_dropped() -> None:
+    network = NormedMLP((2, 16, 24, 32, 3), generators=[generator(0), generator(1)], dropout=0.5)
+    masks = network.draw_masks(200, [generator(2), generator(3)])
+    assert masks is not None and [tuple(mask.shape) for mask in masks] == [(2, 16, 200), (2, 24, 200)]
+    assert all(set(mask.unique().tolist()) == {0.0, 2.0} for mask in masks)
+    assert NormedMLP((2, 16, 3), generators=[generator(0)], dropout=0.5).draw_masks(9, [generator(1)]) is None
+
+
+def test_first_units_bend_all_over_the_data() -> None:
+    """On standardised inputs a unit bends where w x + b = 0; with zero biases that is nowhere but at the centre."""
+    network = NormedMLP((1, 2000, 8, 1), generators=[generator(0)], dropout=0.0)
+    bends = -(network.biases[0] / network.weights[0]).detach().flatten()
+    for low, high in ((-1.5, -0.5), (-0.5, 0.5), (0.5, 1.5)):
+        assert ((bends > low) & (bends < high)).float().mean() > 0.1
+    assert all(not bias.detach().any() for bias in list(network.biases)[1:])
 
 
 def random_mixtures(shape: tuple[int, ...], dtype: torch.dtype) -> Mixture:

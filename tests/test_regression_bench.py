@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench.agents import regressor_settings
 
 from imagine_bench import registry
 from imagine_bench.bench import plan
@@ -153,6 +154,7 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
         (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
         (["--task", "toy_regression", "--set", "members=1"], "Setting members is 1 in an ensemble; it must be at"),
         (["--task", "toy_regression", "--set", "precision=half"], "No precision 'half'."),
+        (["--task", "toy_regression", "--set", "hidden=[64]"], "dropout acts between hidden layers, so it needs at"),
         (["--task", "toy_regresion"], "No task 'toy_regresion'. Did you mean 'toy_regression'? Known: arrow_puzzle"),
     ],
 )  # fmt: skip
@@ -163,6 +165,12 @@ def test_wrong_words_get_one_line_and_write_nothing(
     (line,) = capsys.readouterr().err.splitlines()
     assert sentence in line
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(("preset", "epochs"), [("smoke", 4), ("quick", 120), ("thesis", 300)])
+def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: int) -> None:
+    one, ensemble = (regressor_settings.resolve(preset, {}, ensemble=kind) for kind in (False, True))
+    assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
 
 
 def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
