@@ -188,7 +188,8 @@ def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
         return f"epistemic uncertainty {doubt[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
     if not rollout.accepted.all():
         step = int((~rollout.accepted).argmax())
-        return f"epistemic uncertainty {doubt[step]:.2g} at macro-action {step + 1} does not pass the agent's filter"
+        uncertainty = f"epistemic uncertainty of the state {doubt[step]:.2g}"
+        return f"the agent's filter discards macro-action {step + 1} ({uncertainty})"
     return ""
 
 

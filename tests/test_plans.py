@@ -129,7 +129,7 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
             {"max_epistemic": 0.3},
             r"0.9 at macro-action \d is above 0.3",
         ),
-        (Dreamer(choose=TASK.rules.optimal_action, accepts=False), {}, "does not pass the agent's filter"),
+        (Dreamer(choose=TASK.rules.optimal_action, accepts=False), {}, r"the agent's filter discards macro-action \d"),
     ],
 )
 def test_a_doubted_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[str, Any], words: str) -> None:
