@@ -7,7 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.interfaces import Follow, Frame, SampledFutures
+from imagine_bench.capabilities import Follow, SampledFutures
+from imagine_bench.interfaces import Frame
 
 from .encoder import Encoder
 from .imagination import TERMINAL, Imagination
@@ -27,7 +28,7 @@ def sample_futures(
     depth: int,
     rng: np.random.Generator,
 ) -> SampledFutures:
-    """Imagine futures in closed loop; see :class:`imagine_bench.interfaces.FutureSampler`.
+    """Imagine futures in closed loop; see :class:`imagine_bench.capabilities.FutureSampler`.
 
     Args:
         imagination: The world model; the filter is not asked.

@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imagine_bench.capabilities import Follow, ImaginedRollout, SampledFutures
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, Follow, Frame, ImaginedRollout, SampledFutures
+from imagine_bench.interfaces import AgentContext, Frame
 
 from .controller import Controller
 from .futures import sample_futures
@@ -30,7 +31,7 @@ class ImaginingLearner(Learner):
     imagination: Imagination
 
     def carry_over(self) -> None:
-        """Keep the network of the dynamics; see :class:`imagine_bench.interfaces.Transferable`.
+        """Keep the network of the dynamics; see :class:`imagine_bench.capabilities.Transferable`.
 
         Reward, termination, controller, memories and the schedule of exploration begin anew.
         """
@@ -43,7 +44,7 @@ class ImaginingLearner(Learner):
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.interfaces.Imaginer`.
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.capabilities.Imaginer`.
 
         Raises:
             InvalidValueError: No depth to imagine, or actions that are none.
@@ -67,7 +68,7 @@ class ImaginingLearner(Learner):
         depth: int,
         rng: np.random.Generator,
     ) -> SampledFutures:
-        """Imagine many futures of the same beginnings; see :class:`imagine_bench.interfaces.FutureSampler`."""
+        """Imagine many futures of the same beginnings; see :class:`imagine_bench.capabilities.FutureSampler`."""
         encoder = self.perception.encoder
         return sample_futures(
             self.imagination, encoder, frames, actions, follow=follow, samples=samples, depth=depth, rng=rng

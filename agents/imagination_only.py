@@ -75,7 +75,7 @@ class ImaginationOnly(ImaginingLearner):
         self.rehearsal.begin(0)
 
     def rehearse(self) -> bool:
-        """One imagined episode; see :class:`imagine_bench.interfaces.Rehearser`. Real steps call for a new rehearsal.
+        """One imagined episode; see :class:`imagine_bench.capabilities.Rehearser`. Real steps call for a new rehearsal.
 
         Raises:
             DivergedError: The controller's loss is no longer finite.

@@ -6,7 +6,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from imagine_bench.interfaces import OnEpisode
+from imagine_bench.capabilities import OnEpisode
 
 
 class _EpisodeCounter(BaseCallback):

@@ -13,8 +13,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import OnEpisode
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, OnEpisode, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .encoder import Encoder
 from .latent_observation import LatentObservation
@@ -45,7 +46,7 @@ class LibraryAgent:
         self._model: Any = None
 
     def train(self, env: gymnasium.Env[Any, Any], *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
-        """Train in the library's own loop; see :class:`imagine_bench.interfaces.SelfTrainer`."""
+        """Train in the library's own loop; see :class:`imagine_bench.capabilities.SelfTrainer`."""
         from .peer_training import learn  # noqa: PLC0415 - needs the library
 
         keywords = dataclasses.asdict(self.settings.sb3)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, ImaginedRollout, Outcome, TaskSpec
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.interfaces import Frame, Outcome, TaskSpec
 from imagine_bench.results import ComparedRollout
 
 

@@ -12,7 +12,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import FutureSampler, Rules, SampledFutures, TaskSpec
+from imagine_bench.capabilities import FutureSampler, SampledFutures
+from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.results import Futures
 from imagine_bench.seeding import Purpose, SeedTree
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import statistics
+from imagine_bench.capabilities import Imaginer
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Imaginer, TaskSpec
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.seeding import Purpose, SeedTree
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.comparison import compare_rollout
-from imagine_bench.interfaces import Frame, ImaginedRollout, Imaginer, Rules, TaskSpec
+from imagine_bench.interfaces import Frame, Rules, TaskSpec
 from imagine_bench.results import ComparedRollout, OpenLoop
 from imagine_bench.seeding import Purpose, SeedTree
 

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, ImaginedRollout, Rules
+from imagine_bench.interfaces import Frame, Rules
 from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed, tunes
 from imagine_bench.trained import Trained

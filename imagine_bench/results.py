@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import ImaginedRollout
 from imagine_bench.protocol import Protocol
 
 

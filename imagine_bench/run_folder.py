@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import read_json, sha256, write_bytes, write_json
-from imagine_bench.interfaces import ImaginedRollout
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 FORMAT = "imagine_bench run 1"

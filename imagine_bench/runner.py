@@ -17,13 +17,13 @@ from typing import Any
 import gymnasium
 
 from imagine_bench import registry, run_folder
+from imagine_bench.capabilities import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
 from imagine_bench.checkpointing import load_newest, save_snapshot
 from imagine_bench.errors import DivergedError
 from imagine_bench.evaluation import Tally, TrainingStarts, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
 from imagine_bench.imagination_quality import Question, ask, examples, imagine_courses, open_loop
-from imagine_bench.interfaces import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, RunResult
 from imagine_bench.runs import Counters, Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree, episode_seed, exam

@@ -11,18 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.capabilities import Answer, Questioner, SelfTrainer, Transferable
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.evaluation import Info
-from imagine_bench.interfaces import (
-    Agent,
-    Answer,
-    Observation,
-    Questioner,
-    Rules,
-    SelfTrainer,
-    Transferable,
-    Transition,
-)
+from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 from imagine_bench.protocol import Protocol
 from imagine_bench.runs import RunSpec
 

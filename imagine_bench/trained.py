@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import encoders, registry
+from imagine_bench.capabilities import Imaginer
 from imagine_bench.checkpointing import load_newest
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.files import read_json
-from imagine_bench.interfaces import Agent, Imaginer, TaskSpec
+from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import BenchResult, RunResult
 from imagine_bench.runs import RunSpec

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentState, Frame, ImaginedRollout, Observation, Transition
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
 
 N_ACTIONS = 6
 

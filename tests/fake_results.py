@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imagine_bench.interfaces import ImaginedRollout
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import BenchResult, Checkpoint, ComparedRollout, OpenLoop, RunResult
 

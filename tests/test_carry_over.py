@@ -17,7 +17,8 @@ from imagine_bench.agents.imagine.questions import last_step, likeliest
 from test_imagine import same
 from test_learner import same as same_learner
 
-from imagine_bench.interfaces import Answer, Observation, Questioner, Transferable
+from imagine_bench.capabilities import Answer, Questioner, Transferable
+from imagine_bench.interfaces import Observation
 
 GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
 """Another task in the tiny world: other goals, the same bad end."""

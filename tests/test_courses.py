@@ -10,9 +10,10 @@ from fake_agents import FakeImaginer
 from numpy.typing import NDArray
 
 from imagine_bench import course_pictures, pictures, registry
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.imagination_quality import COURSES, examples, imagine_courses, is_random
-from imagine_bench.interfaces import Frame, ImaginedRollout, TaskSpec
+from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree
 

@@ -17,7 +17,8 @@ from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldMo
 from numpy.typing import NDArray
 
 from imagine_bench import futures, registry
-from imagine_bench.interfaces import Follow, Frame, Outcome, SampledFutures, TaskSpec
+from imagine_bench.capabilities import Follow, SampledFutures
+from imagine_bench.interfaces import Frame, Outcome, TaskSpec
 from imagine_bench.seeding import SeedTree
 
 State = tuple[int, ...]

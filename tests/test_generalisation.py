@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.generalisation import Probing, answer, probing, summarise
-from imagine_bench.interfaces import Frame, ImaginedRollout, TaskSpec
+from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc

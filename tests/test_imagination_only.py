@@ -11,8 +11,9 @@ from fake_latents import CODES, context, frame, live, transition
 from imagine_bench.agents import dqn, imagination_agents, imagination_only
 from imagine_bench.agents.imagination_only import ImaginationOnly
 
+from imagine_bench.capabilities import Rehearser
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Observation, Rehearser
+from imagine_bench.interfaces import Observation
 
 GOAL = 10
 STATES = 6

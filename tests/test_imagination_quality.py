@@ -10,8 +10,9 @@ import pytest
 from test_runner import context
 
 from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.imagination_quality import EXAMPLES, Question, ask, examples, open_loop
-from imagine_bench.interfaces import ImaginedRollout, Outcome, TaskSpec
+from imagine_bench.interfaces import Outcome, TaskSpec
 from imagine_bench.seeding import SeedTree
 
 

@@ -16,8 +16,9 @@ from imagine_bench.agents.imagine.outcomes import Outcomes
 from imagine_bench.agents.imagine.planner import Planner
 from imagine_bench.agents.imagine.settings import DynamicsSettings, ImagineSettings, OutcomeSettings, resolve
 
+from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import AgentState, Imaginer, Observation, ValueReader
+from imagine_bench.interfaces import AgentState, Observation
 
 
 def same(first: AgentState, second: AgentState) -> bool:

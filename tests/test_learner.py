@@ -13,8 +13,9 @@ from fake_latents import ACTIONS, CODES, context, frame, live, transition
 from imagine_bench.agents import dqn, imagination_agents, imagination_only
 from imagine_bench.agents.learner import Learner
 
+from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError
-from imagine_bench.interfaces import AgentState, Imaginer, Observation, ValueReader
+from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.seeding import SeedTree
 
 MAKERS: dict[str, Callable[..., Learner]] = {

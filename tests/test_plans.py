@@ -18,8 +18,9 @@ from rerun.chunk import RrdReader
 from test_recording import rerun
 
 from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Frame, ImaginedRollout
+from imagine_bench.interfaces import Frame
 from imagine_bench.plans import Plan, carry_out, fewest_actions, make_env, make_plans
 from imagine_bench.protocol import protocol
 from imagine_bench.recording.plans import record_plans

@@ -15,9 +15,10 @@ from test_resume_learners import measured
 from test_runner import final_arrays, small
 
 from imagine_bench import encoders, registry, runner
+from imagine_bench.capabilities import Answer, Questioner, Transferable
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, AgentState, Answer, Observation, Questioner, Transferable, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 from imagine_bench.kinds import kind_of
 from imagine_bench.protocol import Protocol, protocol
 from imagine_bench.registry import AgentEntry

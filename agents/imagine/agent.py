@@ -7,16 +7,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import Answer, ImaginedRollout
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import (
-    AgentContext,
-    AgentState,
-    Answer,
-    Frame,
-    ImaginedRollout,
-    Observation,
-    Transition,
-)
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -150,7 +143,7 @@ class ImagineAgent:
         self.planner.forget()
 
     def question(self, observation: Observation) -> NDArray[np.int64] | None:
-        """What to ask; see :class:`imagine_bench.interfaces.Questioner` and :mod:`.questions`."""
+        """What to ask; see :class:`imagine_bench.capabilities.Questioner` and :mod:`.questions`."""
         planning = self.settings.planning
         return question(
             self.model,
@@ -179,7 +172,7 @@ class ImagineAgent:
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.interfaces.Imaginer`.
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.capabilities.Imaginer`.
 
         ``epistemic`` is the probability that something untested decides the transition, ``modal`` that it does not
         lead where it most probably leads; a categorical model knows no Gaussian noise, so ``aleatoric`` is 0.

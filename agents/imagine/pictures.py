@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from imagine_bench.interfaces import ImaginedRollout
+from imagine_bench.capabilities import ImaginedRollout
 
 from ..encoder import Encoder
 

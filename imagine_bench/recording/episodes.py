@@ -21,12 +21,13 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.comparison import compare_rollout
 from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.files import make_folder
 from imagine_bench.imagination_quality import courses_from, is_random
-from imagine_bench.interfaces import Agent, Frame, Imaginer, Observation, SceneReader, TaskSpec, ValueReader
+from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
 from imagine_bench.pictures import png, rgb, rollout_strip
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s

@@ -1,0 +1,195 @@
+"""What agents may offer beyond :class:`~.interfaces.Agent`: imagination, answers to a probe, training of their own.
+
+The bench asks an agent which of these it has, and offers what the protocol wants only to those that do. Shapes: ``D``
+imagined depth, ``A`` actions, ``M`` coordinates of a macrostate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, Observation
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginedRollout:
+    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``.
+
+    Attributes:
+        actions: Macro-actions imagined. Shape (D,), int64.
+        frames: Decoded latents as pictures of the whole view in [0, 1], grey (D, H', W') or RGB (D, H', W', 3).
+        start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
+        rewards: Predicted rewards. Shape (D,).
+        p_terminated: Predicted probability that the episode ended there. Shape (D,).
+        q_values: The controller's values in the state *before* each action. Shape (D, A).
+        epistemic: Epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
+        aleatoric: The same for aleatoric. Shape (D,).
+        modal: The same for modal. Shape (D,).
+        accepted: Whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
+        macrostates: The macrostate an evaluation-only probe reads from each imagined latent. Shape (D, M).
+    """
+
+    actions: NDArray[np.int64]
+    frames: NDArray[np.float32]
+    start_frame: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    p_terminated: NDArray[np.float32]
+    q_values: NDArray[np.float32]
+    epistemic: NDArray[np.float32]
+    aleatoric: NDArray[np.float32]
+    modal: NDArray[np.float32]
+    accepted: NDArray[np.bool_]
+    macrostates: NDArray[np.int64]
+
+
+@runtime_checkable
+class ValueReader(Protocol):
+    """An agent that can say what it expects of each action."""
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        """Values of every macro-action. Shape (A,)."""
+
+
+@runtime_checkable
+class Rehearser(Protocol):
+    """An agent that practises by itself, without the world, before it is tested."""
+
+    def rehearse(self) -> bool:
+        """Practise a little on what has been learned so far, or say that there is nothing left to practise.
+
+        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that an
+        interrupted rehearsal goes on bit for bit.
+
+        Returns:
+            Whether anything was done; False changes nothing.
+        """
+
+
+OnEpisode = Callable[[bool, int], bool]
+"""Told whether a training episode succeeded and its macro-actions; answers whether training goes on."""
+
+
+@runtime_checkable
+class SelfTrainer(Protocol):
+    """An agent whose training loop is its own, as a library's is; the bench only watches and tests it.
+
+    It cannot be stopped and taken up again: an interrupted run of it starts anew.
+    """
+
+    def train(self, env: Any, *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
+        """Train in ``env``, from nothing.
+
+        Args:
+            env: The task's Gymnasium environment; every reset is the next training episode of the run.
+            episodes: Real training episodes there will be.
+            horizon: Most macro-actions of one.
+            on_episode: To be told of each episode as it ends, before the next macro-action; it may ask the agent to
+                act. Training ends when it answers False.
+        """
+
+
+@runtime_checkable
+class Transferable(Protocol):
+    """An agent that can take what it knows of a world into another task in the same world."""
+
+    def carry_over(self) -> None:
+        """Keep what was learned of how the world moves; what was rewarded and what ended episodes is a hint at most.
+
+        The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a teacher says of an action that was only imagined: the reward it would bring, and whether it would end
+    the episode.
+    """
+
+    reward: float
+    terminated: bool
+
+
+@runtime_checkable
+class Questioner(Protocol):
+    """An agent that can ask a teacher what actions which it only imagines would bring."""
+
+    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+        """Before it acts: the macro-actions whose last one is asked about, from the frame seen, or None to ask nothing.
+
+        It changes nothing but the agent's measurements.
+
+        Returns:
+            Macro-actions (D,) with D of at least 1. The scene is imagined to go on through ends of episodes, so the
+            answer concerns the last one alone.
+        """
+
+    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+        """Take in the answer to :meth:`question`; None says that it is a matter of chance, so that there is none."""
+
+
+@runtime_checkable
+class Imaginer(Protocol):
+    """An agent that can show what it imagines; it changes nothing in the agent."""
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        """Imagine up to ``depth`` transitions from ``frame``.
+
+        Args:
+            frame: A real camera image. Shape (64, 64, 3).
+            actions: The macro-actions to imagine, (D,) with D <= depth, never stopped early; None lets the greedy
+                controller choose and stops where the model says the episode has ended.
+            depth: Longest rollout.
+            rng: Draws components, noise and dropout masks.
+        """
+
+
+Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
+"""Macrostates (N, M) that a probe read from imagined latents to macro-actions (N,); a negative one ends there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampledFutures:
+    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held.
+
+    Attributes:
+        macrostates: What the evaluation-only probe reads. Shape (D, R, S, M).
+        rewards: Predicted rewards, 0 once a future has ended. Shape (D, R, S).
+        ended: Whether the model has said, here or before, that the episode is over. Shape (D, R, S).
+    """
+
+    macrostates: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    ended: NDArray[np.bool_]
+
+
+@runtime_checkable
+class FutureSampler(Protocol):
+    """An agent that can be asked for many futures of the same beginning; it changes nothing in the agent."""
+
+    def sample_futures(
+        self,
+        frames: Frame,
+        actions: NDArray[np.int64],
+        *,
+        follow: Follow,
+        samples: int,
+        depth: int,
+        rng: np.random.Generator,
+    ) -> SampledFutures:
+        """Imagine S = ``samples`` futures of D = ``depth`` macro-actions from each of R frames.
+
+        Args:
+            frames: Real camera images. Shape (R, 64, 64, 3).
+            actions: The first macro-action from each. Shape (R,).
+            follow: Chooses the later ones.
+            samples: Futures of each row.
+            depth: Macro-actions of each future.
+            rng: Draws components, noise and dropout masks.
+        """
