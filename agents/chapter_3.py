@@ -47,5 +47,12 @@ _SMOKE: dict[str, Deviation] = {
     "imagination.rehearsal_episodes": Deviation(50, "shows that every part works, within a minute"),
 }
 
-_PRESETS = {"smoke": _SMOKE, "quick": _QUICK, "thesis": {}, "full": _QUICK, "sample_efficiency": _QUICK}
+_PRESETS = {
+    "smoke": _SMOKE,
+    "quick": _QUICK,
+    "thesis": {},
+    "full": _QUICK,
+    "sample_efficiency": _QUICK,
+    "lessons": _QUICK,
+}
 CHAPTER_3 = Family(thesis=_THESIS, presets=_PRESETS)

@@ -50,5 +50,5 @@ _SMOKE: dict[str, Deviation] = {
     "imagination.start_episode": Deviation(10, "imagination must happen within a few dozen episodes"),
 }
 
-_PRESETS = {"smoke": _SMOKE, "quick": _QUICK, "thesis": {}, "full": {}, "sample_efficiency": _QUICK}
+_PRESETS = {"smoke": _SMOKE, "quick": _QUICK, "thesis": {}, "full": {}, "sample_efficiency": _QUICK, "lessons": _QUICK}
 CHAPTER_5 = Family(thesis=Settings(), presets=_PRESETS)

@@ -11,12 +11,18 @@ from imagine_bench.agents.presets import resolve as resolve_in
 from imagine_bench.agents.settings import Settings
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocol import PRESETS as BENCH_PRESETS
 
 PRESETS = [(family, preset) for family in FAMILIES for preset in FAMILIES[family].presets]
 
 
 def resolve(preset: str, overrides: dict[str, Any]) -> Settings:
     return resolve_in(preset, overrides, "chapter_5")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_preset_of_the_bench_has_settings_in_every_family(family: str) -> None:
+    assert set(FAMILIES[family].presets) == set(BENCH_PRESETS)
 
 
 def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None:
