@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import gymnasium
 import numpy as np
@@ -67,3 +68,20 @@ def test_bundled_encoder_reads_what_physics_leaves_behind(task: str) -> None:
     read = encoder.read_macrostate(encoder.encode(np.array(frames))[0])
     assert (read == np.array(macrostates)).all(axis=1).sum() >= 39
     assert len(np.unique(macrostates, axis=0)) > 5
+
+
+@pytest.mark.parametrize("appearance", ["clean", "mild"])
+@pytest.mark.parametrize("task", sorted({name for name, *_ in PROMISED}))
+def test_bundled_codes_give_every_macrostate_a_code_of_its_own(task: str, appearance: str) -> None:
+    """Neither torn by jitter nor mixed up. A code for every fourth frame of a macrostate would be a third torn."""
+    spec = registry.task(task)
+    encoder = Encoder.load(bundled_encoder(f"{spec.encoder}-{appearance}-codes"))
+    rng = SeedTree(987_654_321).child("encoder_probe", appearance, "codes").generator()
+    frames, macrostates = draw_frames(spec, appearance, 1000, rng)
+    codes = [tuple(row) for row in encoder.encode(frames)[0].tolist()]
+    pairs = Counter(zip(map(tuple, macrostates.tolist()), codes, strict=True))
+    usual: dict[tuple[int, ...], tuple[float, ...]] = {}
+    for (macrostate, code), _ in pairs.most_common():
+        usual.setdefault(macrostate, code)
+    assert len(set(usual.values())) == len(usual)
+    assert sum(pairs[macrostate, code] for macrostate, code in usual.items()) >= 995

@@ -82,3 +82,26 @@ def test_clouds_are_counted_whatever_their_shape_and_equal_points_hang_together(
     assert set(label[2000:].tolist()) == {label[2000]}
     assert label.max() == 1
     assert (label[:2000] != label[2000]).all()
+
+
+def torn(gap: float) -> np.ndarray:
+    """Four clouds of 400 points: two of them ``gap`` apart, the other two 2.4 to 3.4 away from every other."""
+    rng = np.random.default_rng(0)
+    corners = [(-0.2, 0.0), (gap, 0.0), (0.0, 2.8), (2.8, 2.8)]
+    return np.concatenate([np.array(corner) + rng.uniform(0.0, 0.2, size=(400, 2)) for corner in corners])
+
+
+@pytest.mark.parametrize(("gap", "values"), [(0.15, 3), (0.9, 4)])
+def test_a_value_that_is_torn_by_a_narrow_gap_is_one(gap: float, values: int) -> None:
+    label = clouds(torn(gap)).reshape(4, 400)
+    assert label.max() + 1 == values
+    owners = [set(row.tolist()) - {-1} for row in label]
+    assert all(len(owner) == 1 for owner in owners)
+    assert (owners[0] == owners[1]) == (values == 3)
+    assert owners[2] != owners[3]
+    if values == 3:
+        assert owners[0] == {0}, "the largest comes first, counted whole"
+
+
+def test_two_clouds_have_no_third_to_be_measured_by() -> None:
+    assert clouds(torn(0.15)[:800]).max() + 1 == 2
