@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.errors import require_known
 
 from .presets import FAMILIES, checked_values, flatten
+from .ranges import POSITIVE, PROBABILITY, require_ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,14 @@ class PeerSettings:
     sb3: LibrarySettings = field(default_factory=LibrarySettings)
 
 
+_RANGES = {
+    "sb3.learning_rate": POSITIVE,
+    "sb3.gamma": PROBABILITY,
+    "sb3.exploration_final_eps": PROBABILITY,
+}
+"""Ranges of the numbers; every other is a count of at least 1."""
+
+
 def names() -> frozenset[str]:
     """The dotted names of all settings."""
     return frozenset(flatten(PeerSettings()))
@@ -66,11 +75,5 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> PeerSetti
     """
     require_known("preset", preset, FAMILIES[require_known("settings family", family, FAMILIES)].presets)
     settings: PeerSettings = checked_values(PeerSettings(), overrides)
-    for name, value in flatten(settings).items():
-        share = name in ("sb3.gamma", "sb3.exploration_final_eps")
-        if share and not 0.0 <= value <= 1.0:
-            raise InvalidValueError(f"Setting {name} is {value}; it must lie in [0, 1].")
-        if not share and not (value > 0 if isinstance(value, float) else value >= 1):
-            least = "above 0" if isinstance(value, float) else "at least 1"
-            raise InvalidValueError(f"Setting {name} is {value}; it must be {least}.")
+    require_ranges(flatten(settings), _RANGES)
     return settings

@@ -6,8 +6,8 @@ nothing but its deviations from the family's thesis values, each with its reason
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -19,6 +19,7 @@ from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
 from .precision import PRECISIONS, settle
+from .ranges import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, require_ranges
 from .settings import START_STATES, Settings
 from .uncertainty import REDUCTIONS
 
@@ -26,44 +27,30 @@ FAMILIES: dict[str, Family] = {"chapter_3": CHAPTER_3, "chapter_5": CHAPTER_5}
 """What a TaskSpec may name as its settings."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Range:
-    """Which numbers a setting takes, in words too. NaN satisfies no comparison, so it is never allowed."""
-
-    holds: Callable[[float], bool]
-    words: str
-
-
-_PROBABILITY = _Range(lambda value: 0.0 <= value <= 1.0, "must lie in [0, 1]")
-_SHARE = _Range(lambda value: 0.0 <= value < 1.0, "must lie in [0, 1)")
-_POSITIVE = _Range(lambda value: value > 0.0, "must be above 0")
-_RATE = _Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
-_NOT_NEGATIVE = _Range(lambda value: value >= 0.0, "must be at least 0")
-_COUNT = _Range(lambda value: value >= 1, "must be at least 1")
 _RANGES = {
-    "model.dropout": _SHARE,
-    "model.reward_scale": _POSITIVE,
-    "model.learning_rate": _POSITIVE,
-    "model.max_norm": _POSITIVE,
-    "model.updates_per_step": _COUNT,
-    "model.sigma_floor": _POSITIVE,
-    "model.gradient_clip": _POSITIVE,
-    "controller.learning_rate": _POSITIVE,
-    "controller.discount": _PROBABILITY,
-    "controller.updates_per_step": _NOT_NEGATIVE,
-    "controller.target_rate": _RATE,
-    "controller.gradient_clip": _POSITIVE,
-    "controller.epsilon_min": _PROBABILITY,
-    "controller.epsilon_max": _PROBABILITY,
-    "controller.epsilon_decay": _NOT_NEGATIVE,
-    "memory.spread": _NOT_NEGATIVE,
-    "imagination.start_episode": _NOT_NEGATIVE,
-    "imagination.updates_per_step": _NOT_NEGATIVE,
-    "imagination.temperature": _NOT_NEGATIVE,
-    "imagination.exploration": _PROBABILITY,
-    "imagination.threshold": _NOT_NEGATIVE,
-    "imagination.threshold_quantile": _PROBABILITY,
-    "imagination.reward_threshold": _NOT_NEGATIVE,
+    "model.dropout": SHARE,
+    "model.reward_scale": POSITIVE,
+    "model.learning_rate": POSITIVE,
+    "model.max_norm": POSITIVE,
+    "model.updates_per_step": COUNT,
+    "model.sigma_floor": POSITIVE,
+    "model.gradient_clip": POSITIVE,
+    "controller.learning_rate": POSITIVE,
+    "controller.discount": PROBABILITY,
+    "controller.updates_per_step": NOT_NEGATIVE,
+    "controller.target_rate": RATE,
+    "controller.gradient_clip": POSITIVE,
+    "controller.epsilon_min": PROBABILITY,
+    "controller.epsilon_max": PROBABILITY,
+    "controller.epsilon_decay": NOT_NEGATIVE,
+    "memory.spread": NOT_NEGATIVE,
+    "imagination.start_episode": NOT_NEGATIVE,
+    "imagination.updates_per_step": NOT_NEGATIVE,
+    "imagination.temperature": NOT_NEGATIVE,
+    "imagination.exploration": PROBABILITY,
+    "imagination.threshold": NOT_NEGATIVE,
+    "imagination.threshold_quantile": PROBABILITY,
+    "imagination.reward_threshold": NOT_NEGATIVE,
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 
@@ -127,11 +114,7 @@ def _require_ranges(settings: Settings) -> None:
     flat = flatten(settings)
     for name, (kind, known) in _WORDS.items():
         require_known(kind, flat[name], known)
-    for name, value in flat.items():
-        allowed = _RANGES.get(name, _COUNT)
-        numbers = value if isinstance(value, tuple) else (value,)
-        if any(type(number) in (int, float) and not allowed.holds(number) for number in numbers):
-            raise InvalidValueError(f"Setting {name} is {value}; it {allowed.words}.")
+    require_ranges(flat, _RANGES)
 
 
 def checked_values(settings: Any, values: Mapping[str, Any]) -> Any:

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.errors import require_known
 
 from ..presets import FAMILIES, checked_values, flatten
+from ..ranges import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, require_ranges
 
 EXPLORATIONS = ("curiosity", "optimism", "random")
 
@@ -98,10 +99,22 @@ class ImagineSettings:
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
 
-_COUNTS = frozenset(("dynamics.parents", "outcomes.sweeps", "planning.depth", "planning.branches", "planning.states"))
-_NOT_NEGATIVE = frozenset(("outcomes.order",))
-_POSITIVE = frozenset(("dynamics.concentration", "outcomes.pseudo_tests", "outcomes.pseudo_conjunctions"))
-_OPEN = frozenset(("dynamics.persistence", "dynamics.slip", "outcomes.prior", "outcomes.leak"))
+_RANGES = {
+    "dynamics.parents": COUNT,
+    "dynamics.persistence": INSIDE,
+    "dynamics.concentration": POSITIVE,
+    "dynamics.slip": INSIDE,
+    "outcomes.order": NOT_NEGATIVE,
+    "outcomes.prior": INSIDE,
+    "outcomes.pseudo_tests": POSITIVE,
+    "outcomes.pseudo_conjunctions": POSITIVE,
+    "outcomes.leak": INSIDE,
+    "outcomes.sweeps": COUNT,
+    "planning.depth": COUNT,
+    "planning.branches": COUNT,
+    "planning.states": COUNT,
+}
+"""Ranges of the numbers; every other is a share."""
 
 
 def names() -> frozenset[str]:
@@ -124,22 +137,5 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> ImagineSe
     require_known("preset", preset, FAMILIES[require_known("settings family", family, FAMILIES)].presets)
     settings: ImagineSettings = checked_values(ImagineSettings(), overrides)
     require_known("exploration", settings.planning.exploration, EXPLORATIONS)
-    for name, value in flatten(settings).items():
-        if isinstance(value, bool | str):
-            continue
-        holds, words = _allowed(name, value)
-        if not holds:
-            raise InvalidValueError(f"Setting {name} is {value}; it must {words}.")
+    require_ranges(flatten(settings), _RANGES, otherwise=PROBABILITY)
     return settings
-
-
-def _allowed(name: str, value: float) -> tuple[bool, str]:
-    if name in _COUNTS:
-        return value >= 1, "be at least 1"
-    if name in _NOT_NEGATIVE:
-        return value >= 0, "be at least 0"
-    if name in _POSITIVE:
-        return value > 0, "be above 0"
-    if name in _OPEN:
-        return 0 < value < 1, "lie between 0 and 1"
-    return 0 <= value <= 1, "lie in [0, 1]"
