@@ -61,6 +61,7 @@ PRESETS: dict[str, dict[str, Deviation]] = {
 ENSEMBLE: dict[str, Deviation] = {
     "members": Deviation(5, "as many as Lakshminarayanan et al. (2017) recommend"),
     "dropout": Deviation(0.0, "in an ensemble the members are the weight samples"),
+    "batch_size": Deviation(250, "so few epochs want more steps in each"),
 }
 """What a deep ensemble changes of every preset; its epochs are those of :func:`_ensemble_epochs`."""
 ENSEMBLE_SHARE = 10
