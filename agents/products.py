@@ -21,12 +21,16 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     return torch.bmm(a, b)
 
 
-def affine(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """``x @ weight + bias`` for each member: (E, N, I), (E, I, O) and (E, 1, O). Without a gradient of its own."""
+def affine(x: Tensor, weight: Tensor, bias: Tensor, *, relu: bool = False) -> Tensor:
+    """``x @ weight + bias`` for each member: (E, N, I), (E, I, O) and (E, 1, O). Without a gradient of its own.
+
+    With ``relu``, what is below 0 becomes 0, by oneDNN in the same pass over memory.
+    """
     if _by_onednn(x, weight):
-        parts = zip(x, weight, bias, strict=True)
-        return _stacked([_ONEDNN(rows, w.t(), b[0], "none", [], "") for rows, w, b in parts])
-    return torch.baddbmm(bias, x, weight)
+        parts, then = zip(x, weight, bias, strict=True), "relu" if relu else "none"
+        return _stacked([_ONEDNN(rows, w.t(), b[0], then, [], "") for rows, w, b in parts])
+    result = torch.baddbmm(bias, x, weight)
+    return result.relu_() if relu else result
 
 
 def _stacked(members: list[Tensor]) -> Tensor:

@@ -155,7 +155,7 @@ def _together() -> Iterator[Figure]:
     """What chapter 4 computes as one batch, against the same one after another."""
     ratios = {}
     for rows in _BATCHES:
-        one_pass_s, loop_s = registry.load(_WEIGHT_SAMPLES)(rows, 50, 5 if rows < 1_000 else 3)
+        one_pass_s, loop_s = registry.load(_WEIGHT_SAMPLES)(rows, 50, 5)
         ratios[rows] = one_pass_s / loop_s
     worst = max(ratios, key=lambda rows: ratios[rows])
     yield Figure(

@@ -108,11 +108,18 @@ def test_dropped_units_are_dropped_after_folding_too() -> None:
     torch.testing.assert_close(sample_outputs(network.folded(), x[0], mask)[0], expected[0], rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("rows", [1, 7, 300])
-def test_weight_samples_in_one_pass_are_those_of_a_loop(rows: int) -> None:
-    network = MemberMLP((2, 32, 32, 32, 9), members=1, dropout=0.2, generator=generator())
+@pytest.mark.parametrize(
+    ("rows", "dropout", "sizes"),
+    [
+        (1, 0.2, (2, 32, 32, 32, 9)), (7, 0.2, (2, 32, 32, 32, 9)), (300, 0.2, (2, 32, 32, 32, 9)),
+        (300, 0.6, (2, 32, 24, 32, 9)), (300, 0.2, (2, 32, 9)), (3, 0.2, (2, 32, 9)),
+    ],
+)  # fmt: skip
+def test_weight_samples_in_one_pass_are_those_of_a_loop(rows: int, dropout: float, sizes: tuple[int, ...]) -> None:
+    """Few rows and many, few units dropped, which are then gathered, and more than half, which are not."""
+    network = MemberMLP(sizes, members=1, dropout=dropout, generator=generator())
     x = torch.randn(rows, 2, generator=generator(1))
-    masks = [dropout_mask((50, 32), 0.2, generator(2 + layer)) for layer in range(3)]
+    masks = [dropout_mask((50, units), dropout, generator(2 + layer)) for layer, units in enumerate(sizes[1:-1])]
     loop = [network(x[None], tuple(m[t].expand(1, rows, -1) for m in masks))[0] for t in range(50)]
     torch.testing.assert_close(sample_outputs(network, x, masks), torch.stack(loop), rtol=1e-4, atol=1e-5)
     ensemble = MemberMLP((2, 32, 9), members=5, dropout=0.0, generator=generator())
