@@ -26,6 +26,11 @@ NOT_NEGATIVE = Range(lambda value: value >= 0.0, "must be at least 0")
 COUNT = Range(lambda value: value >= 1, "must be at least 1")
 
 
+def between(low: float, high: float, why: str = "") -> Range:
+    """Numbers from ``low`` to ``high``, both allowed; ``why`` says what is wrong with the others."""
+    return Range(lambda value: low <= value <= high, f"must lie in [{low:g}, {high:g}]" + (why and f": {why}"))
+
+
 def require_ranges(values: Mapping[str, Any], ranges: Mapping[str, Range], otherwise: Range = COUNT) -> None:
     """Raise InvalidValueError for a number, or a number in a tuple, that its setting does not allow.
 

@@ -12,6 +12,7 @@ from .bayesian_mdn import MDNSettings
 from .family import Deviation
 from .precision import PRECISIONS
 from .presets import checked
+from .ranges import NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, between, require_ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,18 +70,19 @@ ENSEMBLE_SHARE = 10
 ENSEMBLE_EPOCHS = 120
 """Below so many epochs members have hardly learned; they get them where that costs no more than the one network."""
 
-_RANGES: dict[str, tuple[float, float, str]] = {
-    "dropout": (0.0, 0.95, "must lie in [0, 0.95]"),
-    "weight_decay": (0.0, 1e6, "must be at least 0"),
-    "learning_rate": (1e-12, 1.0, "must lie in (0, 1]"),
-    "final_rate": (0.0, 1.0, "must lie in [0, 1]"),
-    "gradient_clip": (1e-12, 1e12, "must be above 0"),
-    "sigma_floor": (1e-9, 1.0, "must lie in [1e-9, 1]"),
-    "weight_samples": (2, 10_000, "must lie in [2, 10000]: the spread of one sample is 0"),
-    "components": (1, 1_000, "must lie in [1, 1000]"),
-    "members": (1, 1_000, "must lie in [1, 1000]"),
+_RANGES = {
+    "dropout": between(0.0, 0.95),
+    "weight_decay": NOT_NEGATIVE,
+    "learning_rate": RATE,
+    "final_rate": PROBABILITY,
+    "gradient_clip": POSITIVE,
+    "sigma_floor": between(1e-9, 1.0),
+    "sigma_ceiling": between(1.0, 1e9),
+    "weight_samples": between(2, 10_000, "the spread of one sample is 0"),
+    "components": between(1, 1_000),
+    "members": between(1, 1_000),
 }
-_COUNT = (1, 1e9, "must be at least 1")
+"""Ranges of the numbers; every other number is a count of at least 1."""
 
 
 def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> RegressorSettings:
@@ -133,9 +135,4 @@ def _require_ranges(settings: RegressorSettings) -> None:
             f"Setting hidden is {settings.hidden}; dropout acts between hidden layers, so it needs at least two of "
             "them. Add one, or set dropout=0."
         )
-    for field in fields(settings):
-        value = getattr(settings, field.name)
-        low, high, words = _RANGES.get(field.name, _COUNT)
-        numbers = value if isinstance(value, tuple) else (value,)
-        if any(not isinstance(number, str) and not low <= number <= high for number in numbers):
-            raise InvalidValueError(f"Setting {field.name} is {value}; it {words}.")
+    require_ranges({field.name: getattr(settings, field.name) for field in fields(settings)}, _RANGES)
