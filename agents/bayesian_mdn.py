@@ -33,7 +33,9 @@ class MDNSettings:
         hidden: Units a hidden layer.
         components: Gaussians in the mixture, K.
         dropout: Probability of dropping a unit of a hidden layer that another one follows; [0, 1).
-        weight_decay: Of the hidden layers, added to the gradient: the term ``weight_decay / 2 * |w|^2`` of the loss.
+        weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
+            ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
+            leave the data as ``w`` shrinks, and a third of the first layer die.
         learning_rate: Of Adam.
         gradient_clip: Largest gradient norm of each network.
         sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
@@ -70,8 +72,9 @@ class BayesianMDN:
         sizes = (n_inputs, *settings.hidden, mdn.output_size(settings.components, n_outputs))
         precision = hidden_dtype(settings.precision, generators[0].device.type)
         self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
+        hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
         self.optimiser = MemberAdam(
-            self.network, list(self.network.weights)[:-1], learning_rate=settings.learning_rate,
+            self.network, hidden, learning_rate=settings.learning_rate,
             weight_decay=settings.weight_decay, gradient_clip=settings.gradient_clip,
         )  # fmt: skip
 

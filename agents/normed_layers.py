@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from .layers import MemberMLP, dropout_mask, kept_scale
 
-EPSILON = 1e-3
-"""Added to every variance, the default of Keras."""
+EPSILON = 1e-5
+"""Added to every variance (the default of PyTorch): little, as decay makes units small."""
 MOMENTUM = 0.99
 """Share of the running statistics that one batch leaves (the default of Keras), once there have been 100 batches."""
 _REACH = 3.0**0.5

@@ -157,6 +157,18 @@ def test_first_units_bend_all_over_the_data() -> None:
     assert all(not bias.detach().any() for bias in list(network.biases)[1:])
 
 
+def test_decay_leaves_first_units_their_bends() -> None:
+    """Where only weights decayed, bends at -b / w would leave the data: a quarter of the units would be dead here."""
+    x = torch.rand(2, 300, 1, generator=generator(5)) * 2.0 - 1.0
+    y = torch.sin(6.0 * x) + 0.1 * torch.randn(x.shape, generator=generator(6))
+    settings = MDNSettings(hidden=(64, 32), components=2, learning_rate=1e-2)
+    model = BayesianMDN(1, 1, settings, [generator(0), generator(1)])
+    for _ in range(250):
+        model.update(x, y)
+    spread = model.network.get_buffer("variance_1")
+    assert (spread < 1e-6 * spread.amax()).float().mean() < 0.1
+
+
 def random_mixtures(shape: tuple[int, ...], dtype: torch.dtype) -> Mixture:
     g = generator(3)
     weights = torch.randn(*shape[:-1], generator=g, dtype=dtype).log_softmax(-1)
