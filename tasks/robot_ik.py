@@ -81,6 +81,12 @@ def draw_targets(rng: np.random.Generator, count: int) -> Floats:
     raise AssertionError("half of the square is workspace")  # pragma: no cover
 
 
+def draw_places(rng: np.random.Generator, count: int) -> Floats:
+    """Points drawn uniformly from the disc of the stretched arm, within reach or not. Shape (count, 2), in metres."""
+    radius, angle = sum(LINKS_M) * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, size=count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
 def samples_of(variant: str) -> int:
     """The number of motor babbling samples that a variant names.
 
@@ -123,7 +129,12 @@ def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
     """
     require_variant(variant)
     require_reachable(np.maximum(np.abs(inputs) - 1e-6, 0.0) * np.sign(inputs))  # a stretched arm rests on the edge
-    return np.linalg.norm(arm().execute(predictions) - inputs, axis=-1)
+    return missed(inputs, predictions)
+
+
+def missed(points_m: Floats, joints_rad: Floats) -> Floats:
+    """How far from points (N, 2) the tip comes to rest when joints (N, 3) are carried out, in metres. Shape (N,)."""
+    return np.linalg.norm(arm().execute(joints_rad) - points_m, axis=-1)
 
 
 def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
@@ -132,27 +143,36 @@ def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[
     Returns:
         ``decision/...``: ``points`` (E, DECISIONS, CANDIDATES, 2), ``error``, ``joints`` and one entry a score of the
         same leading shape, ``mink_error`` of the first candidate of each choice (E, DECISIONS).
+        ``disc/...``: ``error``, scores and ``outside_m`` of the same choices among points of the whole disc of the
+        stretched arm, some of them out of reach.
         ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, and the three
         uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
     """
-    decisions = {f"decision/{name}": values for name, values in _decide(variant, assess, seeds).items()}
-    maps = {f"map/{name}": values for name, values in _map(variant, assess, len(seeds)).items()}
-    babbling = training(variant, seeds[0].child("data").generator()).inputs
-    return {**decisions, **maps, "babbling": babbling}
+    count = DECISIONS * CANDIDATES
+    parts = {"map": _map(variant, assess, len(seeds))}
+    points = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
+    parts["decision"] = {**_decide(points, assess, "decisions"), "mink_error": _mink_errors(points, seeds)}
+    points = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
+    parts["disc"] = _decide(points, assess, "disc")
+    measured = {f"{part}/{name}": values for part, found in parts.items() for name, values in found.items()}
+    return {**measured, "babbling": training(variant, seeds[0].child("data").generator()).inputs}
 
 
-def _decide(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
-    shape = (len(seeds), DECISIONS, CANDIDATES)
-    points = np.stack([draw_targets(node.child("candidates").generator(), shape[1] * shape[2]) for node in seeds])
-    said = assess(points, "decisions")
-    wrong = np.stack([errors(variant, *pair) for pair in zip(points, said.prediction, strict=True)])
-    result = {"points": points.reshape(*shape, 2), "error": wrong.reshape(shape)}
-    result["joints"] = said.prediction.reshape(*shape, 3)
-    result |= {name: score(said).reshape(shape) for name, score in SCORES.items()}
-    first = result["points"][:, :, 0]
+def _decide(points_m: Floats, assess: Assess, purpose: str) -> dict[str, NDArray[Any]]:
+    """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
+    shape = (len(points_m), DECISIONS, CANDIDATES)
+    said = assess(points_m, purpose)
+    wrong = np.stack([missed(*pair) for pair in zip(points_m, said.prediction, strict=True)])
+    result = {"points": points_m.reshape(*shape, 2), "error": wrong.reshape(shape)}
+    result |= {"joints": said.prediction.reshape(*shape, 3), "outside_m": distance_to_workspace(result["points"])}
+    return result | {name: score(said).reshape(shape) for name, score in SCORES.items()}
+
+
+def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
+    """Errors of inverse kinematics with the true arm at the first candidate of each choice. Shape (E, DECISIONS)."""
+    first = points_m.reshape(len(seeds), DECISIONS, CANDIDATES, 2)[:, :, 0]
     solved = [arm().solve(p, node.child("mink").generator()) for p, node in zip(first, seeds, strict=True)]
-    result["mink_error"] = np.stack([errors(variant, *pair) for pair in zip(first, solved, strict=True)])
-    return result
+    return np.stack([missed(*pair) for pair in zip(first, solved, strict=True)])
 
 
 def _map(variant: str, assess: Assess, networks: int) -> dict[str, NDArray[Any]]:

@@ -64,6 +64,22 @@ def test_targets_are_uniform_over_the_workspace() -> None:
     assert inner == pytest.approx(np.pi * 0.25 / area, rel=0.05)  # that disc lies inside as a whole
 
 
+def test_places_fill_the_disc_of_the_stretched_arm() -> None:
+    places = ik.draw_places(np.random.default_rng(7), 40_000)
+    radius = np.linalg.norm(places, axis=1)
+    assert radius.max() <= 1.0 and (radius < 0.5).mean() == pytest.approx(0.25, abs=0.01)
+    assert np.abs(places.mean(axis=0)).max() < 0.02
+    area = (ik.distance_to_workspace(np.random.default_rng(5).uniform(-1, 1, (400_000, 2))) == 0).mean() * 4
+    assert (ik.distance_to_workspace(places) == 0).mean() == pytest.approx(area / np.pi, abs=0.01)
+
+
+def test_a_place_out_of_reach_is_missed_by_its_distance_at_least() -> None:
+    places = ik.draw_places(np.random.default_rng(8), 200)
+    joints = np.random.default_rng(9).uniform(ik.LOW_RAD, ik.HIGH_RAD, (200, 3))
+    assert (ik.missed(places, joints) >= ik.distance_to_workspace(places) - 1e-4).all()
+    assert (ik.distance_to_workspace(places) > 0.1).any()
+
+
 def test_babbling_is_what_was_reached_and_the_joints_with_noise() -> None:
     data = ik.training("200", np.random.default_rng(6))
     commanded = np.random.default_rng(6).uniform(ik.LOW_RAD, ik.HIGH_RAD, (200, 3))

@@ -21,8 +21,8 @@ BEST_GOAL = 0.45
 
 
 def sections(result: RegressionResult) -> list[Section]:
-    """The decisions, the maps."""
-    return [_decisions(result), _maps(result)]
+    """The decisions, the same among places out of reach, the maps."""
+    return [_decisions(result), _beyond(result), _maps(result)]
 
 
 def totals(result: RegressionResult, agent: str, variant: str) -> dict[str, Values]:
@@ -31,11 +31,24 @@ def totals(result: RegressionResult, agent: str, variant: str) -> dict[str, Valu
     ``random`` is what a choice by chance may expect, the mean over the candidates; ``mink`` reaches a candidate by
     inverse kinematics of the true arm.
     """
-    error = result.arrays(agent, variant, "decision/error")  # [E, choices, candidates]
-    chosen = {name: result.arrays(agent, variant, f"decision/{name}").argmin(axis=-1) for name in SCORES}
-    by = {name: np.take_along_axis(error, pick[..., None], axis=-1)[..., 0] for name, pick in chosen.items()}
-    by |= {"min": error.min(axis=-1), "max": error.max(axis=-1), "random": error.mean(axis=-1)}
-    by["mink"] = result.arrays(agent, variant, "decision/mink_error")
+    mink = result.arrays(agent, variant, "decision/mink_error").sum(axis=1)
+    return {**by_criterion(result, agent, variant, "decision", "error"), "mink": mink}
+
+
+def by_criterion(result: RegressionResult, agent: str, variant: str, part: str, what: str) -> dict[str, Values]:
+    """``what`` of the chosen candidates, cumulated over the choices, by criterion: (E,) each.
+
+    Args:
+        result: What was measured.
+        agent: The regressor.
+        variant: Its data.
+        part: ``decision``, whose candidates are within reach, or ``disc``, whose need not be.
+        what: A quantity of every candidate: ``error`` or ``outside_m``.
+    """
+    values = result.arrays(agent, variant, f"{part}/{what}")  # [E, choices, candidates]
+    picks = {name: result.arrays(agent, variant, f"{part}/{name}").argmin(axis=-1) for name in SCORES}
+    by = {name: np.take_along_axis(values, pick[..., None], axis=-1)[..., 0] for name, pick in picks.items()}
+    by |= {"min": values.min(axis=-1), "max": values.max(axis=-1), "random": values.mean(axis=-1)}
     return {name: values.sum(axis=1) for name, values in by.items()}
 
 
@@ -98,6 +111,44 @@ def _decisions(result: RegressionResult) -> Section:
             Table(
                 name="ratio_to_random", header=["ratio to random", *(n.replace("_", " ") for n in SCORES)], rows=ratios,
                 caption="In brackets: 95 % interval over networks (bootstrap). Below 1 a criterion beats chance.",
+            ),
+        ),
+        answers=answers,
+    )  # fmt: skip
+
+
+def _beyond(result: RegressionResult) -> Section:
+    """The same choices among points of the whole disc of the stretched arm."""
+    protocol, columns = result.protocol, (*SCORES, "min", "max", "random")
+    rng = SeedTree(int(protocol.hash, 16)).child("report_disc").generator()
+    errors, ratios, answers = [], [], []
+    for agent in protocol.agents:
+        title = registry.regressor_entry(agent).title
+        for variant in protocol.variants:
+            found = by_criterion(result, agent, variant, "disc", "error")
+            outside = by_criterion(result, agent, variant, "disc", "outside_m")
+            errors.append([f"{title}, {variant}", *(mean_std(found[name].tolist()) for name in columns)])
+            against = {name: ratio_to_random(found[name], found["random"], rng) for name in SCORES}
+            ratios.append([f"{title}, {variant}", *(_interval(against[name]) for name in SCORES)])
+            answers.append(
+                f"{title}, {variant} samples, any place on the disc of the stretched arm: choosing the least epistemic "
+                f"uncertainty leaves {against['epistemic'].value:.2f} of the error of a random choice, and asks for "
+                f"{outside['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
+                f"{outside['random'].mean():.2f} m)."
+            )
+    names = [name.replace("_", " ") for name in columns]
+    return Section(
+        title="The same among places that may be out of reach",
+        words=(
+            "Here the 20 places lie anywhere on the disc of the stretched arm, whose left part no configuration "
+            "reaches. A place out of reach is missed by its distance from the workspace at least: does the robot know "
+            "what it cannot reach? The thesis draws its points 'over the workspace' and does not say how.",
+        ),
+        tables=(
+            Table(name="disc", header=["cumulated error (m)", *names], rows=errors),
+            Table(
+                name="disc_ratio_to_random", header=["ratio to random", *(n.replace("_", " ") for n in SCORES)],
+                rows=ratios, caption="In brackets: 95 % interval over networks (bootstrap).",
             ),
         ),
         answers=answers,
