@@ -131,8 +131,11 @@ class Imagination:
 
     def learn(self, real: RealMemory) -> list[ModelLosses]:
         """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
-        updates, size = self.model.settings.updates_per_step, self.model.settings.batch_size
-        drawn = real.sample(updates * size, self._generators["replay"])
+        settings = self.model.settings
+        updates, size = settings.updates_per_step, settings.batch_size
+        drawn = real.sample(
+            updates * size, self._generators["replay"], spread=settings.spread, balance=settings.balance
+        )
         parts = zip(*(getattr(drawn, field.name).split(size) for field in fields(Batch)), strict=True)
         return [self.model.update(Batch(*part), self._generators["dropout"]) for part in parts]
 

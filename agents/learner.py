@@ -54,7 +54,7 @@ class Learner:
         self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
         self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
-        self.real = RealMemory(settings.memory.real, perception.latent_size, device, settings.memory.spread)
+        self.real = RealMemory(settings.memory.real, perception.latent_size, device)
         self.meters = Meters()
         self.steps = 0
 

@@ -59,10 +59,13 @@ class _Ring:
             self._columns[name][index] = values
         self.added += count
 
-    def _draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+    def _draw(self, count: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
         if self.added == 0:
             raise InvalidValueError("The memory is empty; store a transition before sampling from it.")
-        index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+        if weights is None:
+            index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
+        else:
+            index = torch.multinomial(weights, count, replacement=True, generator=generator)
         return {name: column.index_select(0, index) for name, column in self._columns.items()}
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -83,11 +86,9 @@ class RealMemory(_Ring):
         capacity: Largest number of transitions.
         latent_size: Z.
         device: Where the rows lie.
-        spread: Latents are drawn with this many times the posterior's standard deviation.
     """
 
-    def __init__(self, capacity: int, latent_size: int, device: torch.device, spread: float = 1.0) -> None:
-        self._spread = spread
+    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
         latents = ("mu", "sigma", "next_mu", "next_sigma")
         columns = {name: torch.zeros(capacity, latent_size, device=device) for name in latents}
         columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -110,10 +111,18 @@ class RealMemory(_Ring):
         columns["action"][row], columns["reward"][row], columns["terminated"][row] = action, reward, float(terminated)
         self.added += 1
 
-    def sample(self, count: int, generator: torch.Generator) -> Batch:
-        """Draw transitions with replacement, and latents from their posteriors."""
-        rows = self._draw(count, generator)
-        noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * self._spread
+    def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
+        """Draw transitions with replacement, and latents from their posteriors.
+
+        Args:
+            count: B.
+            generator: Draws rows and latents.
+            spread: Latents are drawn with this many times the posterior's standard deviation.
+            balance: A transition's probability is proportional to n ** -balance, with n the number of those of the same
+                reward and end: 0 draws all alike, 1 draws every outcome as often.
+        """
+        rows = self._draw(count, generator, self._weights(balance) if balance else None)
+        noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * spread
         return Batch(
             z=torch.addcmul(rows["mu"], rows["sigma"], noise[0]),
             action=rows["action"],
@@ -121,6 +130,12 @@ class RealMemory(_Ring):
             next_z=torch.addcmul(rows["next_mu"], rows["next_sigma"], noise[1]),
             terminated=rows["terminated"],
         )
+
+    def _weights(self, balance: float) -> Tensor:
+        """Unnormalised probabilities of the filled rows. Shape (N,)."""
+        outcomes = torch.stack([self._columns[name][: len(self)] for name in ("reward", "terminated")])
+        _, which, counts = outcomes.unique(dim=1, return_inverse=True, return_counts=True)
+        return counts[which].float() ** -balance
 
 
 class StartMemory(_Ring):

@@ -31,6 +31,12 @@ class WorldModelSettings:
         max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
         updates_per_step: Model updates a real step, N_E.
         batch_size: Transitions an update.
+        spread: Latents of a batch are drawn from N(mu, (spread sigma)^2), anew for each batch; the thesis draws with 1.
+            An encoder whose posteriors are narrower than the looks of one macrostate vary leaves networks to learn the
+            few pictures they saw by heart; a larger spread keeps them from it.
+        balance: How much batches make up for rare outcomes: a transition is drawn in proportion to n ** -balance, with
+            n the number of remembered ones of the same reward and end. The thesis draws all alike, 0. A good policy
+            fails rarely, and a model that has forgotten what fails imagines that nothing does.
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each network; None clips nothing.
@@ -51,6 +57,8 @@ class WorldModelSettings:
     max_norm: float | None = 3.0
     updates_per_step: int = 16
     batch_size: int = 512
+    spread: float = 1.0
+    balance: float = 0.0
     predict_change: bool = False
     sigma_floor: float = 0.01
     gradient_clip: float | None = None
@@ -132,15 +140,11 @@ class MemorySettings:
 
     Attributes:
         real: Transitions of the real memory.
-        spread: Latents of a batch are drawn from N(mu, (spread sigma)^2), anew for each batch; the thesis draws with 1.
-            An encoder whose posteriors are narrower than the looks of one macrostate vary leaves networks to learn the
-            few pictures they saw by heart; a larger spread keeps them from it.
         imagined: Transitions of the imagined memory.
         starts: Starts of real episodes, for those who imagine whole episodes.
     """
 
     real: int = 50_000
-    spread: float = 1.0
     imagined: int = 3_000
     starts: int = 1_000
 

@@ -54,7 +54,6 @@ _FACTORS = (
         _FILTERED,
     ),
     *_pair("targets", "target network", {"controller.target_rate": 0.02}),
-    *_pair("augmentation", "latents spread five times", {"memory.spread": 5.0}),
     *_pair("exploration", "thesis' epsilon", {"controller.epsilon_decay": 0.03}),
     *_pair("discount", "0.9", {"controller.discount": 0.9}),
     *_pair("discount", "0.99", {"controller.discount": 0.99}),

@@ -81,10 +81,29 @@ def test_sampling_an_empty_memory_is_an_error() -> None:
 
 
 def test_latents_spread_as_widely_as_asked() -> None:
-    memory = RealMemory(1, 2, CPU, spread=5.0)
+    memory = RealMemory(1, 2, CPU)
     sigma = torch.tensor([0.1, 0.2])
     memory.add((torch.tensor([3.0, -1.0]), sigma), 0, 0.0, (torch.zeros(2), sigma), False)
-    drawn = memory.sample(4000, torch.Generator().manual_seed(0))
+    drawn = memory.sample(4000, torch.Generator().manual_seed(0), spread=5.0)
     for values, centre in ((drawn.z, torch.tensor([3.0, -1.0])), (drawn.next_z, torch.zeros(2))):
         torch.testing.assert_close(values.mean(dim=0), centre, rtol=0.0, atol=0.06)
         torch.testing.assert_close(values.std(dim=0), 5.0 * sigma, rtol=0.06, atol=0.0)
+
+
+@pytest.mark.parametrize(("balance", "expected"), [(0.0, 0.8), (0.5, 2.0 / 3.0), (1.0, 0.5)])
+def test_rare_outcomes_are_drawn_as_often_as_the_balance_says(balance: float, expected: float) -> None:
+    memory, nothing = RealMemory(32, 2, CPU), (torch.zeros(2), torch.zeros(2))
+    for row in range(20):  # 16 of one outcome, 4 of another: n ** (1 - balance) gives 16 : 4, 4 : 2 and 1 : 1
+        memory.add(nothing, 0, -1.0, nothing, terminated=row % 5 == 0)
+    drawn = memory.sample(20_000, torch.Generator().manual_seed(0), balance=balance)
+    assert float((drawn.terminated == 0.0).float().mean()) == pytest.approx(expected, abs=0.01)
+
+
+def test_the_same_reward_with_and_without_an_end_are_two_outcomes() -> None:
+    memory, nothing = RealMemory(8, 2, CPU), (torch.zeros(2), torch.zeros(2))
+    for reward, terminated in ((1.0, True), (1.0, False), (2.0, False), (2.0, False)):
+        memory.add(nothing, 0, reward, nothing, terminated)
+    drawn = memory.sample(30_000, torch.Generator().manual_seed(0), balance=1.0)
+    for reward, terminated in ((1.0, 1.0), (1.0, 0.0), (2.0, 0.0)):
+        share = ((drawn.reward == reward) & (drawn.terminated == terminated)).float().mean()
+        assert float(share) == pytest.approx(1.0 / 3.0, abs=0.01)
