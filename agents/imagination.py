@@ -162,9 +162,12 @@ class Imagination:
         """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
         if not self.filtered:
             return torch.ones_like(step.reward, dtype=torch.bool)
-        known = self.score(decompose(step.samples).epistemic) <= self.threshold
-        limit = self.settings.reward_threshold
-        return known if limit is None or step.reward_doubt is None else known & (step.reward_doubt <= limit)
+        keep = self.score(decompose(step.samples).epistemic) <= self.threshold
+        if self.settings.reward_threshold is not None and step.reward_doubt is not None:
+            keep &= step.reward_doubt <= self.settings.reward_threshold
+        if self.settings.termination_threshold is not None:
+            keep &= torch.minimum(step.p_terminated, 1.0 - step.p_terminated) <= self.settings.termination_threshold
+        return keep
 
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts and store what the filter keeps.

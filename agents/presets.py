@@ -52,6 +52,7 @@ _RANGES = {
     "imagination.threshold": NOT_NEGATIVE,
     "imagination.threshold_quantile": PROBABILITY,
     "imagination.reward_threshold": NOT_NEGATIVE,
+    "imagination.termination_threshold": PROBABILITY,
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 

@@ -117,6 +117,8 @@ class ImaginationSettings:
             epistemic variance of transitions that really happened, a batch of them a real step.
         reward_threshold: If given, the filter reads the reward network too: the largest standard deviation of a reward
             over T of its dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
+        termination_threshold: If given, the filter reads the termination network too: the largest probability that
+            passes of what the model thinks less likely, that the episode ends there or that it goes on; in [0, 0.5].
     """
 
     start_episode: int = 1000
@@ -132,6 +134,7 @@ class ImaginationSettings:
     threshold: float = 0.3
     threshold_quantile: float | None = None
     reward_threshold: float | None = None
+    termination_threshold: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

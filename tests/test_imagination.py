@@ -28,8 +28,8 @@ class CountingModel:
 
     members = 1
 
-    def __init__(self, *, doubt_at: int = -1, end_at: int = -1, spurious_at: int = -1) -> None:
-        self.doubt_at, self.end_at, self.spurious_at = doubt_at, end_at, spurious_at
+    def __init__(self, *, doubt_at: int = -1, end_at: int = -1, spurious_at: int = -1, torn_at: int = -1) -> None:
+        self.doubt_at, self.end_at, self.spurious_at, self.torn_at = doubt_at, end_at, spurious_at, torn_at
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> None:
         return None
@@ -51,7 +51,8 @@ class CountingModel:
         return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
 
     def assess(self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return 10.0 * next_z[:, 1], (next_z[:, 1] == self.end_at).float()
+        ends = (next_z[:, 1] == self.end_at).float() + 0.3 * (next_z[:, 1] == self.torn_at)
+        return 10.0 * next_z[:, 1], ends
 
 
 def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Imagination, Controller]:
@@ -105,6 +106,21 @@ def test_a_reward_that_its_network_doubts_is_refused_with_the_rest_of_its_rollou
     imagination, controller = make(filtered=True, model=CountingModel(spurious_at=5), reward_threshold=limit)
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 3 * kept
     assert stored_counts(imagination) == sorted(3 * [float(count) for count in range(1, kept + 1)])
+
+
+@pytest.mark.parametrize(("limit", "kept"), [(0.2, 4), (0.31, 10), (None, 10)])
+def test_an_end_that_its_network_half_expects_is_refused_with_the_rest_of_its_rollout(
+    limit: float | None, kept: int
+) -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(torn_at=5), termination_threshold=limit)
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 3 * kept
+    unfiltered, controller = make(filtered=False, model=CountingModel(torn_at=5), termination_threshold=limit)
+    assert unfiltered.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 30
+
+
+def test_a_sure_end_passes_the_filter() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(end_at=4), termination_threshold=0.0)
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 12
 
 
 def test_without_the_filter_a_doubtful_reward_is_kept() -> None:
