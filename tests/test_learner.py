@@ -89,7 +89,7 @@ def test_algorithm_1_in_its_order(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def note(owner: object, name: str, label: Callable[..., str]) -> None:
         original = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda *args: (calls.append(label(*args)), original(*args))[1])
+        monkeypatch.setattr(owner, name, lambda *args, **how: (calls.append(label(*args)), original(*args, **how))[1])
 
     note(agent.real, "add", lambda *_: "store")
     note(agent.imagination.model, "update", lambda *_: "model")
