@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from fake_results import bench_result, compared_rollout
 
-from imagine_bench import pictures, reference
+from imagine_bench import pictures, reference, registry
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.protocol import Protocol
-from imagine_bench.report import summary_table, words, write_report
+from imagine_bench.report import plots, summary_table, words, write_report
 from imagine_bench.report.data import collect
 from imagine_bench.report.words import percent, signed_percent
 from imagine_bench.results import BenchResult
@@ -348,3 +348,9 @@ def test_episodes_to_mastery_ask_for_what_the_task_calls_mastered(
         demanding = dataclasses.replace(spec, mastery=mastery)
         monkeypatch.setattr("imagine_bench.report.data.registry.task", lambda _, spec=demanding: spec)
         assert collect(result).reached[agent] == reached
+
+
+def test_no_two_registered_agents_share_a_colour() -> None:
+    colors = [plots.color(agent) for agent in registry.AGENTS]
+    assert len(set(colors)) == len(colors)
+    assert plots.color("an agent that nobody registered").startswith("#")

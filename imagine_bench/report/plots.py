@@ -14,20 +14,16 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData
 from imagine_bench.report.words import agent_words
 
 _INK = "#2b2b2f"  # in the SVG this becomes the page's own text colour
-_COLORS = {  # Okabe and Ito's palette
-    "random": "#8c8c8c",
-    "oracle": "#b8860b",
-    "dqn": "#0072b2",
-    "imagination": "#d55e00",
-    "imagination_uncertainty": "#009e73",
-    "imagination_only": "#cc79a7",
-    "imagination_only_uncertainty": "#56b4e9",
-}
-_SPARE_COLORS = ("#e69f00", "#882255", "#999933")
+# Okabe and Ito's palette, greys and Tol's muted colours, in the order in which agents are registered.
+_COLORS = (
+    "#8c8c8c", "#b8860b", "#0072b2", "#d55e00", "#009e73", "#882255",
+    "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
+)  # fmt: skip
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",
@@ -99,7 +95,8 @@ def all_plots(data: ReportData) -> list[Plot]:
 
 def color(agent: str) -> str:
     """The agent's colour, the same in every plot."""
-    return _COLORS.get(agent, _SPARE_COLORS[sum(agent.encode()) % len(_SPARE_COLORS)])
+    known = list(AGENTS)
+    return _COLORS[(known.index(agent) if agent in known else sum(agent.encode())) % len(_COLORS)]
 
 
 def success_figure(data: ReportData) -> Figure:
