@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
 from imagine_bench.capabilities import OnEpisode
 
@@ -28,4 +29,5 @@ class _EpisodeCounter(BaseCallback):
 
 def learn(model: Any, steps: int, on_episode: OnEpisode) -> None:
     """Train for at most ``steps`` macro-actions, until ``on_episode`` says that it is enough."""
+    model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves a folder a run among temporary files
     model.learn(steps, callback=_EpisodeCounter(on_episode), log_interval=None)

@@ -48,6 +48,14 @@ def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: P
     assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
 
 
+def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    do(tmp_path / "run")
+    assert not list(temporary.iterdir())
+
+
 def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = do(tmp_path / "whole")
 
