@@ -103,7 +103,7 @@ def _decisions(result: RegressionResult) -> Section:
             "Random is the expectation of a choice by chance, min and max are the best and the worst choice in "
             "hindsight, mink is the error of inverse kinematics with a known model of the arm, the ceiling.",
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
-            "is measured. Places outside of the workspace are never asked for; the maps below show the distance there.",
+            "is measured. Here no place outside of the workspace is asked for; the maps below show the distance there.",
         ),
         pictures=(_ratio_picture(result, rng),),
         tables=(
