@@ -1,12 +1,13 @@
 """Generalisation: does the model know where macro-actions lead that no training episode can ever contain?
 
 Episodes end in terminal macrostates, so no agent has acted in one; the scene nevertheless obeys the same dynamics there
-(thesis 5.2.3, "Model Generalization": 20 such transitions). Here it is asked for all of them, and for all others too.
+(thesis 5.2.3, "Model Generalization": 20 such transitions). Here it is asked for all of them, and for all others too:
+of those, by what the rules say comes of them, since a model that is right on average may have forgotten what fails.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +16,11 @@ from numpy.typing import NDArray
 from imagine_bench import statistics
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.interfaces import Outcome, TaskSpec
 from imagine_bench.seeding import Purpose, SeedTree
+
+CONSEQUENCES = ("success", "failure", "the episode goes on")
+"""What may come of a transition by the rules, as far as they leave no choice between these."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +33,7 @@ class Probing:
         frames: A frame of each macrostate (kinematic mode). Shape (N, 64, 64, 3).
         terminal: Whether no episode goes on from the macrostate: the transition cannot be in any training data.
         legal: Whether the macrostate breaks no rule. Shape (N,).
-        possible: What the macrostate may be afterwards, by the rules. Length N.
+        possible: What may come of it, by the rules. Length N.
     """
 
     macrostates: NDArray[np.int64]
@@ -37,7 +41,7 @@ class Probing:
     frames: NDArray[np.uint8]
     terminal: NDArray[np.bool_]
     legal: NDArray[np.bool_]
-    possible: tuple[frozenset[tuple[int, ...]], ...]
+    possible: tuple[tuple[Outcome, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,27 +51,50 @@ class Answers:
     Attributes:
         right: Whether the imagined macrostate, read by the evaluation-only probe, is one the rules allow.
         epistemic: Epistemic uncertainty, reduced as the agent's filter does.
+        reward_error: Distance of the imagined reward from the nearest one that the rules allow, in units of reward.
+        end_right: Whether the rules allow what is imagined more likely: that the episode ends here, or that it goes on.
     """
 
     right: NDArray[np.bool_]
     epistemic: NDArray[np.float64]
+    reward_error: NDArray[np.float64]
+    end_right: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks:
+    """What an agent imagines of the transitions of one consequence that training can contain.
+
+    Attributes:
+        count: How many there are.
+        right: Share of them whose next macrostate is right.
+        end_right: Share of them whose end, or going on, is right.
+        reward_error: Their mean error, in units of reward.
+    """
+
+    count: int
+    right: float
+    end_right: float
+    reward_error: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Generalisation:
-    """One agent's answers in four numbers.
+    """One agent's answers in a few numbers.
 
     Attributes:
         unseen: Share right among transitions out of terminal macrostates.
         unseen_legal: The same out of the legal ones of them, such as goals; NaN where there are none.
         seen: Share right among the transitions that training can contain.
         auroc: Probability that a transition out of a terminal macrostate is doubted more than another.
+        consequences: The transitions that training can contain, by those of :data:`CONSEQUENCES` that there are.
     """
 
     unseen: float
     unseen_legal: float
     seen: float
     auroc: float
+    consequences: dict[str, Marks]
 
 
 def probing(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> Probing:
@@ -92,9 +119,7 @@ def probing(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation")
         frames=spec.render_macrostates(macrostates, appearance, rng),
         terminal=terminal,
         legal=np.array([rules.is_legal(state) for state, _ in pairs]),
-        possible=tuple(
-            frozenset(outcome.macrostate for outcome in rules.outcomes(state, action)) for state, action in pairs
-        ),
+        possible=tuple(tuple(rules.outcomes(state, action)) for state, action in pairs),
     )
 
 
@@ -109,18 +134,31 @@ def answer(
         seeds: Names the generators that imagination draws from.
         on_progress: Told how many are done.
     """
-    right, epistemic = [], []
+    rows = []
     for index, (frame, action) in enumerate(zip(probe.frames, probe.actions, strict=True)):
         rng = seeds.child(index).generator()
         step = agent.imagine(frame, actions=np.array([action]), depth=1, rng=rng)
-        right.append(tuple(int(value) for value in step.macrostates[0]) in probe.possible[index])
-        epistemic.append(float(step.epistemic[0]))
+        possible = probe.possible[index]
+        rows.append((
+            tuple(int(value) for value in step.macrostates[0]) in {outcome.macrostate for outcome in possible},
+            float(step.epistemic[0]),
+            min(abs(float(step.rewards[0]) - outcome.reward) for outcome in possible),
+            bool(step.p_terminated[0] > 0.5) in {outcome.terminated for outcome in possible},
+        ))  # fmt: skip
         on_progress(index + 1)
-    return Answers(right=np.array(right), epistemic=np.array(epistemic, dtype=np.float64))
+    right, epistemic, reward_error, end_right = (np.array(column) for column in zip(*rows, strict=True))
+    return Answers(right=right, epistemic=epistemic, reward_error=reward_error, end_right=end_right)
+
+
+def consequence(possible: Sequence[Outcome]) -> str | None:
+    """The one of :data:`CONSEQUENCES` that the rules say comes of a transition; None where they leave it open."""
+    success, failure, going_on = CONSEQUENCES
+    found = {success if o.success else failure if o.terminated else going_on for o in possible}
+    return found.pop() if len(found) == 1 else None
 
 
 def summarise(probe: Probing, answers: Answers) -> Generalisation:
-    """The four numbers."""
+    """The numbers of one agent."""
     right, terminal = answers.right, probe.terminal
     legal_ends = terminal & probe.legal
     return Generalisation(
@@ -128,4 +166,20 @@ def summarise(probe: Probing, answers: Answers) -> Generalisation:
         unseen_legal=float(right[legal_ends].mean()) if legal_ends.any() else float("nan"),
         seen=float(right[~terminal].mean()),
         auroc=statistics.auroc(answers.epistemic[terminal], answers.epistemic[~terminal]),
+        consequences=_by_consequence(probe, answers),
     )
+
+
+def _by_consequence(probe: Probing, answers: Answers) -> dict[str, Marks]:
+    found = np.array([consequence(possible) or "" for possible in probe.possible])
+    parts = {name: ~probe.terminal & (found == name) for name in CONSEQUENCES}
+    return {
+        name: Marks(
+            count=int(part.sum()),
+            right=float(answers.right[part].mean()),
+            end_right=float(answers.end_right[part].mean()),
+            reward_error=float(answers.reward_error[part].mean()),
+        )
+        for name, part in parts.items()
+        if part.any()
+    }

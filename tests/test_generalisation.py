@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.generalisation import Probing, answer, probing, summarise
-from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.generalisation import Probing, answer, consequence, probing, summarise
+from imagine_bench.interfaces import Frame, Outcome, TaskSpec
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
@@ -41,11 +41,13 @@ class Cheat:
         index, self.asked = self.asked, self.asked + 1
         assert np.array_equal(frame, self.probe.frames[index]) and actions == [self.probe.actions[index]] and depth == 1
         wrong = bool(self.wrong[index])
-        told = self.probe.macrostates[index] if wrong else next(iter(self.probe.possible[index]))
+        (truth,) = self.probe.possible[index]
+        told = self.probe.macrostates[index] if wrong else truth.macrostate
         one = np.zeros(1, dtype=np.float32)
         return ImaginedRollout(
             actions=actions, frames=np.zeros((1, 64, 64), np.float32), start_frame=np.zeros((64, 64), np.float32),
-            rewards=one, p_terminated=one, q_values=np.zeros((1, 6), np.float32), epistemic=one + (1.0 + wrong),
+            rewards=one + truth.reward + 2 * wrong, p_terminated=one + (truth.terminated != wrong),
+            q_values=np.zeros((1, 6), np.float32), epistemic=one + (1.0 + wrong),
             aleatoric=one, modal=one, accepted=np.ones(1, bool), macrostates=np.array([told]),
         )  # fmt: skip
 
@@ -55,8 +57,8 @@ def test_all_of_them_are_asked(spec: TaskSpec, probe: Probing) -> None:
     assert int((probe.terminal & probe.legal).sum()) == 18 * 6  # the goals
     for state, action, possible in zip(probe.macrostates.tolist(), probe.actions, probe.possible, strict=True):
         (following,) = possible
-        assert following == spec.rules.turned(tuple(state), int(action))  # type: ignore[attr-defined]
-        assert sum(a != b for a, b in zip(state, following, strict=True)) == 1
+        assert following.macrostate == spec.rules.turned(tuple(state), int(action))  # type: ignore[attr-defined]
+        assert sum(a != b for a, b in zip(state, following.macrostate, strict=True)) == 1
 
 
 @pytest.mark.parametrize(("part", "numbers"), [("terminal", (0.0, 1.0, 1.0)), ("none", (1.0, 1.0, 0.5))])
@@ -71,6 +73,23 @@ def test_half_wrong_is_half(probe: Probing) -> None:
     wrong = np.arange(len(probe.actions)) % 2 == 0
     result = summarise(probe, answer(Cheat(probe, wrong), probe, SeedTree(0)))
     assert result.unseen == result.seen == result.auroc == 0.5
+
+
+def test_marks_by_what_comes_of_it(spec: TaskSpec, probe: Probing) -> None:
+    fails = np.array([outcome.terminated and not outcome.success for (outcome,) in probe.possible])
+    marks = summarise(probe, answer(Cheat(probe, fails), probe, SeedTree(0))).consequences
+    assert sum(one.count for one in marks.values()) == int((~probe.terminal).sum())
+    assert marks["failure"].count == int((fails & ~probe.terminal).sum()) > 0
+    assert (marks["failure"].right, marks["failure"].end_right) == (0.0, 0.0)
+    assert marks["failure"].reward_error == pytest.approx(2.0)
+    for name in ("success", "the episode goes on"):
+        assert (marks[name].right, marks[name].end_right, marks[name].reward_error) == (1.0, 1.0, pytest.approx(0.0))
+
+
+def test_rules_that_leave_it_open() -> None:
+    end = Outcome(probability=0.5, macrostate=(0,), reward=0.0, terminated=True, success=False)
+    on = dataclasses.replace(end, terminated=False)
+    assert (consequence([end]), consequence([on]), consequence([end, on])) == ("failure", "the episode goes on", None)
 
 
 def test_a_task_without_terminal_macrostates_says_so(spec: TaskSpec) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from imagine_bench import reference, statistics
 from imagine_bench.files import make_folder, write_bytes, write_json
-from imagine_bench.generalisation import Answers, Generalisation, Probing
+from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.report.words import agent_words, percent
 from imagine_bench.seeding import SeedTree
@@ -54,7 +54,26 @@ def generalisation_table(asked: Sequence[Asked], probe: Probing, task: TaskSpec)
         cells = [_cell([getattr(one.summary, name) for one in asked if one.agent == agent], name) for agent in agents]
         there = f"{thesis['correct']} (of {thesis['attempted']})" if name == "unseen" and thesis else "–"
         lines.append(f"| {words} | {' | '.join(cells)} | {there} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *_consequence_lines(asked)])
+
+
+def _consequence_lines(asked: Sequence[Asked]) -> list[str]:
+    """The transitions that training can contain, by what the rules say comes of them: one row an agent and kind."""
+    lines = [
+        "The others, by what the rules say comes of them:",
+        "",
+        "| agent | consequence | transitions | next macrostate right, % | end right, % | reward's mean error |",
+        "|---|---|---|---|---|---|",
+    ]
+    for agent in dict.fromkeys(one.agent for one in asked):
+        runs = [one.summary.consequences for one in asked if one.agent == agent]
+        for name in runs[0]:
+            marks = [run[name] for run in runs]
+            right = _cell([one.right for one in marks], f"{name} right")
+            end = _cell([one.end_right for one in marks], f"{name} end")
+            reward = _cell([one.reward_error for one in marks], f"{name} reward", _plain)
+            lines.append(f"| {agent_words(agent).title} | {name} | {marks[0].count} | {right} | {end} | {reward} |")
+    return lines
 
 
 def write_generalisation(
@@ -73,25 +92,34 @@ def write_generalisation(
     write_bytes(folder / "generalisation.md", page.encode())
 
 
-def _cell(values: Sequence[float], name: str) -> str:
+def _plain(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _cell(values: Sequence[float], name: str, words: Callable[[float], str] = percent) -> str:
     if any(math.isnan(value) for value in values):
         return "–"
-    mean = percent(float(np.mean(values)))
+    mean = words(float(np.mean(values)))
     if len(values) == 1:
         return mean
     rng = SeedTree(0).child("report", "generalisation", name).generator()
     low, high = statistics.bootstrap_interval(values, rng, statistic="mean")
-    return f"{mean} [{percent(low)}, {percent(high)}]"
+    return f"{mean} [{words(low)}, {words(high)}]"
 
 
 def _csv(asked: Sequence[Asked], probe: Probing) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["agent", "seed", "macrostate", "action", "terminal", "legal", "right", "epistemic"])
+    table.writerow([
+        "agent", "seed", "macrostate", "action", "terminal", "legal", "consequence",
+        "right", "end_right", "reward_error", "epistemic",
+    ])  # fmt: skip
     for one in asked:
         for index, state in enumerate(probe.macrostates):
             table.writerow([
                 one.agent, one.seed, " ".join(map(str, state)), int(probe.actions[index]), int(probe.terminal[index]),
-                int(probe.legal[index]), int(one.answers.right[index]), f"{one.answers.epistemic[index]:.6g}",
+                int(probe.legal[index]), consequence(probe.possible[index]) or "open",
+                int(one.answers.right[index]), int(one.answers.end_right[index]),
+                f"{one.answers.reward_error[index]:.6g}", f"{one.answers.epistemic[index]:.6g}",
             ])  # fmt: skip
     return text.getvalue()
