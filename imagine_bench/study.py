@@ -114,6 +114,7 @@ class Line:
         train_cpu_s: Mean CPU seconds of training a run.
         difference: Against the variant it is compared with, one a budget; None where it is compared with nothing.
         folder: Where its runs lie.
+        environment: Command, commit, versions and machine of its first sitting; JSON-like.
     """
 
     variant: Variant
@@ -121,6 +122,7 @@ class Line:
     train_cpu_s: float
     difference: tuple[statistics.Estimate, ...] | None
     folder: Path
+    environment: Mapping[str, Any]
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher, bars: int) -> tuple[Line, ...]:
@@ -149,6 +151,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher, bars: 
             train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in results[variant.name].runs])),
             difference=None if variant.against is None else _differences(study, variant, success),
             folder=results[variant.name].folder,
+            environment=results[variant.name].environment,
         )
         for variant in study.variants
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -67,6 +68,9 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     write_study(tmp_path / "out", STUDY, lines)
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
+    origins = json.loads((tmp_path / "out" / "runs.json").read_text())
+    assert [origin["variant"] for origin in origins] == ["table", "mild", "imaginer"]
+    assert all(origin["versions"] and origin["machine"] for origin in origins)
     assert (tmp_path / "out" / "study.png").stat().st_size > 5_000
     assert "| appearance | mild | table |" in (tmp_path / "out" / "study.md").read_text()
 
@@ -131,9 +135,12 @@ def test_the_table_says_what_helps() -> None:
     from imagine_bench.statistics import Estimate
 
     lines = [
-        Line(variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, difference=None, folder=Path("a-b")),
         Line(
-            variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"),
+            variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, folder=Path("a-b"), environment={},
+            difference=None,
+        ),
+        Line(
+            variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"), environment={},
             difference=(Estimate(0.25, 0.1, 0.4), Estimate(0.0, -0.1, 0.1)),
         ),
     ]  # fmt: skip

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench import statistics
-from imagine_bench.files import make_folder, write_bytes
+from imagine_bench.files import make_folder, write_bytes, write_json
 from imagine_bench.report.plots import STYLE
 from imagine_bench.report.words import estimate_text, percent
 from imagine_bench.study import Line, Study
@@ -41,7 +41,7 @@ def study_table(study: Study, lines: Sequence[Line]) -> str:
 
 
 def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
-    """Write ``study.md``, ``seeds.csv``, ``summary.csv`` and ``study.png``.
+    """Write ``study.md``, ``seeds.csv``, ``summary.csv``, ``runs.json`` and ``study.png``.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -55,7 +55,15 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
     write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
     write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())
     write_bytes(folder / "summary.csv", _summary(study, lines).encode())
+    write_json(folder / "runs.json", [_origin(line) for line in lines])
     write_bytes(folder / "study.png", _plot(study, lines))
+
+
+def _origin(line: Line) -> dict[str, Any]:
+    """Where a line's numbers come from."""
+    facts = {name: line.environment.get(name) for name in ("command", "commit", "versions", "machine")}
+    variant = line.variant
+    return {"variant": variant.name, "settings": dict(variant.settings), "bench": line.folder.name, **facts}
 
 
 def _seeds(study: Study, lines: Sequence[Line]) -> str:
