@@ -114,12 +114,12 @@ def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> Reg
     return settings
 
 
-def check(preset: str, overrides: Mapping[str, Any]) -> None:
-    """Raise what any regressor would raise for these settings."""
-    for ensemble in (False, True):
-        settings = resolve(preset, overrides, ensemble=ensemble)
-    if settings.members < 2:
+def resolve_all(preset: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, RegressorSettings]:
+    """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
+    one, ensemble = (resolve(preset, overrides, ensemble=ensemble) for ensemble in (False, True))
+    if ensemble.members < 2:
         raise InvalidValueError("Setting members is 1 in an ensemble; it must be at least 2: the spread of one is 0.")
+    return one, ensemble
 
 
 def _ensemble_epochs(epochs: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from imagine_bench.errors import InvalidValueError, RunFailedError, UnknownNameE
 from imagine_bench.kinds import kind_of, require_options
 from imagine_bench.launchers import Failure, Job, Launcher
 from imagine_bench.progress import ProgressBars
-from imagine_bench.protocol import Protocol, protocol
+from imagine_bench.protocol import Protocol, digest, protocol
 from imagine_bench.runs import Observer, Progress, RunSpec
 from imagine_bench.store import BenchStore, bench_folder, load_bench
 from imagine_bench.teaching import require_able
@@ -63,12 +64,12 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
         SetupError: The device does not exist here.
     """
     wanted = protocol(task, preset, **changes)
-    check_overrides(wanted)
+    identities = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
     paths = _encoders(wanted, encoder)
     names = {"encoder": "latents", "codes": "codes"}
-    identities = {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
+    identities |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
     whole = protocol(task, preset, **{**changes, **identities})
     if whole.after or whole.demonstrations or whole.questions:
         _check_abilities(whole, paths)
@@ -85,8 +86,8 @@ def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
             require_able(registry.make_agent(agent, spec.context()), agent, wanted)
 
 
-def check_overrides(wanted: Protocol) -> None:
-    """Check each override by the agents that have such a setting.
+def resolved_settings(wanted: Protocol) -> dict[str, Any]:
+    """All settings of every learner by its name, each override checked by the agents that have such a setting.
 
     Raises:
         UnknownNameError: No agent of the protocol has it; the message lists what there is.
@@ -97,8 +98,8 @@ def check_overrides(wanted: Protocol) -> None:
     for name in overrides:
         if name not in known:
             raise UnknownNameError("setting", name, sorted(known))
-    for agent in wanted.agents:
-        registry.check_settings(agent, wanted.preset, overrides, wanted.settings)
+    found = {agent: registry.settings(agent, wanted.preset, overrides, wanted.settings) for agent in wanted.agents}
+    return {agent: dataclasses.asdict(found[agent]) for agent in wanted.agents if registry.agent_entry(agent).learns}
 
 
 def _encoders(wanted: Protocol, given: str | None) -> Encoders:

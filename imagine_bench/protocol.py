@@ -23,12 +23,18 @@ _FIRST_WAVE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
 
 
+def digest(values: Any) -> str:
+    """Twelve hex digits that change when anything in JSON-like values does."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+
+
 class ProtocolData:
     """What protocols of every kind can do, being dataclasses of JSON-like values."""
 
     def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[call-overload]
+        """A JSON-serialisable copy; without a digest of settings where there is none, as in protocols from before."""
+        values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[call-overload]
+        return {name: value for name, value in values.items() if name != "settings_digest" or value}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
@@ -40,7 +46,7 @@ class ProtocolData:
     @property
     def hash(self) -> str:
         """Twelve hex digits that change when anything in the protocol does."""
-        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:12]
+        return digest(self.as_dict())
 
     @property
     def waves(self) -> tuple[int | None, ...]:
@@ -67,6 +73,8 @@ class Protocol(ProtocolData):
         execution: ``"physics"`` or ``"kinematic"``.
         appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
         overrides: Agent settings that replace the preset's, as sorted (dotted name, value) pairs.
+        settings_digest: :func:`digest` of every setting of every learner: a preset may be another one tomorrow, and
+            what was run with it is then another bench. Empty in a protocol that :func:`.bench.plan` did not make.
         open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
         sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
             distribution at each budget; 0 asks for none.
@@ -92,6 +100,7 @@ class Protocol(ProtocolData):
     execution: str = "physics"
     appearance: str = "clean"
     overrides: tuple[tuple[str, Any], ...] = ()
+    settings_digest: str = ""
     open_loop_starts: int = 100
     sampled_futures: int = 16
     recorded_episodes: int = 5

@@ -199,14 +199,14 @@ def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in overrides.items() if name in names}
 
 
-def check_settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> None:
-    """Check the overrides that this agent has settings for.
+def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> Any:
+    """An agent's settings, a dataclass, with those of the overrides that it has.
 
     Raises:
         UnknownNameError: No such preset or family.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
+    return load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
 
 
 def task(name: str) -> TaskSpec:

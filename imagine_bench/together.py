@@ -10,10 +10,10 @@ from typing import Any
 from imagine_bench.archive import is_archive, load_archive
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.partial import cut, load_so_far
-from imagine_bench.protocol import Protocol
+from imagine_bench.protocol import Protocol, digest
 from imagine_bench.results import BenchResult
 
-_OWN = ("agents", "encoder", "codes")
+_OWN = ("agents", "settings_digest", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
@@ -60,6 +60,7 @@ def _joined(protocols: Sequence[Protocol], folders: Sequence[Path]) -> Protocol:
     return dataclasses.replace(
         first,
         agents=agents,
+        settings_digest=digest([protocol.settings_digest for protocol in protocols]),
         seeds=_common([protocol.seeds for protocol in protocols], "seeds"),
         budgets=_common([protocol.budgets for protocol in protocols], "budgets"),
         encoder=_one([protocol.encoder for protocol in protocols]),

@@ -44,12 +44,38 @@ def test_any_change_changes_the_hash():
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
         "after": ("arrow_puzzle",), "demonstrations": 1, "questions": 1,
+        "settings_digest": "0123456789ab",
     }  # fmt: skip
     assert {*changes, "after_episodes"} >= {field.name for field in dataclasses.fields(Protocol)}
     after = dataclasses.replace(base, after=("arrow_puzzle",))
     assert dataclasses.replace(after, after_episodes=7).hash != after.hash
     hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
     assert len(hashes | {base.hash}) == len(changes) + 1
+
+
+@pytest.mark.parametrize(
+    ("agents", "moved"), [(("dqn",), True), (("random", "imagination"), True), (("random", "oracle"), False)]
+)
+def test_a_preset_that_changes_is_another_bench(
+    monkeypatch: pytest.MonkeyPatch, agents: tuple[str, ...], moved: bool
+) -> None:
+    from imagine_bench.agents import chapter_5
+    from imagine_bench.agents.family import Deviation
+
+    before, _ = plan_control("arrow_puzzle", "quick", agents=agents)
+    again, _ = plan_control("arrow_puzzle", "quick", agents=agents)
+    assert before == again and len(before.settings_digest) == 12
+    monkeypatch.setitem(chapter_5.CHAPTER_5.presets["quick"], "controller.discount", Deviation(0.9, "a test"))
+    after, _ = plan_control("arrow_puzzle", "quick", agents=agents)
+    assert (after.hash != before.hash) is moved
+    asked, _ = plan_control("arrow_puzzle", "quick", agents=agents, budgets=(5,))
+    assert asked.settings_digest == after.settings_digest
+
+
+def test_a_protocol_from_before_keeps_its_hash() -> None:
+    """Kept results and unfinished benches are found again: a digest that is not there changes nothing."""
+    kept = protocol("arrow_puzzle").as_dict()
+    assert "settings_digest" not in kept and Protocol.from_dict(kept).hash == protocol("arrow_puzzle").hash
 
 
 def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_word(monkeypatch):

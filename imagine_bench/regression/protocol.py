@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.protocol import ProtocolData, require_ascending, require_unmixed
+from imagine_bench.protocol import ProtocolData, digest, require_ascending, require_unmixed
 
-_CHECK_OVERRIDES = "imagine_bench.agents.regressor_settings:check"
+_SETTINGS = "imagine_bench.agents.regressor_settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
 
 
@@ -32,6 +32,7 @@ class RegressionProtocol(ProtocolData):
         test_points: Unseen points of each network, for errors and calibration.
         recorded: Whether runs leave a recording.
         overrides: Settings that replace the preset's, as sorted (name, value) pairs.
+        settings_digest: As of :class:`imagine_bench.protocol.Protocol`.
         device: ``"cpu"`` or ``"cuda"``.
     """
 
@@ -44,6 +45,7 @@ class RegressionProtocol(ProtocolData):
     test_points: int = 500
     recorded: bool = True
     overrides: tuple[tuple[str, Any], ...] = ()
+    settings_digest: str = ""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
@@ -96,7 +98,7 @@ def plan(
     require_known("preset", preset, PRESETS)
     values = {**PRESETS[preset], **registry.regression(task).presets.get(preset, {}), **changes}
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    registry.load(_CHECK_OVERRIDES)(wanted.preset, dict(wanted.overrides))
+    settings = registry.load(_SETTINGS)(wanted.preset, dict(wanted.overrides))
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)
-    return wanted, {}
+    return replace(wanted, settings_digest=digest([asdict(one) for one in settings])), {}
