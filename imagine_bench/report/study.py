@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -94,8 +95,9 @@ def _summary(study: Study, lines: Sequence[Line]) -> str:
 def _plot(study: Study, lines: Sequence[Line]) -> bytes:
     """Differences in points with their intervals, a panel a budget, a row a variant."""
     compared = [line for line in lines if line.difference]
+    usual = Counter(line.variant.against for line in compared).most_common(1)[0][0] if compared else None
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.2, 1.4 + 0.3 * max(1, len(compared))), layout="constrained")
+        figure = Figure(figsize=(10.0, 1.6 + 0.27 * max(1, len(compared))), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(study.budgets), sharey=True))
         for index, (axes, budget) in enumerate(zip(panels, study.budgets, strict=True)):
             axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)
@@ -105,15 +107,22 @@ def _plot(study: Study, lines: Sequence[Line]) -> bytes:
                 color = _HELPS if low > 0 else _HURTS if high < 0 else _UNCLEAR
                 axes.plot([low, high], [row, row], color=color)
                 axes.plot([value], [row], marker="o", markersize=5, color=color)
-            axes.set(title=f"after {budget:,} real episodes", xlabel="points of success")
-        panels[0].set_yticks(
-            range(len(compared)), [f"{line.variant.name} – {line.variant.against}" for line in compared]
-        )
+            axes.set_title(f"{budget:,} episodes")
+        panels[0].set_yticks(range(len(compared)), [_label(line, usual) for line in compared])
         panels[0].invert_yaxis()
+        figure.supxlabel(f"points of success, against {usual} where nothing else is named", fontsize="medium")
         FigureCanvasAgg(figure).draw()
         png = io.BytesIO()
         figure.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return png.getvalue()
+
+
+def _label(line: Line, usual: str | None) -> str:
+    """What a row compares; ``usual`` need not be named in every one."""
+    variant = line.variant
+    if variant.against == usual:
+        return f"{variant.factor}: {variant.name}"
+    return f"{variant.name} – {variant.against}"
 
 
 def _csv(rows: list[list[Any]]) -> str:
