@@ -120,7 +120,8 @@ class _PlanStory:
         imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
         recording.log("/real/frame", rr.Image(real), strict=True)
         recording.log("/imagined/frame", rr.Image(rgb(imagined)), strict=True)
-        strip = rollout_strip(_so_far(compared, done), self._trained.task.action_names)
+        task = self._trained.task  # room for the longest plan: the viewer takes no pictures of different sizes
+        strip = rollout_strip(_so_far(compared, done), task.action_names, columns=task.horizon)
         image = rr.EncodedImage(contents=png(strip), media_type="image/png")
         recording.log("/imagined/strip", image, strict=True)
         text = rr.TextDocument(self._words(plan, done), media_type=rr.MediaType.MARKDOWN)
