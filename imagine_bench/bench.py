@@ -64,13 +64,13 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
         SetupError: The device does not exist here.
     """
     wanted = protocol(task, preset, **changes)
-    identities = {"settings_digest": digest(resolved_settings(wanted))}
+    filled = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
     paths = _encoders(wanted, encoder)
     names = {"encoder": "latents", "codes": "codes"}
-    identities |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
-    whole = protocol(task, preset, **{**changes, **identities})
+    filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
+    whole = protocol(task, preset, **{**changes, **filled})
     if whole.after or whole.demonstrations or whole.questions:
         _check_abilities(whole, paths)
     return whole, paths
