@@ -6,12 +6,14 @@ pictures that are alike, that cannot tell the two apart; reading the whole trans
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from imagine_bench.errors import require_known
 
-from .layers import Masks, MemberMLP
+from .layers import Masks, MemberMLP, by_network
 from .precision import hidden_dtype
 from .settings import WorldModelSettings
 from .weight_samples import sample_outputs
@@ -73,13 +75,25 @@ class Assessment(nn.Module):
         return torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._transition else next_z
 
     def forward(
-        self, z: Tensor, action: Tensor, next_z: Tensor, masks: list[Masks | None] | None = None
+        self,
+        z: Tensor,
+        action: Tensor,
+        next_z: Tensor,
+        masks: Sequence[Masks | None] | None = None,
+        parameters: Sequence[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Rewards and termination logits of N transitions, without ``masks`` deterministic. Two of shape (N,)."""
+        """Rewards and termination logits of N transitions of S seeds, without ``masks`` deterministic: (S, N) each.
+
+        Args:
+            z: Shape (S, N, Z).
+            action: Shape (S, N).
+            next_z: Shape (S, N, Z).
+            masks: From :meth:`draw_masks`.
+            parameters: Those of S networks, one network after the other, instead of its own.
+        """
         read = self._read(z, action, next_z)
         drawn = [None] * len(self.networks) if masks is None else masks
-        outputs = [
-            network(read.unsqueeze(0), mask).squeeze(0) for network, mask in zip(self.networks, drawn, strict=True)
-        ]
-        reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [N, 2] to [N] and [N]
+        own = [None] * len(self.networks) if parameters is None else by_network(self.networks, parameters)
+        outputs = [network(read, *rest) for network, *rest in zip(self.networks, drawn, own, strict=True)]
+        reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [S, N, 2] to [S, N] and [S, N]
         return reward, logit

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from imagine_bench.cohort import answer_each, together
 from imagine_bench.errors import DivergedError
 
+from . import joint
 from .flat_adam import FlatAdam
 from .layers import MemberMLP
 from .memory import Batch
@@ -62,21 +64,12 @@ class Controller(nn.Module):
         self.optimiser = FlatAdam(
             [self.network], learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
         )
-        self._target = None if settings.target_rate == 1.0 else _Target(self.network, settings.target_rate)
+        self.target = None if settings.target_rate == 1.0 else _Target(self.network, settings.target_rate)
 
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:
         """Action values of latents (N, Z). Shape (N, A)."""
         return self.network(z.unsqueeze(0)).squeeze(0)
-
-    def _next_values(self, next_z: Tensor) -> Tensor:
-        return self.values(next_z) if self._target is None else self._target.values(next_z)
-
-    def loss(self, batch: Batch) -> Tensor:
-        """Mean squared Bellman error; no gradient flows through the target."""
-        target = td_target(batch.reward, batch.terminated, self._next_values(batch.next_z), self.settings.discount)
-        q = self.network(batch.z.unsqueeze(0)).squeeze(0).gather(1, batch.action.unsqueeze(1)).squeeze(1)  # [B]
-        return (target - q).square().mean()
 
     def update(self, batch: Batch) -> float:
         """One step of Adam on a batch; returns the loss before it.
@@ -84,25 +77,60 @@ class Controller(nn.Module):
         Raises:
             DivergedError: The loss is NaN or infinite; the weights are left as they were.
         """
-        loss = self.loss(batch)
-        value = loss.item()
-        if not math.isfinite(value):
-            raise DivergedError(f"The controller's loss is {value}. Lower controller.learning_rate.")
-        self.optimiser.step(loss)
-        if self._target is not None:
-            self._target.follow()
-        return value
+        return together(update_together, (self, batch), kind=(self.settings, self.network.sizes))
+
+    def descend(self, loss: float, gradient: Tensor) -> float:
+        """What follows from the gradient (P,) of a loss: Adam, and the target network. Raises as :meth:`update`."""
+        if not math.isfinite(loss):
+            raise DivergedError(f"The controller's loss is {loss}. Lower controller.learning_rate.")
+        self.optimiser.descend(gradient)
+        if self.target is not None:
+            self.target.follow()
+        return loss
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies of weights and moments, and of the target network's weights where there is one."""
-        target = {} if self._target is None else {"target": self._target.array()}
+        target = {} if self.target is None else {"target": self.target.array()}
         return {**self.optimiser.arrays(), **target}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take up the result of :meth:`arrays`."""
         self.optimiser.load(arrays)
-        if self._target is not None:
-            self._target.load(arrays["target"])
+        if self.target is not None:
+            self.target.load(arrays["target"])
+
+
+def bellman_errors(controllers: Sequence[Controller], batch: Batch, parameters: Sequence[Tensor]) -> Tensor:
+    """Mean squared Bellman errors of S controllers of one shape; no gradient flows through the targets.
+
+    Args:
+        controllers: S of them.
+        batch: Theirs, every shape with a leading S.
+        parameters: Theirs, with a leading S.
+
+    Returns:
+        Shape (1, S).
+    """
+    network, settings = controllers[0].network, controllers[0].settings
+    with torch.no_grad():
+        if controllers[0].target is None:
+            q_next = network(batch.next_z, None, parameters)
+        else:
+            q_next = torch.stack([other.target.values(z) for other, z in zip(controllers, batch.next_z, strict=True)])
+    target = td_target(batch.reward, batch.terminated, q_next, settings.discount)
+    q = network(batch.z, None, parameters).gather(2, batch.action.unsqueeze(2)).squeeze(2)  # [S, B]
+    return (target - q).square().mean(dim=1).unsqueeze(0)
+
+
+def update_together(updates: Sequence[tuple[Controller, Batch]]) -> list[float | Exception]:
+    """Update controllers of one shape by one joint gradient; see :meth:`Controller.update`."""
+    controllers = [controller for controller, _ in updates]
+    batch = joint.batches([part for _, part in updates])
+    losses, gradients = joint.gradients(
+        [controller.optimiser for controller in controllers],
+        lambda parameters: bellman_errors(controllers, batch, parameters),
+    )
+    return answer_each(Controller.descend, list(zip(controllers, losses[0].tolist(), gradients, strict=True)))
 
 
 class _Target:

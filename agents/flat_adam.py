@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -30,17 +29,19 @@ class FlatAdam:
 
     def __init__(self, modules: Sequence[nn.Module], *, learning_rate: float, gradient_clip: float | None) -> None:
         groups = [list(module.parameters()) for module in modules]
-        self._parameters = [parameter for group in groups for parameter in group]
+        self.parameters = [parameter for group in groups for parameter in group]
         self._rate, self._clip = learning_rate, gradient_clip
-        self._vector = torch.cat([p.detach().reshape(-1) for p in self._parameters])
-        self._gradient, self._mean, self._square = (torch.zeros_like(self._vector) for _ in range(3))
-        self._step = torch.zeros((), device=self._vector.device)
-        for parameter, values in zip(
-            self._parameters, self._vector.split([p.numel() for p in self._parameters]), strict=True
-        ):
+        self._sizes = [sum(parameter.numel() for parameter in group) for group in groups]
+        self.settle(torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters]).unsqueeze(0), 0)
+        self._gradient, self._mean, self._square = (torch.zeros_like(self.vector) for _ in range(3))
+        self._step = torch.zeros((), device=self.vector.device)
+
+    def settle(self, home: Tensor, row: int) -> None:
+        """Let the vector be a row of ``home`` (S, P), which already holds its values, from now on."""
+        self.home, self.row, self.vector = home, row, home[row]
+        parts = self.vector.split([parameter.numel() for parameter in self.parameters])
+        for parameter, values in zip(self.parameters, parts, strict=True):
             parameter.data = values.view(parameter.shape)
-        ends = accumulate((sum(p.numel() for p in group) for group in groups), initial=0)
-        self._segments = [self._gradient[start:end] for start, end in pairwise(ends)]
 
     def step(self, loss: Tensor) -> None:
         """Descend the gradient of a scalar loss once.
@@ -48,12 +49,19 @@ class FlatAdam:
         Raises:
             DivergedError: A gradient is NaN or infinite; the parameters are left as they were.
         """
-        gradients = torch.autograd.grad(loss, self._parameters)
-        torch.cat([gradient.reshape(-1) for gradient in gradients], out=self._gradient)
-        self._clip_gradients()
+        gradients = torch.autograd.grad(loss, self.parameters)
+        self.descend(torch.cat([gradient.reshape(-1) for gradient in gradients], out=self._gradient))
+
+    def descend(self, gradient: Tensor) -> None:
+        """Descend a gradient (P,) once; it is overwritten.
+
+        Raises:
+            DivergedError: It is NaN or infinite; the parameters are left as they were.
+        """
+        self._clip_gradient(gradient)
         adam(
-            [self._vector],
-            [self._gradient],
+            [self.vector],
+            [gradient],
             [self._mean],
             [self._square],
             [],
@@ -72,11 +80,12 @@ class FlatAdam:
         """Take steps of this size from now on."""
         self._rate = learning_rate
 
-    def _clip_gradients(self) -> None:
+    def _clip_gradient(self, gradient: Tensor) -> None:
         """Check the gradient of each module, and scale it down to the largest norm that is allowed."""
-        norms = [float(segment.norm()) for segment in self._segments]
+        segments = gradient.split(self._sizes)
+        norms = [float(segment.norm()) for segment in segments]
         require_finite(norms)
-        for segment, norm in zip(self._segments, norms, strict=True):
+        for segment, norm in zip(segments, norms, strict=True):
             if self._clip is not None and norm > self._clip:
                 segment.mul_(self._clip / norm)
 
@@ -90,7 +99,7 @@ class FlatAdam:
             tensor.copy_(torch.tensor(arrays[name]))
 
     def _tensors(self) -> dict[str, Tensor]:
-        return {"value": self._vector, "exp_avg": self._mean, "exp_avg_sq": self._square, "step": self._step}
+        return {"value": self.vector, "exp_avg": self._mean, "exp_avg_sq": self._square, "step": self._step}
 
 
 def require_finite(norms: Sequence[float]) -> None:

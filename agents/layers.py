@@ -7,9 +7,9 @@ case E = 1. Shapes: ``E`` members, ``N`` rows, ``H`` hidden units.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -97,12 +97,27 @@ class MemberMLP(nn.Module):
             return None
         return tuple(dropout_mask((self.members, rows, h), self.dropout, generator) for h in self.sizes[1:-1])
 
-    def forward(self, x: Tensor, masks: Masks | None = None) -> Tensor:
-        """Map (E, N, in) to (E, N, out); without ``masks`` no unit is dropped and the result is deterministic."""
-        exact = self.weights[0].dtype
+    def forward(self, x: Tensor, masks: Masks | None = None, parameters: Sequence[Tensor] | None = None) -> Tensor:
+        """Map (E, N, in) to (E, N, out); without ``masks`` no unit is dropped and the result is deterministic.
+
+        Args:
+            x: Shape (E, N, in).
+            masks: From :meth:`draw_masks`.
+            parameters: Weights, then biases, of as many networks of this shape as ``x`` has, instead of its own.
+        """
+        layers = len(self.weights)
+        weights = self.weights if parameters is None else parameters[:layers]
+        biases = self.biases if parameters is None else parameters[layers:]
+        exact = weights[0].dtype
         dtype = self.hidden_dtype if torch.is_grad_enabled() and exact == torch.float32 else exact
         dropout = dropout_bits(self.dropout) / 2**_PROBABILITY_BITS
-        return dense_stack(x, list(self.weights), list(self.biases), masks, dropout, dtype)
+        return dense_stack(x, list(weights), list(biases), masks, dropout, dtype)
+
+
+def by_network(networks: Iterable[MemberMLP], parameters: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+    """Parameters of several networks, one after the other, as one sequence a network."""
+    ends = list(accumulate((2 * len(network.weights) for network in networks), initial=0))
+    return [parameters[start:end] for start, end in pairwise(ends)]
 
 
 @torch.no_grad()

@@ -8,13 +8,16 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from .controller import Controller
+from .controller import update_together as update_controllers
 from .memory import Batch
 from .perception import prepare_torch
 from .plain_model import PlainWorldModel
 from .precision import hidden_dtype, settle
+from .presets import resolve
 from .products import product
 from .settings import WorldModelSettings
-from .world_model import WorldModel
+from .world_model import Update, WorldModel, update_together
 
 LATENTS, ACTIONS = 24, 6
 """Those of the arrow puzzle's bundled encoders."""
@@ -74,6 +77,36 @@ def measure(rounds: int = 25) -> ModelSpeed:
         roofline_ms=1e3 * _flops(models[precision], settings.batch_size) / peak_flops,
         peak_gflops=peak_flops / 1e9,
     )
+
+
+def measure_abreast(preset: str, seeds: int, rounds: int = 15) -> tuple[float, float]:
+    """How much faster the updates of several seeds are as one computation than one after another.
+
+    Args:
+        preset: Of the arrow puzzle's settings.
+        seeds: S.
+        rounds: Readings of each, taken in turn; the least counts.
+
+    Returns:
+        The ratio of CPU times of the three networks of the model, and that of the controller.
+    """
+    prepare_torch("cpu")
+    settings, draws = resolve(preset, {}, "chapter_5"), torch.Generator().manual_seed(0)
+    weights = [torch.Generator().manual_seed(seed) for seed in range(seeds)]
+    models = [WorldModel(LATENTS, ACTIONS, settings.model, generator) for generator in weights]
+    lessons = [Update(model, _batch(settings.model.batch_size, draws), draws) for model in models]
+    controllers = [Controller(LATENTS, ACTIONS, settings.controller, generator) for generator in weights]
+    batches = [(controller, _batch(settings.controller.batch_size, draws)) for controller in controllers]
+    best = _least_cpu_s(
+        {
+            "model": lambda: [update_together([lesson]) for lesson in lessons],
+            "models": lambda: update_together(lessons),
+            "controller": lambda: [update_controllers([batch]) for batch in batches],
+            "controllers": lambda: update_controllers(batches),
+        },
+        rounds,
+    )
+    return best["model"] / best["models"], best["controller"] / best["controllers"]
 
 
 def _model(settings: WorldModelSettings, precision: str) -> WorldModel:

@@ -34,20 +34,19 @@ class MemberAdam(FlatAdam):
         gradient_clip: float | None,
     ) -> None:
         super().__init__([module], learning_rate=learning_rate, gradient_clip=gradient_clip)
-        self._members, self._weight_decay = len(self._parameters[0]), weight_decay
-        sizes = [parameter.numel() for parameter in self._parameters]
-        self._by_member = [part.view(self._members, -1) for part in self._gradient.split(sizes)]
+        self._members, self._weight_decay = len(self.parameters[0]), weight_decay
         chosen = {id(parameter) for parameter in decayed}
-        pairs = zip(self._gradient.split(sizes), self._parameters, strict=True)
-        self._decayed = [(part.view_as(p), p) for part, p in pairs if id(p) in chosen]
+        self._decays = [id(parameter) in chosen for parameter in self.parameters]
 
-    def _clip_gradients(self) -> None:
-        norms = torch.stack([part.square().sum(dim=1) for part in self._by_member]).sum(dim=0).sqrt()  # [E]
+    def _clip_gradient(self, gradient: Tensor) -> None:
+        parts = [part.view(self._members, -1) for part in gradient.split([p.numel() for p in self.parameters])]
+        norms = torch.stack([part.square().sum(dim=1) for part in parts]).sum(dim=0).sqrt()  # [E]
         require_finite(norms.tolist())
         if self._clip is not None and bool((norms > self._clip).any()):
             scale = (self._clip / norms.clamp_min(1e-30)).clamp_max(1.0)[:, None]
-            for part in self._by_member:
+            for part in parts:
                 part.mul_(scale)
         with torch.no_grad():
-            for part, parameter in self._decayed:
-                part.add_(parameter, alpha=self._weight_decay)
+            for part, parameter, decays in zip(parts, self.parameters, self._decays, strict=True):
+                if decays:
+                    part.add_(parameter.view_as(part), alpha=self._weight_decay)

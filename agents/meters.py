@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from imagine_bench.cohort import cpu_time_s
 
 
 class Meters:
@@ -22,9 +23,9 @@ class Meters:
     @contextmanager
     def cpu_time(self, name: str) -> Iterator[None]:
         """Add the CPU seconds of the block, uncounted: :meth:`count` says what they are a mean of."""
-        start = time.process_time()
+        start = cpu_time_s()
         yield
-        self.add(name, time.process_time() - start, 0.0)
+        self.add(name, cpu_time_s() - start, 0.0)
 
     def count(self, *names: str) -> None:
         """Count one more of what ``names`` are means of, such as a real step for CPU seconds a step."""

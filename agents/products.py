@@ -29,8 +29,15 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, *, relu: bool = False) -> Te
     if _by_onednn(x, weight):
         parts, then = zip(x, weight, bias, strict=True), "relu" if relu else "none"
         return _stacked([_ONEDNN(rows, w.t(), b[0], then, [], "") for rows, w, b in parts])
-    result = torch.baddbmm(bias, x, weight)
+    # Of several members with one output each, MKL sums in another order; no member may change another's bits.
+    members = 1 if weight.shape[2] == 1 else len(weight)
+    parts = zip(bias.split(members), x.split(members), weight.split(members), strict=True)
+    result = _joined([torch.baddbmm(*part) for part in parts])
     return result.relu_() if relu else result
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _stacked(members: list[Tensor]) -> Tensor:

@@ -8,18 +8,21 @@ the losses trains them all. The dynamics may be an ensemble of E networks, which
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imagine_bench.cohort import answer_each, together
 from imagine_bench.errors import DivergedError
 
+from . import joint
 from . import mixture as mdn
 from .assessment import Assessment
 from .flat_adam import FlatAdam
-from .layers import Masks, MemberMLP, clip_unit_norms
+from .layers import Masks, MemberMLP, by_network, clip_unit_norms
 from .memory import Batch
 from .mixture import Mixture
 from .precision import hidden_dtype
@@ -39,6 +42,25 @@ def log_cosh(x: Tensor) -> Tensor:
     """``log(cosh(x))`` without overflow: quadratic near 0, linear far away."""
     size = x.abs()
     return size + functional.softplus(-2.0 * size) - math.log(2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """A model, the batch that it learns from now, and what draws its dropout masks."""
+
+    model: WorldModel
+    batch: Batch
+    dropout: torch.Generator
+
+
+def update_together(updates: Sequence[Update]) -> list[ModelLosses | Exception]:
+    """Update models of one shape by one joint gradient; see :meth:`WorldModel.update`."""
+    models = [update.model for update in updates]
+    terms, gradients = joint.gradients(
+        [model.optimiser for model in models], lambda parameters: models[0].losses(updates, parameters)
+    )
+    losses = [ModelLosses(*values) for values in terms.T.tolist()]
+    return answer_each(WorldModel.descend, list(zip(models, losses, gradients, strict=True)))
 
 
 class WorldModel(nn.Module):
@@ -73,24 +95,47 @@ class WorldModel(nn.Module):
         )
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
-    def _mixture(self, z: Tensor, action: Tensor, masks: Masks | None) -> Mixture:
-        """``p(z' | z, a)`` of every row by every member of the ensemble, with leading axes (E, N)."""
+    def _mixture(
+        self, z: Tensor, action: Tensor, masks: Masks | None, parameters: Sequence[Tensor] | None = None
+    ) -> Mixture:
+        """``p(z' | z, a)`` of every row (S, N) by every member of the seed's ensemble, with leading axes (S E, N)."""
         settings = self.settings
-        inputs = torch.cat([z, self._one_hot[action]], dim=-1).expand(settings.members, -1, -1)  # [E, N, Z + A]
-        outputs = self.dynamics(inputs, masks)  # [E, N, K (1 + 2 Z)]
+        inputs = self._to_members(torch.cat([z, self._one_hot[action]], dim=-1))  # [S E, N, Z + A]
+        outputs = self.dynamics(inputs, masks, parameters)  # [S E, N, K (1 + 2 Z)]
         mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
-        return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
+        if not settings.predict_change:
+            return mixture
+        return replace(mixture, means=mixture.means + self._to_members(z).unsqueeze(-2))
 
-    def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean losses of dynamics (summed over members), reward and termination, under fresh dropout masks."""
-        rows = len(batch.action)
-        mixture = self._mixture(batch.z, batch.action, self.dynamics.draw_masks(rows, dropout))
-        masks = self.assessment.draw_masks(rows, dropout)
-        reward, logit = self.assessment(batch.z, batch.action, batch.next_z, masks)
-        return (
-            -mdn.log_likelihood(mixture, batch.next_z).mean(dim=1).sum(),  # each member descends as if it were alone
-            log_cosh(reward - batch.reward / self.settings.reward_scale).mean(),
-            functional.binary_cross_entropy_with_logits(logit, batch.terminated),
+    def _to_members(self, rows: Tensor) -> Tensor:
+        """Rows of S seeds (S, N, ...) for each of their E members. Shape (S E, N, ...)."""
+        return rows.unsqueeze(1).expand(-1, self.members, *rows.shape[1:]).flatten(0, 1)
+
+    def losses(self, updates: Sequence[Update], parameters: Sequence[Tensor]) -> Tensor:
+        """Mean losses of dynamics (summed over members), reward and termination, under fresh dropout masks.
+
+        Args:
+            updates: Those of S models of this shape.
+            parameters: Theirs, one network after the other, with a leading axis of S E.
+
+        Returns:
+            Shape (3, S).
+        """
+        rows, seeds = len(updates[0].batch.action), len(updates)
+        batch = joint.batches([update.batch for update in updates])
+        drawn = [[network.draw_masks(rows, update.dropout) for network in self.networks] for update in updates]
+        dynamics, *assessment = [joint.masks(masks) for masks in zip(*drawn, strict=True)]
+        own, *others = by_network(self.networks, parameters)
+        mixture = self._mixture(batch.z, batch.action, dynamics, own)
+        read = batch.z, batch.action, batch.next_z
+        reward, logit = self.assessment(*read, assessment, [part for other in others for part in other])
+        likelihood = mdn.log_likelihood(mixture, self._to_members(batch.next_z)).mean(dim=1)  # [S E]
+        return torch.stack(
+            [
+                -likelihood.view(seeds, -1).sum(dim=1),  # each member descends as if it were alone
+                log_cosh(reward - batch.reward / self.settings.reward_scale).mean(dim=1),
+                functional.binary_cross_entropy_with_logits(logit, batch.terminated, reduction="none").mean(dim=1),
+            ]
         )
 
     def update(self, batch: Batch, dropout: torch.Generator) -> ModelLosses:
@@ -99,11 +144,14 @@ class WorldModel(nn.Module):
         Raises:
             DivergedError: A loss is NaN or infinite; the weights are left as they were.
         """
-        terms = self.losses(batch, dropout)
-        losses = ModelLosses(*torch.stack(terms).tolist())
+        kind = (self.settings, self.latent_size, self.n_actions)
+        return together(update_together, Update(self, batch, dropout), kind=kind)
+
+    def descend(self, losses: ModelLosses, gradient: Tensor) -> ModelLosses:
+        """What follows from the gradient (P,) of losses: Adam and the max-norm constraint. Raises as :meth:`update`."""
         if not all(map(math.isfinite, (losses.dynamics, losses.reward, losses.termination))):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
-        self.optimiser.step(torch.stack(terms).sum())
+        self.optimiser.descend(gradient)
         if self.settings.max_norm is not None:
             clip_unit_norms(self.networks, self.settings.max_norm)
         return losses
@@ -131,7 +179,7 @@ class WorldModel(nn.Module):
         rows = len(z)
         samples = 1 if weights is None else weights[0].shape[1]
         masks = None if weights is None else tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
-        mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [E, T N, ...]
+        mixture = self._mixture(z.repeat(1, samples, 1), action.repeat(1, samples), masks)  # [E, T N, ...]
         return Mixture(
             *(
                 values.reshape(-1, rows, *values.shape[2:])
@@ -142,8 +190,8 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def assess(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:
         """Predicted rewards and termination probabilities of N transitions, without dropout: two of shape (N,)."""
-        reward, logit = self.assessment(z, action, next_z)
-        return reward * self.settings.reward_scale, logit.sigmoid()
+        reward, logit = self.assessment(z.unsqueeze(0), action.unsqueeze(0), next_z.unsqueeze(0))
+        return reward.squeeze(0) * self.settings.reward_scale, logit.squeeze(0).sigmoid()
 
     @torch.no_grad()
     def reward_doubt(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:

@@ -28,6 +28,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
 _TOGETHER = "imagine_bench.together:load_together"
+_ABREAST = "(default: so many that every worker has some)"
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
@@ -71,7 +72,9 @@ class Bench:
     set: tuple[str, ...] = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
-    """Runs at a time."""
+    """Processes at a time."""
+    abreast: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_ABREAST)] = None
+    """Runs of one agent that go on side by side in a process and learn as one computation, to the same bits."""
     launcher: str = "local"
     """Where runs are carried out: local processes, or ray (the cluster at RAY_ADDRESS, else one started here)."""
     device: str = DEVICES[0]
@@ -90,7 +93,8 @@ class Bench:
             self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options
         )
         workers = usable_cores() if self.workers is None else self.workers
-        _show(bench(wanted, encoder, root=self.out, launcher=launcher(self.launcher, workers), bars=workers).folder)
+        where = launcher(self.launcher, workers, self.abreast)
+        _show(bench(wanted, encoder, root=self.out, launcher=where, bars=workers).folder)
 
 
 @dataclass(frozen=True, kw_only=True)

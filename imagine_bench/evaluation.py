@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from imagine_bench.cohort import cpu_time_s
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
 
@@ -110,7 +110,7 @@ class Tally:
         self, env: gymnasium.Env[Any, Any], agent: Agent, *, privileged: bool, purpose: Purpose = "evaluation"
     ) -> None:
         """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-        start_s = time.process_time()
+        start_s = cpu_time_s()
         seed, success = episode_seed(purpose, 0, self.episodes), False
         for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
             self.env_steps += 1
@@ -119,4 +119,4 @@ class Tally:
             success = bool(info["is_success"])
         self.episodes += 1
         self.successes += success
-        self.cpu_s += time.process_time() - start_s
+        self.cpu_s += cpu_time_s() - start_s

@@ -1,4 +1,4 @@
-"""The same runs on a Ray cluster: one task a run, in a fresh process with one thread, resumed wherever it was lost.
+"""The same runs on a Ray cluster: a task a cohort, in a fresh process with one thread, resumed wherever it was lost.
 
 The folder of the bench must be on a file system that all nodes share. A worker or a whole node that dies costs what a
 ``kill -9`` costs locally, the time since the run's last checkpoint: Ray starts its task again elsewhere, which finds
@@ -9,15 +9,12 @@ from __future__ import annotations
 
 import os
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from imagine_bench import registry
-from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError, SetupError
-from imagine_bench.kinds import kind_of
-from imagine_bench.launchers import ONE_THREAD, Failure, Job, log_line, redirect_output
+from imagine_bench.errors import BusyError, InvalidValueError, SetupError
+from imagine_bench.launchers import ONE_THREAD, Failure, Job, carry_out, cohorts, run_job
 from imagine_bench.runs import Observer, Progress
 
 _LOST = 20
@@ -31,21 +28,22 @@ class RayCluster:
     """Tasks of the Ray cluster at ``RAY_ADDRESS``, or of one started here for the purpose.
 
     Args:
-        workers: Runs at a time on a cluster started here; an existing one runs as many as it has CPUs.
+        workers: Tasks at a time on a cluster started here; an existing one runs as many as it has CPUs.
+        abreast: Most runs of one agent side by side in a task; None for one.
 
     Raises:
         InvalidValueError: Fewer than one worker.
         SetupError: Ray is not installed.
     """
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, abreast: int | None = None) -> None:
         if workers < 1:
             raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
         try:
             import ray  # noqa: F401, PLC0415 - an optional dependency
         except ImportError as error:
             raise SetupError("The launcher 'ray' needs Ray: pip install 'imagine-bench[ray]'.") from error
-        self._workers = workers
+        self._workers, self._abreast = workers, abreast or 1
 
     def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
         """Carry out every job; see :class:`imagine_bench.launchers.Launcher`.
@@ -57,7 +55,7 @@ class RayCluster:
 
         self._connect(ray)
         try:
-            return _carry_out(ray, jobs, on_progress)
+            return _launch(ray, cohorts(jobs, self._abreast), on_progress)
         finally:
             ray.shutdown()
 
@@ -73,27 +71,27 @@ class RayCluster:
             ) from error
 
 
-def _carry_out(ray: Any, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) -> tuple[Failure, ...]:
     here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
         ray.get_runtime_context().get_node_id(), soft=False
     )
     board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
     work = ray.remote(
         num_cpus=1,
-        max_calls=1,  # a fresh process for each run: no threads, GL contexts or open logs of another
+        max_calls=1,  # a fresh process for each cohort: no threads, GL contexts or open logs of another
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
     )(_work)
-    running = {work.remote(_absolute(job), board): job for job in jobs}
+    running = {work.remote([_absolute(job) for job in group], board): group for group in groups}
     failures = []
     while running:
         ended, _ = ray.wait(list(running), timeout=_POLL_S)
         for progress in ray.get(board.take.remote()):
             on_progress(progress)
         for task in ended:
-            job, reason = running.pop(task), _reason(ray, task)
-            if reason:
-                failures.append(Failure(job=job, reason=reason))
+            group = running.pop(task)
+            reasons = _reasons(ray, task, len(group))
+            failures += [Failure(job=job, reason=reason) for job, reason in zip(group, reasons, strict=True) if reason]
     for progress in ray.get(board.take.remote()):
         on_progress(progress)
     return tuple(failures)
@@ -106,13 +104,13 @@ def _absolute(job: Job) -> Job:
     return replace(job, spec=spec, folder=job.folder.resolve())
 
 
-def _reason(ray: Any, task: Any) -> str:
-    """Why an ended task's run failed, or an empty string."""
+def _reasons(ray: Any, task: Any, count: int) -> list[str]:
+    """Why each of an ended task's runs failed, or empty strings."""
     try:
-        reason: str = ray.get(task)
+        reasons: list[str] = ray.get(task)
     except ray.exceptions.RayError as error:
-        return f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"
-    return reason
+        return [f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"] * count
+    return reasons
 
 
 class _Board:
@@ -129,17 +127,11 @@ class _Board:
         return news
 
 
-def _work(job: Job, board: Any) -> str:
-    """One run, its output to the log. Returns why it failed, or an empty string."""
-    try:
-        redirect_output(job)
-        log_line(f"{job.spec.agent} seed {job.spec.seed} begins or goes on, on a Ray worker")
-        _run_when_free(job, board.put.remote)
-    except Exception as error:
-        traceback.print_exc()
-        return str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}"
-    log_line("done")
-    return ""
+def _work(jobs: Sequence[Job], board: Any) -> list[str]:
+    """Runs side by side. Returns why each failed, or empty strings."""
+    reasons = [""] * len(jobs)
+    carry_out(jobs, board.put.remote, reasons.__setitem__, _run_when_free)
+    return reasons
 
 
 def _run_when_free(job: Job, on_progress: Observer) -> None:
@@ -147,8 +139,7 @@ def _run_when_free(job: Job, on_progress: Observer) -> None:
     deadline_s = time.monotonic() + _FREED_WITHIN_S
     while True:
         try:
-            registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, on_progress)
-            return
+            return run_job(job, on_progress)
         except BusyError:
             if time.monotonic() > deadline_s:
                 raise

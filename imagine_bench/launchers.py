@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -18,7 +19,8 @@ from pathlib import Path
 from typing import Protocol
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_known
+from imagine_bench.cohort import side_by_side
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
 from imagine_bench.files import make_folder, writing
 from imagine_bench.kinds import kind_of
 from imagine_bench.runs import Observer, Progress, RunSpec
@@ -56,24 +58,33 @@ class Failure:
     reason: str
 
 
+def cohorts(jobs: Sequence[Job], abreast: int) -> list[tuple[Job, ...]]:
+    """Jobs in order, up to ``abreast`` of one agent in each group, which go on side by side in one process."""
+    groups = [tuple(group) for _, group in itertools.groupby(jobs, key=lambda job: job.spec.agent)]
+    return [group[start : start + abreast] for group in groups for start in range(0, len(group), abreast)]
+
+
 LAUNCHERS = {"local": "imagine_bench.launchers:LocalPool", "ray": "imagine_bench.launcher_ray:RayCluster"}
 """Where runs can be carried out, by name."""
 
 
-def launcher(name: str, workers: int) -> Launcher:
+def launcher(name: str, workers: int, abreast: int | None = None) -> Launcher:
     """The launcher of that name.
 
     Args:
         name: One of :data:`LAUNCHERS`.
-        workers: Runs at a time on this machine.
+        workers: Processes at a time on this machine.
+        abreast: Most runs of one agent side by side in a process; None for what the launcher thinks best.
 
     Raises:
         UnknownNameError: No such launcher.
-        InvalidValueError: Fewer than one worker.
+        InvalidValueError: Fewer than one worker, or fewer than one run abreast.
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    made: Launcher = make(workers)
+    if abreast is not None and abreast < 1:
+        raise InvalidValueError(f"{abreast} runs abreast are none; give at least 1.")
+    made: Launcher = make(workers, abreast)
     return made
 
 
@@ -93,23 +104,24 @@ class Launcher(Protocol):
 
 
 class LocalPool:
-    """Processes of this machine, each with one thread and one run; none outlives this process, however it ends.
+    """Processes of this machine, each with one thread; none outlives this process, however it ends.
 
     Args:
-        workers: Runs at a time.
+        workers: Processes at a time.
+        abreast: Most runs of one agent side by side in a process; None for as many as leave no worker without work.
 
     Raises:
         InvalidValueError: Fewer than one worker.
     """
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, abreast: int | None = None) -> None:
         if workers < 1:
             raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
-        self._workers = workers
+        self._workers, self._abreast = workers, abreast
 
     def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
-        """Carry out every job, ``workers`` at a time, in order; see :class:`Launcher`."""
-        waiting = list(reversed(jobs))
+        """Carry out every job, ``workers`` cohorts at a time, in order; see :class:`Launcher`."""
+        waiting = cohorts(jobs, self._abreast or max(1, -(-len(jobs) // self._workers)))[::-1]
         running: list[_Child] = []
         failures: list[Failure] = []
         try:
@@ -119,7 +131,7 @@ class LocalPool:
                 wait([source for child in running for source in child.sources], timeout=_POLL_S)
                 for child in running:
                     child.forward(on_progress)
-                failures += [child.failure() for child in running if child.ended and child.reason]
+                failures += [failure for child in running if child.ended for failure in child.failures()]
                 running = [child for child in running if not child.ended]
         finally:
             for child in running:
@@ -128,13 +140,14 @@ class LocalPool:
 
 
 class _Child:
-    """One job in a process of its own."""
+    """Jobs side by side in a process of their own."""
 
-    def __init__(self, job: Job) -> None:
-        self.job, self._reason, self._finished = job, "", False
+    def __init__(self, jobs: tuple[Job, ...]) -> None:
+        self._jobs, self._reasons = jobs, dict[int, str]()
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._receiver, sender = context.Pipe(duplex=False)
-        self.process: BaseProcess = context.Process(target=_work, args=(job, sender), name=job.log.parent.name)
+        name = f"{jobs[0].spec.agent}/{jobs[0].folder.name}"
+        self.process: BaseProcess = context.Process(target=_work, args=(jobs, sender), name=name)
         with _environment(ONE_THREAD), _interrupts_ignored():
             self.process.start()
         sender.close()
@@ -149,20 +162,18 @@ class _Child:
         """Whether the process is gone and everything it sent was read."""
         return self._receiver.closed and not self.process.is_alive()
 
+    def failures(self) -> list[Failure]:
+        """The jobs of this ended process that failed; one that said nothing died with the process."""
+        reasons = [self._reasons.get(index, self._death) for index in range(len(self._jobs))]
+        return [Failure(job=job, reason=reason) for job, reason in zip(self._jobs, reasons, strict=True) if reason]
+
     @property
-    def reason(self) -> str:
-        """Why the ended job failed; empty if it did not."""
-        if self._finished or self._reason:
-            return self._reason
+    def _death(self) -> str:
         code = self.process.exitcode or 0
         if code < 0:
             name = signal.Signals(-code).name
             return f"its process was killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
         return f"its process ended early with exit code {code}"
-
-    def failure(self) -> Failure:
-        """The failure of this ended job."""
-        return Failure(job=self.job, reason=self.reason)
 
     def forward(self, on_progress: Observer) -> None:
         """Read what the process has sent so far."""
@@ -171,10 +182,8 @@ class _Child:
                 message = self._receiver.recv()
                 if isinstance(message, Progress):
                     on_progress(message)
-                elif isinstance(message, str):
-                    self._reason = message
                 else:
-                    self._finished = True
+                    index, self._reasons[index] = message
         except (EOFError, OSError):
             self._receiver.close()
             self.process.join(_PATIENCE_S)
@@ -189,23 +198,55 @@ class _Child:
         self._receiver.close()
 
 
-def _work(job: Job, sender: Connection) -> None:
-    """The life of a worker process: one run, its output to the log, its end told to the parent."""
+def _work(jobs: tuple[Job, ...], sender: Connection) -> None:
+    """The life of a worker process: its runs, and how each one ended, told to the parent."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    carry_out(jobs, sender.send, lambda index, reason: sender.send((index, reason)))
+
+
+def run_job(job: Job, on_progress: Observer) -> None:
+    """Carry out one job in this process."""
+    registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, on_progress)
+
+
+def carry_out(
+    jobs: Sequence[Job],
+    on_progress: Observer,
+    on_end: Callable[[int, str], None],
+    run: Callable[[Job, Observer], None] = run_job,
+) -> None:
+    """Carry out jobs side by side in this process; whatever becomes of one, the others go on.
+
+    Args:
+        jobs: What libraries print goes to the log of the first.
+        on_progress: Told now and then how far each is.
+        on_end: Told the index of each job that ends, and why it failed, or an empty string.
+        run: What carries out one of them.
+    """
+    with suppress(SetupError):  # where that log cannot be written, its own run will say so
+        _redirect_output(jobs[0])
+
+    def work(index: int, job: Job) -> None:
+        on_end(index, _reason(job, on_progress, run))
+
+    side_by_side([functools.partial(work, index, job) for index, job in enumerate(jobs)])
+
+
+def _reason(job: Job, on_progress: Observer, run: Callable[[Job, Observer], None]) -> str:
+    """Carry out one job, with beginning and end in its log. Returns why it failed, or an empty string."""
     try:
-        redirect_output(job)
-        log_line(f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
-        registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, sender.send)
-        sender.send(None)
+        _log(job, f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
+        run(job, on_progress)
+        _log(job, "done")
     except Exception as error:
-        traceback.print_exc()
-        sender.send(str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}")
-        sys.exit(1)
-    log_line("done")
+        with suppress(SetupError):
+            _log(job, traceback.format_exc())
+        return str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}"
+    return ""
 
 
-def redirect_output(job: Job) -> None:
-    """Let everything this process prints, native libraries included, end in the run's log."""
+def _redirect_output(job: Job) -> None:
+    """Let everything this process prints, native libraries included, end in the job's log."""
     make_folder(job.folder)
     with writing(job.log):
         log = os.open(job.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -214,9 +255,11 @@ def redirect_output(job: Job) -> None:
     os.close(log)
 
 
-def log_line(line: str) -> None:
-    """Print a line with the time."""
-    print(time.strftime("%Y-%m-%d %H:%M:%S"), line, flush=True)
+def _log(job: Job, text: str) -> None:
+    """Add a text with the time to the job's log."""
+    make_folder(job.folder)
+    with writing(job.log), job.log.open("a") as log:
+        print(time.strftime("%Y-%m-%d %H:%M:%S"), text, file=log)
 
 
 def _die_with_parent() -> None:

@@ -19,6 +19,7 @@ import gymnasium
 from imagine_bench import registry, run_folder
 from imagine_bench.capabilities import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
 from imagine_bench.checkpointing import load_newest, save_snapshot
+from imagine_bench.cohort import cpu_time_s
 from imagine_bench.errors import DivergedError
 from imagine_bench.evaluation import Tally, TrainingStarts, play
 from imagine_bench.files import lock, make_folder
@@ -114,16 +115,16 @@ class _Run:
 
     def _watch(self, agent: SelfTrainer) -> None:
         """Let the agent train itself through all budgets, and test it, in an environment apart, at each of them."""
-        budgets, start_s = self.spec.protocol.budgets, time.process_time()
+        budgets, start_s = self.spec.protocol.budgets, cpu_time_s()
 
         def on_episode(success: bool, length: int) -> bool:
             nonlocal start_s
             self.counters.add_episode(success, length)
-            self.counters.train_cpu_s += time.process_time() - start_s
+            self.counters.train_cpu_s += cpu_time_s() - start_s
             self._tell("training")
             if self.counters.episode in budgets:
                 self._test(self.counters.episode)
-            start_s = time.process_time()
+            start_s = cpu_time_s()
             return self.counters.episode < budgets[-1]
 
         with closing(_make_env(self.spec)) as own:
@@ -144,9 +145,9 @@ class _Run:
 
     def _train(self, budget: int) -> None:
         while self.counters.episode < budget:
-            start_s = time.process_time()
+            start_s = cpu_time_s()
             self._training_episode()
-            self.counters.train_cpu_s += time.process_time() - start_s
+            self.counters.train_cpu_s += cpu_time_s() - start_s
             self._tell("training")
             self._save_now_and_then()
 
@@ -159,11 +160,11 @@ class _Run:
                 continue
             with closing(_make_env(self.spec, task)) as env:
                 while counters.before < end:
-                    start_s = time.process_time()
+                    start_s = cpu_time_s()
                     self._earlier_episode(env, counters.before % protocol.after_episodes)
                     if counters.before == end:
                         agent.carry_over()
-                    counters.train_cpu_s += time.process_time() - start_s
+                    counters.train_cpu_s += cpu_time_s() - start_s
                     self._tell("training")
                     self._save_now_and_then()
 
@@ -216,14 +217,14 @@ class _Run:
             return
         more = True
         while more:
-            start_s = time.process_time()
+            start_s = cpu_time_s()
             more = self.agent.rehearse()
-            self.counters.train_cpu_s += time.process_time() - start_s
+            self.counters.train_cpu_s += cpu_time_s() - start_s
             self._tell("rehearsing")
             self._save_now_and_then()
 
     def _row(self, budget: int, test: Tally) -> Checkpoint:
-        start_s = time.process_time()
+        start_s = cpu_time_s()
         loop = None
         if isinstance(self.agent, Imaginer) and self._questions:
             self._tell("imagining", at_once=True)
@@ -238,7 +239,7 @@ class _Run:
             mean_length=test.env_steps / test.episodes,
             faults=test.faults,
             train_cpu_s=self.counters.train_cpu_s,
-            eval_cpu_s=test.cpu_s + time.process_time() - start_s,
+            eval_cpu_s=test.cpu_s + cpu_time_s() - start_s,
             diagnostics=test.diagnostics,
             open_loop=loop,
             futures=futures,

@@ -26,6 +26,8 @@ from imagine_bench.seeding import SeedTree
 TURNS = 2_000
 """Macro-actions of each task's fidelity measurement."""
 _LEARNER_SPEED = "imagine_bench.agents.learner_speed:measure"
+_ABREAST_SPEED = "imagine_bench.agents.learner_speed:measure_abreast"
+_SEEDS = 5
 _WEIGHT_SAMPLES = "imagine_bench.agents.speed:weight_samples"
 _TRAINING = "imagine_bench.agents.speed:training"
 _BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
@@ -60,6 +62,7 @@ def measure(turns: int = TURNS) -> Iterator[Figure]:
     yield from _memory()
     yield from _together()
     yield from _learner()
+    yield from _abreast()
     specs = [registry.task(name) for name in registry.TASKS]
     measured = [(spec, spec.promises) for spec in specs if spec.promises is not None]
     for part in (_kinematic, _encoders):
@@ -183,6 +186,18 @@ def _learner() -> Iterator[Figure]:
         f"{speed.peak_gflops:.0f} GFLOP/s {speed.roofline_ms:.1f})",
         met=ratio >= 2.5,
     )  # fmt: skip
+
+
+def _abreast() -> Iterator[Figure]:
+    """The updates of several seeds as one computation, with the settings of two presets."""
+    for preset in ("thesis", "quick"):
+        model, controller = registry.load(_ABREAST_SPEED)(preset, _SEEDS)
+        yield Figure(
+            what=f"updates of {_SEEDS} seeds ({preset}) as one computation, times faster than one after another",
+            required="> 1",
+            measured=f"{model:.2f} model, {controller:.2f} controller",
+            met=min(model, controller) > 1.0,
+        )
 
 
 def _kinematic(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 _TOP = Path(__file__).parent.parent
-_SHARED = {"interfaces", "capabilities", "errors", "seeding", "preprocessing", "regression"}
+_SHARED = {"cohort", "interfaces", "capabilities", "errors", "seeding", "preprocessing", "regression"}
 """What tasks and agents may take from imagine_bench."""
 _HEAVY = {
     "torch": "agents",

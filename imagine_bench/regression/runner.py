@@ -13,6 +13,7 @@ from typing import Any
 
 from imagine_bench import registry, run_folder
 from imagine_bench.checkpointing import Snapshot, load_newest, save_snapshot
+from imagine_bench.cohort import cpu_time_s
 from imagine_bench.errors import DivergedError
 from imagine_bench.files import lock, make_folder
 from imagine_bench.regression import Assessment, Dataset, Floats, Regressor, RegressorContext
@@ -108,9 +109,9 @@ class _Run:
         step = max(1, regressor.epochs // _SLICES)
         try:
             while regressor.epoch < regressor.epochs:
-                start_s = time.process_time()
+                start_s = cpu_time_s()
                 regressor.train(min(step, regressor.epochs - regressor.epoch))
-                self.train_cpu_s += time.process_time() - start_s
+                self.train_cpu_s += cpu_time_s() - start_s
                 done = _SLICES * regressor.epoch // regressor.epochs
                 self._tell("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
                 if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
@@ -122,7 +123,7 @@ class _Run:
 
     def _measure(self, regressor: Regressor, variant: str) -> None:
         self._tell("testing", f"{variant}, measuring", _SLICES)
-        start_s = time.process_time()
+        start_s = cpu_time_s()
         rows, arrays = calibrate(
             self.task, regressor, variant, self.networks, points=self.protocol.test_points,
             rng=self.seeds.child("calibration", variant).generator(),
@@ -132,7 +133,7 @@ class _Run:
             return regressor.assess(inputs, self.seeds.child("assess", variant, name).generator())
 
         evaluation = self.task.evaluate(variant, assess, self.networks)
-        measure_cpu_s = time.process_time() - start_s
+        measure_cpu_s = cpu_time_s() - start_s
         shared: Row = {**regressor.diagnostics()}  # of all networks together; the CPU seconds are a network's share
         shared["train_cpu_s"] = self.train_cpu_s / self.protocol.networks
         shared["measure_cpu_s"] = measure_cpu_s / self.protocol.networks

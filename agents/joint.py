@@ -1,0 +1,69 @@
+"""One gradient for the models of several seeds: their weights lie side by side, and seeds are a leading axis.
+
+Small networks leave a processor waiting for calls rather than for arithmetic, so one pass through S of them costs less
+than S passes. What is done with a gradient (clipping, Adam's moments, norms) stays each model's own. A model that
+learns alone is the case S = 1 of the same code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from .flat_adam import FlatAdam
+from .layers import Masks
+from .memory import Batch
+
+Losses = Callable[[Sequence[Tensor]], Tensor]
+"""From the parameters of S models of E members, each (S E, ...), to their losses (terms, S)."""
+
+
+def gradients(optimisers: Sequence[FlatAdam], losses: Losses) -> tuple[Tensor, Tensor]:
+    """Losses of S models, and the gradient of the sum of each one's terms by its own parameters.
+
+    Args:
+        optimisers: Those of the models, which must be of one shape.
+        losses: What to differentiate; the parameters come in the order of ``optimisers[0].parameters``.
+
+    Returns:
+        Losses, shape (terms, S), and gradients, shape (S, P).
+    """
+    vectors = _side_by_side(optimisers).detach().requires_grad_()
+    like = optimisers[0].parameters
+    parts = vectors.split([parameter.numel() for parameter in like], dim=1)
+    terms = losses([part.reshape(-1, *parameter.shape[1:]) for part, parameter in zip(parts, like, strict=True)])
+    (gradient,) = torch.autograd.grad(terms.sum(), vectors)
+    return terms.detach(), gradient
+
+
+def _side_by_side(optimisers: Sequence[FlatAdam]) -> Tensor:
+    """The parameters of S models as rows of one tensor (S, P), where they stay until the company changes."""
+    if len(optimisers) == 1:
+        return optimisers[0].vector.unsqueeze(0)
+    home = optimisers[0].home
+    if len(home) != len(optimisers) or any(o.home is not home or o.row != row for row, o in enumerate(optimisers)):
+        home = torch.stack([optimiser.vector for optimiser in optimisers])
+        for row, optimiser in enumerate(optimisers):
+            optimiser.settle(home, row)
+    return home
+
+
+def stacked(tensors: Sequence[Tensor]) -> Tensor:
+    """Tensors of one shape with a leading axis; a single one is not copied."""
+    return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def batches(parts: Sequence[Batch]) -> Batch:
+    """The batches of S models as one, every shape with a leading S."""
+    names = Batch.__slots__
+    return Batch(**{name: stacked([getattr(part, name) for part in parts]) for name in names})
+
+
+def masks(parts: Sequence[Masks | None]) -> Masks | None:
+    """The dropout masks of S models' E members as those of S E members."""
+    drawn = [part for part in parts if part is not None]
+    if not drawn:
+        return None
+    return drawn[0] if len(drawn) == 1 else tuple(torch.cat(layer) for layer in zip(*drawn, strict=True))

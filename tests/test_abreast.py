@@ -1,0 +1,75 @@
+"""Runs of several seeds side by side in one process end as each ends alone."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_launchers import job
+from test_resume_learners import measured
+from test_runner import final_arrays, small
+
+from imagine_bench import encoders, registry, run_folder, runner
+from imagine_bench.cohort import side_by_side
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.launchers import LocalPool, cohorts, launcher
+from imagine_bench.results import RunResult
+from imagine_bench.runs import Progress, RunSpec
+
+SEEDS = (0, 1, 2)
+
+
+def do(root: Path, agent: str, seed: int) -> RunResult | None:
+    overrides = (("imagination.rehearsal_episodes", 5), ("imagination.start_episode", 3))
+    protocol = small(
+        agents=(agent,), seeds=SEEDS, budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=overrides
+    )
+    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    spec = RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=encoder)
+    return runner.run(spec, root / f"seed_{seed}", lambda progress: None)
+
+
+@pytest.mark.parametrize("agent", ["dqn", "imagination_uncertainty", "imagination_only"])
+def test_learners_side_by_side_end_as_alone(tmp_path: Path, agent: str) -> None:
+    alone = [do(tmp_path / "alone", agent, seed) for seed in SEEDS]
+    abreast = side_by_side([partial(do, tmp_path / "abreast", agent, seed) for seed in SEEDS])
+    for seed, one, other in zip(SEEDS, alone, abreast, strict=True):
+        assert isinstance(other, RunResult) and one is not None
+        assert np.array_equal(one.training_length, other.training_length)
+        assert [row.successes for row in one.checkpoints] == [row.successes for row in other.checkpoints]
+        before, after = (final_arrays(tmp_path / way / f"seed_{seed}") for way in ("alone", "abreast"))
+        for name, array in before.items():
+            np.testing.assert_allclose(after[name], array, rtol=1e-3, atol=1e-4, err_msg=name)
+    assert measured(abreast[0]) != measured(abreast[1]), "seeds must differ, or agreement shows nothing"
+
+
+def test_what_a_run_costs_abreast_is_its_own(tmp_path: Path) -> None:
+    """Three side by side are told no more CPU time, all together, than they took."""
+    results = side_by_side([partial(do, tmp_path, "dqn", seed) for seed in SEEDS])
+    alone = do(tmp_path / "alone", "dqn", 0)
+    assert alone is not None
+    told = [row.train_cpu_s for result in results for row in result.checkpoints[-1:]]
+    assert max(told) < 2.0 * alone.checkpoints[-1].train_cpu_s
+
+
+def test_jobs_are_grouped_by_agent_in_order(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, agent, seed) for agent, seed in (("table", 0), ("table", 1), ("table", 2), ("failing", 0))]
+    assert cohorts(jobs, 2) == [tuple(jobs[:2]), tuple(jobs[2:3]), tuple(jobs[3:])]
+    assert cohorts(jobs, 9) == [tuple(jobs[:3]), tuple(jobs[3:])]
+    assert cohorts(jobs, 1) == [(each,) for each in jobs]
+
+
+def test_a_run_that_fails_stops_no_other_beside_it(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, "failing", seed) for seed in (1, 0)]
+    told: list[Progress] = []
+    (failure,) = LocalPool(1, abreast=2).launch(jobs, told.append)
+    assert failure.job is jobs[0] and failure.reason == "RuntimeError: this agent breaks on purpose"
+    assert "Traceback" in jobs[0].log.read_text() and "Traceback" not in jobs[1].log.read_text()
+    assert run_folder.is_done(jobs[1].folder) and not run_folder.is_done(jobs[0].folder)
+
+
+def test_none_abreast_is_refused() -> None:
+    with pytest.raises(InvalidValueError, match="0 runs abreast are none; give at least 1"):
+        launcher("local", 1, 0)
