@@ -96,14 +96,21 @@ class Learner:
             self._learn_model(self.imagination)
         self._learn_values(self.real, self.settings.controller.updates_per_step)
         if self.imagination is not None and self._practises_in(episode):
-            self._imagine(self.imagination, now[0])
-            self._learn_values(self.imagination.memory, self.settings.imagination.updates_per_step)
+            self._practise(self.imagination, now[0], episode)
         self.meters.count(*_TIMES[: 1 if self.imagination is None else None])
         self.steps += 1
 
     def _practises_in(self, episode: int) -> bool:
         """Whether the controller learns from imagination in real episode ``episode``."""
         return episode >= self.settings.imagination.start_episode
+
+    def _practise(self, imagination: Imagination, z: torch.Tensor, episode: int) -> None:
+        """N_I updates on what is imagined now; after the last episode that imagines, on what really happened."""
+        settings = self.settings.imagination
+        ended = settings.end_episode is not None and episode >= settings.end_episode
+        if not ended:
+            self._imagine(imagination, z)
+        self._learn_values(self.real if ended else imagination.memory, settings.updates_per_step)
 
     def _learn_model(self, imagination: Imagination) -> None:
         with self.meters.cpu_time("time/model_s"):

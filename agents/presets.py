@@ -46,6 +46,7 @@ _RANGES = {
     "controller.epsilon_max": PROBABILITY,
     "controller.epsilon_decay": NOT_NEGATIVE,
     "imagination.start_episode": NOT_NEGATIVE,
+    "imagination.end_episode": NOT_NEGATIVE,
     "imagination.updates_per_step": NOT_NEGATIVE,
     "imagination.temperature": NOT_NEGATIVE,
     "imagination.exploration": PROBABILITY,

@@ -101,6 +101,8 @@ class ImaginationSettings:
 
     Attributes:
         start_episode: First training episode that imagines, I_start.
+        end_episode: First training episode that imagines no more; its updates are made on real transitions instead, of
+            which there are enough by then. None: imagination never ends (thesis).
         start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"remembered"``,
             states drawn from the real memory.
         rehearsal_episodes: Imagined episodes of a controller that is trained in imagination alone (thesis 3.2.2).
@@ -122,6 +124,7 @@ class ImaginationSettings:
     """
 
     start_episode: int = 1000
+    end_episode: int | None = None
     start_states: str = "current"
     rehearsal_episodes: int = 1000
     breadth: int = 3

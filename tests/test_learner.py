@@ -104,6 +104,27 @@ def test_algorithm_1_in_its_order(monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls == [*waking, "imagine", *["imagined 8"] * 4]
 
 
+def test_after_imagination_its_updates_are_made_on_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two agents are one until the last episode that imagines; then one's imagined memory stays as it is."""
+    forever, ending = (
+        imagination_agents.make_uncertainty(context(monkeypatch, {"imagination.end_episode": end})) for end in (None, 5)
+    )
+    histories = [live(agent, range(5), np.random.default_rng(0)) for agent in (forever, ending)]
+    assert histories[0] == histories[1]
+    imagined = ending.imagination.memory.added
+    assert imagined == forever.imagination.memory.added > 0
+    sampled: list[int] = []
+    sample = ending.real.sample
+    monkeypatch.setattr(
+        ending.real, "sample", lambda count, *args, **how: (sampled.append(count), sample(count, *args, **how))[1]
+    )
+    ending.observe(transition(0, 1, 0.0, 1), episode=5)
+    forever.observe(transition(0, 1, 0.0, 1), episode=5)
+    updates = ending.settings.controller.updates_per_step + ending.settings.imagination.updates_per_step
+    assert sampled[1:] == [ending.settings.controller.batch_size] * updates  # the first is the model's
+    assert ending.imagination.memory.added == imagined < forever.imagination.memory.added
+
+
 def test_real_and_imagined_transitions_never_mix(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = imagination_agents.make(context(monkeypatch))
     live(agent, range(20), np.random.default_rng(0))
