@@ -28,7 +28,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
 _TOGETHER = "imagine_bench.together:load_together"
-_ABREAST = "(default: so many that every worker has some)"
+_ABREAST = "(default: the workers' equal shares)"
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 

@@ -89,11 +89,19 @@ def _go_on(members: Sequence[_Member]) -> None:
         chosen = max((request.what for request in waiting.values()), key=seen.index)
         group = [member for member in members if member in waiting and waiting[member].what == chosen]
         start_s = time.process_time()
-        answers = chosen[0]([waiting.pop(member).item for member in group])
+        answers = _answers(chosen[0], [waiting.pop(member).item for member in group])
         share_s = (time.process_time() - start_s) / len(group)
         for member, answer in zip(group, answers, strict=True):
             if (request := member.go_on(answer, share_s)) is not None:
                 waiting[member] = request
+
+
+def _answers(function: Callable[[Sequence[Any]], Sequence[Any]], items: Sequence[Any]) -> Sequence[Any]:
+    """What the function answers; what it cannot do for all of them together is an answer to each."""
+    try:
+        return function(items)
+    except Exception as error:
+        return [error] * len(items)
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,7 +55,7 @@ class RayCluster:
 
         self._connect(ray)
         try:
-            return _launch(ray, cohorts(jobs, self._abreast), on_progress)
+            return _launch(ray, cohorts(jobs, self._workers, self._abreast), on_progress)
         finally:
             ray.shutdown()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import multiprocessing
 import os
 import signal
@@ -58,10 +57,20 @@ class Failure:
     reason: str
 
 
-def cohorts(jobs: Sequence[Job], abreast: int) -> list[tuple[Job, ...]]:
-    """Jobs in order, up to ``abreast`` of one agent in each group, which go on side by side in one process."""
-    groups = [tuple(group) for _, group in itertools.groupby(jobs, key=lambda job: job.spec.agent)]
-    return [group[start : start + abreast] for group in groups for start in range(0, len(group), abreast)]
+def cohorts(jobs: Sequence[Job], workers: int, abreast: int | None = None) -> list[tuple[Job, ...]]:
+    """Jobs in groups of one agent that go on side by side in one process, in the order of their first jobs.
+
+    Args:
+        jobs: In the order in which they are wanted.
+        workers: Processes at a time.
+        abreast: Most jobs of a group; None shares out each agent's jobs among all workers, whatever agents cost.
+    """
+    found: list[tuple[Job, ...]] = []
+    for agent in dict.fromkeys(job.spec.agent for job in jobs):
+        same = tuple(job for job in jobs if job.spec.agent == agent)
+        size = abreast or -(-len(same) // workers)
+        found += [same[start : start + size] for start in range(0, len(same), size)]
+    return sorted(found, key=lambda group: jobs.index(group[0]))
 
 
 LAUNCHERS = {"local": "imagine_bench.launchers:LocalPool", "ray": "imagine_bench.launcher_ray:RayCluster"}
@@ -108,7 +117,7 @@ class LocalPool:
 
     Args:
         workers: Processes at a time.
-        abreast: Most runs of one agent side by side in a process; None for as many as leave no worker without work.
+        abreast: Most runs of one agent side by side in a process; None for the workers' equal shares.
 
     Raises:
         InvalidValueError: Fewer than one worker.
@@ -121,7 +130,7 @@ class LocalPool:
 
     def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
         """Carry out every job, ``workers`` cohorts at a time, in order; see :class:`Launcher`."""
-        waiting = cohorts(jobs, self._abreast or max(1, -(-len(jobs) // self._workers)))[::-1]
+        waiting = cohorts(jobs, self._workers, self._abreast)[::-1]
         running: list[_Child] = []
         failures: list[Failure] = []
         try:

@@ -54,11 +54,15 @@ def test_what_a_run_costs_abreast_is_its_own(tmp_path: Path) -> None:
     assert max(told) < 2.0 * alone.checkpoints[-1].train_cpu_s
 
 
-def test_jobs_are_grouped_by_agent_in_order(tmp_path: Path) -> None:
-    jobs = [job(tmp_path, agent, seed) for agent, seed in (("table", 0), ("table", 1), ("table", 2), ("failing", 0))]
-    assert cohorts(jobs, 2) == [tuple(jobs[:2]), tuple(jobs[2:3]), tuple(jobs[3:])]
-    assert cohorts(jobs, 9) == [tuple(jobs[:3]), tuple(jobs[3:])]
-    assert cohorts(jobs, 1) == [(each,) for each in jobs]
+def test_jobs_are_grouped_by_agent_and_come_seed_by_seed(tmp_path: Path) -> None:
+    table, failing = (
+        [job(tmp_path, agent, seed) for seed in range(count)] for agent, count in (("table", 3), ("failing", 2))
+    )
+    jobs = [table[0], failing[0], table[1], failing[1], table[2]]  # as a bench gives them
+    assert cohorts(jobs, 1) == [tuple(table), tuple(failing)]
+    assert cohorts(jobs, 2) == [tuple(table[:2]), (failing[0],), (failing[1],), (table[2],)]
+    assert cohorts(jobs, 1, 2) == [tuple(table[:2]), tuple(failing), (table[2],)]
+    assert cohorts(jobs, 16) == cohorts(jobs, 1, 1) == [(each,) for each in jobs]
 
 
 def test_a_run_that_fails_stops_no_other_beside_it(tmp_path: Path) -> None:

@@ -59,6 +59,20 @@ def test_what_one_is_answered_or_raises_is_no_matter_of_the_others() -> None:
     assert isinstance(refused, ValueError) and isinstance(broken, RuntimeError) and fine == 12
 
 
+def test_what_fails_for_all_together_is_raised_in_each() -> None:
+    def broken(items: Sequence[int]) -> list[int | Exception]:
+        raise MemoryError(f"no room for {len(items)}")
+
+    def work(name: int) -> str:
+        try:
+            together(broken, name)
+        except MemoryError as error:
+            return f"{name}: {error}"
+        return "never"
+
+    assert side_by_side([partial(work, 1), partial(work, 2)]) == ["1: no room for 2", "2: no room for 2"]
+
+
 def test_works_that_drift_apart_meet_again_at_the_first_thing_of_a_step() -> None:
     model, controller = Shared(), Shared()
 
