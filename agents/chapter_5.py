@@ -36,7 +36,7 @@ _QUICK: dict[str, Deviation] = {
     ),
     "imagination.start_episode": Deviation(100, "the quick model is right early; 1000 would leave nothing to compare"),
     "imagination.end_episode": Deviation(
-        1000, "real transitions are enough by then: 99.8 % after 2,000 at mild, 98.6 if it imagines on (ten reported seeds)"
+        1000, "real transitions are enough by then: 99.8 % after 2,000 at mild, 98.6 where it imagines on (ten seeds)"
     ),
     "imagination.start_states": Deviation(
         "remembered",
