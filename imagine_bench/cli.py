@@ -28,7 +28,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
 _TOGETHER = "imagine_bench.together:load_together"
-_ABREAST = "(default: the workers' equal shares)"
+_ABREAST = "(default: equal shares for local workers; with ray 1)"
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
@@ -74,7 +74,7 @@ class Bench:
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
     """Processes at a time."""
     abreast: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_ABREAST)] = None
-    """Runs of one agent that go on side by side in a process and learn as one computation, to the same bits."""
+    """Runs of one agent that go on side by side in a process and learn as one computation."""
     launcher: str = "local"
     """Where runs are carried out: local processes, or ray (the cluster at RAY_ADDRESS, else one started here)."""
     device: str = DEVICES[0]

@@ -18,7 +18,7 @@ from imagine_bench.launchers import ONE_THREAD, Failure, Job, carry_out, cohorts
 from imagine_bench.runs import Observer, Progress
 
 _LOST = 20
-"""Times that one run may lose its worker or its node before it counts as failed."""
+"""Times that a task may lose its worker or its node before its runs count as failed."""
 _POLL_S = 0.5
 _FREED_WITHIN_S = 60.0
 """How long the process of a dead node may hold on to its run's folder."""
