@@ -15,6 +15,7 @@ from torch import Tensor
 from .flat_adam import FlatAdam
 from .layers import Masks
 from .memory import Batch
+from .products import joined, stacked
 
 Losses = Callable[[Sequence[Tensor]], Tensor]
 """From the parameters of S models of E members, each (S E, ...), to their losses (terms, S)."""
@@ -50,11 +51,6 @@ def _side_by_side(optimisers: Sequence[FlatAdam]) -> Tensor:
     return home
 
 
-def stacked(tensors: Sequence[Tensor]) -> Tensor:
-    """Tensors of one shape with a leading axis; a single one is not copied."""
-    return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
-
-
 def batches(parts: Sequence[Batch]) -> Batch:
     """The batches of S models as one, every shape with a leading S."""
     names = Batch.__slots__
@@ -66,4 +62,4 @@ def masks(parts: Sequence[Masks | None]) -> Masks | None:
     drawn = [part for part in parts if part is not None]
     if not drawn:
         return None
-    return drawn[0] if len(drawn) == 1 else tuple(torch.cat(layer) for layer in zip(*drawn, strict=True))
+    return tuple(joined(layer) for layer in zip(*drawn, strict=True))

@@ -6,6 +6,8 @@ too, does with the same operands: 98 against 222 GFLOP/s on a core of a Zen 5 at
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -17,7 +19,7 @@ _ONEDNN = getattr(torch.ops.mkldnn, "_linear_pointwise", None) if torch.backends
 def product(a: Tensor, b: Tensor) -> Tensor:
     """``a @ b`` for each member: (E, N, I) and (E, I, O) give (E, N, O). Any strides; without a gradient of its own."""
     if _by_onednn(a, b):
-        return _stacked([_ONEDNN(x, y.t(), None, "none", [], "") for x, y in zip(a, b, strict=True)])
+        return stacked([_ONEDNN(x, y.t(), None, "none", [], "") for x, y in zip(a, b, strict=True)])
     return torch.bmm(a, b)
 
 
@@ -28,20 +30,22 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, *, relu: bool = False) -> Te
     """
     if _by_onednn(x, weight):
         parts, then = zip(x, weight, bias, strict=True), "relu" if relu else "none"
-        return _stacked([_ONEDNN(rows, w.t(), b[0], then, [], "") for rows, w, b in parts])
+        return stacked([_ONEDNN(rows, w.t(), b[0], then, [], "") for rows, w, b in parts])
     # Of several members with one output each, MKL sums in another order; no member may change another's bits.
     members = 1 if weight.shape[2] == 1 else len(weight)
     parts = zip(bias.split(members), x.split(members), weight.split(members), strict=True)
-    result = _joined([torch.baddbmm(*part) for part in parts])
+    result = joined([torch.baddbmm(*part) for part in parts])
     return result.relu_() if relu else result
 
 
-def _joined(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors one behind another along their first axis; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
-def _stacked(members: list[Tensor]) -> Tensor:
-    return members[0].unsqueeze(0) if len(members) == 1 else torch.stack(members)  # one member is not copied
+def stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors of one shape along a new first axis; a single one is not copied."""
+    return parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(list(parts))
 
 
 def _by_onednn(a: Tensor, b: Tensor) -> bool:

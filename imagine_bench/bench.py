@@ -121,7 +121,7 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
     return {**own, **dict.fromkeys(sorted(replaced), path)}
 
 
-def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher, bars: int) -> Any:
+def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> Any:
     """Run what is missing of a protocol, and read all of it.
 
     Args:
@@ -129,7 +129,6 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher, bars:
         paths: The encoder artefacts that its agents need, by kind.
         root: Folder of all benches.
         launcher: Carries out the runs.
-        bars: Lines of progress, one a run at a time.
 
     Returns:
         The result class of the task's kind.
@@ -147,13 +146,13 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher, bars:
         if missing:
             gl_renderer()  # fails here, in one sentence, rather than in every run
             _warn(store.begin_sitting(describe_environment()), store.folder)
-            failures = _in_waves(store, paths, launcher, bars)
+            failures = _in_waves(store, paths, launcher)
             store.note_time()
             _raise_if_any(failures, missing)
     return load_bench(store.folder)
 
 
-def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher, bars: int) -> list[Failure]:
+def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
     """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
     failures: list[Failure] = []
     for until in store.protocol.waves:
@@ -161,7 +160,7 @@ def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher, bars: int)
         pairs = [pair for pair in store.missing(until) if pair not in failed]
         jobs = [_job(store, paths, *pair, until) for pair in pairs]
         if jobs:
-            with ProgressBars([job.spec for job in jobs], bars) as show:
+            with ProgressBars([job.spec for job in jobs]) as show:
                 failures += launcher.launch(jobs, _noting_time(store, show))
     return failures
 

@@ -16,7 +16,6 @@ from imagine_bench import registry
 from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
 from imagine_bench.encoders import bundled
-from imagine_bench.environment import usable_cores
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
@@ -92,9 +91,8 @@ class Bench:
         wanted, encoder = plan(
             self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options
         )
-        workers = usable_cores() if self.workers is None else self.workers
-        where = launcher(self.launcher, workers, self.abreast)
-        _show(bench(wanted, encoder, root=self.out, launcher=where, bars=workers).folder)
+        where = launcher(self.launcher, self.workers, self.abreast)
+        _show(bench(wanted, encoder, root=self.out, launcher=where).folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,9 +202,8 @@ class StudyCommand:
         from imagine_bench.study import run_study  # noqa: PLC0415 - as above
 
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
-        workers = usable_cores() if self.workers is None else self.workers
-        where = launcher(self.launcher, workers)
-        lines = run_study(study, self.task, root=self.out, launcher=where, bars=workers)
+        where = launcher(self.launcher, self.workers)
+        lines = run_study(study, self.task, root=self.out, launcher=where)
         folder = self.out / self.task / f"study-{study.name}"
         write_study(folder, study, lines)
         print(study_table(study, lines))

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from imagine_bench.errors import BusyError, InvalidValueError, SetupError
-from imagine_bench.launchers import ONE_THREAD, Failure, Job, carry_out, cohorts, run_job
+from imagine_bench.errors import BusyError, SetupError
+from imagine_bench.launchers import ONE_THREAD, Failure, Job, carry_out, cohorts, require_runnable, run_job
 from imagine_bench.runs import Observer, Progress
 
 _LOST = 20
@@ -32,13 +32,12 @@ class RayCluster:
         abreast: Most runs of one agent side by side in a task; None for one.
 
     Raises:
-        InvalidValueError: Fewer than one worker.
+        InvalidValueError: Fewer than one worker, or fewer than one run abreast.
         SetupError: Ray is not installed.
     """
 
     def __init__(self, workers: int, abreast: int | None = None) -> None:
-        if workers < 1:
-            raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
+        require_runnable(workers, abreast)
         try:
             import ray  # noqa: F401, PLC0415 - an optional dependency
         except ImportError as error:

@@ -19,6 +19,7 @@ from typing import Protocol
 
 from imagine_bench import registry
 from imagine_bench.cohort import side_by_side
+from imagine_bench.environment import usable_cores
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
 from imagine_bench.files import make_folder, writing
 from imagine_bench.kinds import kind_of
@@ -73,16 +74,28 @@ def cohorts(jobs: Sequence[Job], workers: int, abreast: int | None = None) -> li
     return sorted(found, key=lambda group: jobs.index(group[0]))
 
 
+def require_runnable(workers: int, abreast: int | None) -> None:
+    """Check how many jobs may go on at a time.
+
+    Raises:
+        InvalidValueError: Fewer than one worker, or fewer than one run abreast.
+    """
+    if workers < 1:
+        raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
+    if abreast is not None and abreast < 1:
+        raise InvalidValueError(f"{abreast} runs abreast are none; give at least 1.")
+
+
 LAUNCHERS = {"local": "imagine_bench.launchers:LocalPool", "ray": "imagine_bench.launcher_ray:RayCluster"}
 """Where runs can be carried out, by name."""
 
 
-def launcher(name: str, workers: int, abreast: int | None = None) -> Launcher:
+def launcher(name: str, workers: int | None = None, abreast: int | None = None) -> Launcher:
     """The launcher of that name.
 
     Args:
         name: One of :data:`LAUNCHERS`.
-        workers: Processes at a time on this machine.
+        workers: Processes at a time on this machine; None for one a core.
         abreast: Most runs of one agent side by side in a process; None for what the launcher thinks best.
 
     Raises:
@@ -91,9 +104,7 @@ def launcher(name: str, workers: int, abreast: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    if abreast is not None and abreast < 1:
-        raise InvalidValueError(f"{abreast} runs abreast are none; give at least 1.")
-    made: Launcher = make(workers, abreast)
+    made: Launcher = make(usable_cores() if workers is None else workers, abreast)
     return made
 
 
@@ -120,12 +131,11 @@ class LocalPool:
         abreast: Most runs of one agent side by side in a process; None for the workers' equal shares.
 
     Raises:
-        InvalidValueError: Fewer than one worker.
+        InvalidValueError: Fewer than one worker, or fewer than one run abreast.
     """
 
     def __init__(self, workers: int, abreast: int | None = None) -> None:
-        if workers < 1:
-            raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
+        require_runnable(workers, abreast)
         self._workers, self._abreast = workers, abreast
 
     def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:

@@ -20,10 +20,9 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     Args:
         specs: The runs to come.
-        workers: Runs at a time.
     """
 
-    def __init__(self, specs: Sequence[RunSpec], workers: int) -> None:
+    def __init__(self, specs: Sequence[RunSpec]) -> None:
         self._work = sum(spec.work for spec in specs)
         self._runs, self._finished = len(specs), 0
         self._done: dict[tuple[str, int], int] = {}
@@ -34,8 +33,6 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         if sys.stderr.isatty():
             form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
             self._total = tqdm(total=self._work, desc=self._description(), bar_format=form, leave=False)
-            rows = range(1, min(workers, len(specs)) + 1)
-            self._lines = [(None, tqdm(bar_format="{desc}", position=row, leave=False)) for row in rows]
 
     def __exit__(self, *_: object) -> None:
         for _, line in self._lines:
@@ -70,12 +67,19 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         total.n = sum(self._done.values())
         total.set_description_str(self._description(), refresh=False)
         total.set_postfix_str(self._times(), refresh=True)
-        own = [row for row, (owner, _) in enumerate(self._lines) if owner == run]
-        free = [row for row, (owner, _) in enumerate(self._lines) if owner is None]
-        for row in (own + free)[:1]:
-            line = self._lines[row][1]
-            line.set_description_str(text)
-            self._lines[row] = (run if text else None, line)
+        row = self._row(run)
+        line = self._lines[row][1]
+        line.set_description_str(text)
+        self._lines[row] = (run if text else None, line)
+
+    def _row(self, run: tuple[str, int]) -> int:
+        """The run's line, else one that a finished run has left, else a new one below."""
+        owners = [owner for owner, _ in self._lines]
+        for wanted in (run, None):
+            if wanted in owners:
+                return owners.index(wanted)
+        self._lines.append((run, tqdm(bar_format="{desc}", position=len(owners) + 1, leave=False)))
+        return len(owners)
 
 
 def _sentence(progress: Progress) -> str:

@@ -125,7 +125,7 @@ class Line:
     environment: Mapping[str, Any]
 
 
-def run_study(study: Study, task: str, *, root: Path, launcher: Launcher, bars: int) -> tuple[Line, ...]:
+def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant, in order, and compare; the same call goes on where it stopped.
 
     Args:
@@ -133,15 +133,13 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher, bars: 
         task: Registered task.
         root: Folder of all benches.
         launcher: Carries out the runs.
-        bars: Lines of progress.
 
     Raises:
         ImagineBenchError: As for :func:`imagine_bench.bench.bench`; what was finished is kept.
     """
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run
     results = {
-        variant.name: bench(protocol, encoder, root=root, launcher=launcher, bars=bars)
-        for variant, protocol, encoder in planned
+        variant.name: bench(protocol, encoder, root=root, launcher=launcher) for variant, protocol, encoder in planned
     }
     success = {variant.name: results[variant.name].success_rates(variant.agent) for variant in study.variants}
     return tuple(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -74,6 +75,7 @@ def test_a_run_that_fails_stops_no_other_beside_it(tmp_path: Path) -> None:
     assert run_folder.is_done(jobs[1].folder) and not run_folder.is_done(jobs[0].folder)
 
 
-def test_none_abreast_is_refused() -> None:
+@pytest.mark.parametrize("make", [partial(launcher, "local"), LocalPool])
+def test_none_abreast_is_refused(make: Callable[[int, int], object]) -> None:
     with pytest.raises(InvalidValueError, match="0 runs abreast are none; give at least 1"):
-        launcher("local", 1, 0)
+        make(1, 0)

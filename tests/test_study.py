@@ -52,7 +52,7 @@ class Here:
 
 def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     launcher = Here()
-    lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher, bars=1)
+    lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert [(line.variant.name, line.success.shape) for line in lines] == [
         ("table", (2, 2)), ("mild", (2, 2)), ("imaginer", (2, 2)),
     ]  # fmt: skip
@@ -62,7 +62,7 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
         assert line.difference is not None
         expected = line.success.mean(axis=0) - base.success.mean(axis=0)
         assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
-    again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher, bars=1)
+    again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert len(launcher.done) == 6, "what is done is not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
     write_study(tmp_path / "out", STUDY, lines)

@@ -22,7 +22,7 @@ from imagine_bench.together import load_together
 
 def do(root: Path, *agents: str, **changes: Any) -> Path:
     result: BenchResult = bench(
-        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=launcher("local", 1), bars=1
+        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=launcher("local", 1)
     )
     return result.folder
 

@@ -1,0 +1,66 @@
+"""What a bench shows on a terminal: the total, and one line for each run that is going on."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+
+import pytest
+from bench_fakes import FakeRunSpec
+from test_runner import small
+
+from imagine_bench.progress import ProgressBars
+from imagine_bench.runs import Phase, Progress
+
+AGENTS, SEEDS = ("table", "random"), (0, 1, 2)
+
+
+class Terminal(io.StringIO):
+    """Somewhere to write that says a person watches."""
+
+    def isatty(self) -> bool:
+        """Always."""
+        return True
+
+
+def specs() -> list[FakeRunSpec]:
+    protocol = small(agents=AGENTS, seeds=SEEDS)
+    return [FakeRunSpec(protocol=protocol, agent=agent, seed=seed) for agent in AGENTS for seed in SEEDS]
+
+
+def far(agent: str, seed: int, phase: Phase = "training") -> Progress:
+    return Progress(agent=agent, seed=seed, phase=phase, done=5, work=10, episode=5)
+
+
+def rows(terminal: Terminal) -> dict[int, str]:
+    """What stands in each row below the first: tqdm goes down, writes over the row, and comes up again."""
+    written = re.findall(r"(\n*)\r([^\r\n\x1b]*)", terminal.getvalue())
+    return {len(down): text.rstrip() for down, text in written if down}
+
+
+def test_every_run_that_goes_on_has_a_row_until_another_takes_it_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with ProgressBars(specs()) as show:
+        for seed in SEEDS:
+            show(far("table", seed))
+        at_first = rows(terminal)
+        show(far("table", 1, "done"))
+        after_one = rows(terminal)
+        show(far("random", 0))
+        show(far("random", 1))
+        at_last = rows(terminal)
+    assert [at_first[row].split(":")[0] for row in (1, 2, 3)] == ["table seed 0", "table seed 1", "table seed 2"]
+    assert after_one[2] == "" and after_one[1] and after_one[3]
+    assert [at_last[row].split(":")[0] for row in (2, 4)] == ["random seed 0", "random seed 1"]
+    assert len(at_last) == 4
+    assert not any(rows(terminal).values()), "nothing stays behind"
+
+
+def test_without_a_terminal_the_end_of_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBars(specs()) as show:
+        show(far("table", 0))
+        show(far("table", 0, "done"))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("1 of 6 runs done") and "table seed 0" in line
