@@ -23,7 +23,7 @@ class RegressorSettings(MDNSettings):
         epochs: Passes over the data.
         final_rate: Learning rate of the last epoch as a share of the first's; in between it falls as a cosine
             (Loshchilov & Hutter 2017). 1 keeps it, as the thesis does.
-        batch_size: Rows an update, at most; the thesis names none.
+        batch_size: Rows an update, at most; None for all, as the thesis names none.
         members: Networks of an ensemble, M; 1 is a single network with dropout.
         weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
         divergence_draws: Values drawn from each weight sample's mixture to estimate their divergence.
@@ -31,22 +31,25 @@ class RegressorSettings(MDNSettings):
 
     epochs: int = 3000
     final_rate: float = 1.0
-    batch_size: int = 1000
+    batch_size: int | None = None
     members: int = 1
     weight_samples: int = 50
     divergence_draws: int = 1
 
 
+_BATCH = Deviation(1000, "few epochs want more than one step in each")
 _FALLING = Deviation(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
 
 PRESETS: dict[str, dict[str, Deviation]] = {
     "smoke": {
         "epochs": Deviation(20, "shows that every part works, within a minute"),
+        "batch_size": _BATCH,
         "learning_rate": Deviation(3e-3, "a tenth of the epochs want larger steps"),
         "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
     },
     "quick": {
         "epochs": Deviation(600, "CPU time"),
+        "batch_size": _BATCH,
         "learning_rate": Deviation(3e-3, "a fifth of the epochs want larger steps"),
         "final_rate": _FALLING,
         "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),

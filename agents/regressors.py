@@ -78,12 +78,13 @@ class MixtureRegressor:
         """Train for so many more epochs: in each, every member sees each of its rows once, in an order of its own."""
         self._trained = None
         rows = self._x.shape[1]
+        batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
         owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
         for _ in range(epochs):
             self._model.optimiser.set_learning_rate(self._rate())
             orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._order])
             losses = []
-            for batch in orders.tensor_split(-(-rows // self.settings.batch_size), dim=1):
+            for batch in orders.tensor_split(batches, dim=1):
                 losses.append(self._model.update(self._x[owner, batch], self._y[owner, batch]))
             self._losses.append(float(torch.stack(losses).mean()))
             self._epoch += 1

@@ -177,6 +177,16 @@ def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: 
     assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
 
 
+@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (1, 600)])
+def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
+    data = Dataset(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
+    settings = {"hidden": (4, 4), "components": 2, "batch_size": batch_size}
+    context = RegressorContext(datasets=(data,), seeds=(SeedTree(0),), overrides=settings)
+    regressor = registry.make_regressor("mc_dropout", context)
+    regressor.train(2)
+    assert regressor.state().values["batches"] == 2 * updates
+
+
 def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
     good = Dataset(inputs=np.zeros((5, 1)), targets=np.ones((5, 1)))
     seeds = (SeedTree(0).child("a"), SeedTree(0).child("b"))
