@@ -37,7 +37,7 @@ class RegressorSettings(MDNSettings):
     divergence_draws: int = 1
 
 
-_BATCH = Deviation(1000, "few epochs want more than one step in each")
+_BATCH = Deviation(1000, "where there are more data: few epochs, more steps (all at once was not tried here)")
 _FALLING = Deviation(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
 
 PRESETS: dict[str, dict[str, Deviation]] = {
