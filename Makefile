@@ -15,7 +15,7 @@ READY := $(VENV)/.ready
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo "  Options: TASK=$(TASK) PRESET=smoke|quick|thesis|full ARGS='--seeds 0 1 2 ...' (imagine-bench --help)"
+	@echo "  Options: TASK=$(TASK) PRESET=$(PRESET) ARGS='--seeds 0 1 2 ...' (imagine-bench list; imagine-bench bench --help)"
 
 $(READY): pyproject.toml .ci/setup.sh
 	@.ci/setup.sh $(VENV) $(READY)

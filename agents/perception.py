@@ -7,8 +7,8 @@ from collections import OrderedDict
 import torch
 from torch import Tensor
 
-from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.errors import InvalidValueError, SetupError, require_known
+from imagine_bench.interfaces import DEVICES, AgentContext, Frame
 
 from .allocator import keep_freed_memory
 from .encoder import Encoder
@@ -49,11 +49,10 @@ def prepare_torch(device: str) -> torch.device:
     Denormals make Adam's moments 10 times slower.
 
     Raises:
-        InvalidValueError: No such device name.
+        UnknownNameError: No such device name.
         SetupError: The machine has no such device.
     """
-    if device not in ("cpu", "cuda"):
-        raise InvalidValueError(f"No device {device!r}. Known: cpu, cuda.")
+    require_known("device", device, DEVICES)
     if device == "cuda" and not torch.cuda.is_available():
         raise SetupError("Device 'cuda' was asked for, but torch finds no NVIDIA GPU here; use device 'cpu'.")
     torch.set_num_threads(1)

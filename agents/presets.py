@@ -19,7 +19,7 @@ from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
 from .precision import PRECISIONS, settle
-from .ranges import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, require_ranges
+from .ranges import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
 from .settings import START_STATES, Settings
 from .uncertainty import REDUCTIONS
 
@@ -53,7 +53,7 @@ _RANGES = {
     "imagination.threshold": NOT_NEGATIVE,
     "imagination.threshold_quantile": PROBABILITY,
     "imagination.reward_threshold": NOT_NEGATIVE,
-    "imagination.termination_threshold": PROBABILITY,
+    "imagination.termination_threshold": between(0.0, 0.5, "it bounds the less likely of two"),
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 

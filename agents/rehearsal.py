@@ -94,9 +94,9 @@ class Rehearsal:
         return {**counters, "imagined": self._memory.added}
 
     def arrays(self) -> snapshot.Arrays:
-        """Copies of weights, moments, memory and generator."""
+        """Copies of weights, moments, target network, memory and generator."""
         return {
-            **snapshot.prefixed("controller", self.controller.optimiser.arrays()),
+            **snapshot.prefixed("controller", self.controller.arrays()),
             **snapshot.prefixed("memory", self._memory.arrays()),
             "generator": snapshot.generator_array(self._generator),
         }
@@ -105,6 +105,6 @@ class Rehearsal:
         """Take up the results of :meth:`arrays` and :meth:`values`."""
         self.begin(values["real_step"])
         self.episodes, self.steps = values["episodes"], values["steps"]
-        self.controller.optimiser.load(snapshot.below("controller", arrays))
+        self.controller.load(snapshot.below("controller", arrays))
         self._memory.load(snapshot.below("memory", arrays), values["imagined"])
         snapshot.load_generator(self._generator, arrays["generator"])

@@ -1,7 +1,8 @@
 """Every hyperparameter of the learners, with its unit and its source. The defaults are the thesis' values of chapter 5.
 
 Another chapter's values are a family of settings (:mod:`.chapter_3`). A preset is a list of deviations from a family's
-values, each beside its reason; ``thesis`` and ``full`` deviate in nothing.
+values, each beside its reason; ``thesis`` deviates in nothing, and chapter
+5's ``full`` neither; chapter 3's is its ``quick``.
 """
 
 from __future__ import annotations

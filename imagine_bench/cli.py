@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from imagine_bench import registry
 from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
 from imagine_bench.encoders import bundled
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, require_known
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
@@ -39,7 +38,7 @@ class Bench:
     task: str
     """Task to compare on; 'imagine-bench list' names them."""
     preset: str = "quick"
-    """Size of the comparison: smoke, quick, thesis or full."""
+    """Size of the comparison; 'imagine-bench list' names them."""
     agents: Annotated[tuple[str, ...], _OF_PRESET] = ()
     """Agents to compare."""
     seeds: Annotated[tuple[int, ...], _OF_PRESET] = ()
@@ -189,7 +188,7 @@ class StudyCommand:
     variants: tuple[str, ...] = ()
     """Only these variants and what they are compared with; by default all."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
-    """Runs at a time."""
+    """Processes at a time."""
     launcher: str = "local"
     """Where runs are carried out: local or ray."""
     out: Path = Path("runs")
@@ -221,16 +220,9 @@ class View:
 
     def __call__(self) -> None:
         """Find and open."""
-        path = self.file or newest_recording(self.out)
-        if not path.is_file():
-            raise ArtefactError(f"There is no recording {path}.")
-        print(f"Recording: {path}")
-        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            print(f"There is no display here. Copy the file to a machine with one and run: rerun {path.name}")
-            return
         from imagine_bench.recording import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
-        open_in_viewer(path)
+        open_in_viewer(self.file or newest_recording(self.out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +234,7 @@ class Encoder:
     appearance: str = APPEARANCES[0]
     """Appearance level of the frames."""
     recipe: str = "default"
-    """How it is trained: default or thesis."""
+    """How it is trained: default, thesis, or codes, for agents that read parts and their values."""
     seed: int = 0
     """Seed of data and training."""
     out: Path = Path("encoders")

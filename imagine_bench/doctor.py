@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from packaging.requirements import Requirement
 
 from imagine_bench import registry
-from imagine_bench.environment import commit, gl_renderer, machine, versions
+from imagine_bench.environment import commit, gl_renderer, installed, machine, versions
 from imagine_bench.errors import ImagineBenchError
 
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
@@ -49,7 +50,7 @@ class Examination:
 def examine() -> Examination:
     """Look at versions, GL, threads, GPU and disk; draws a few frames of the first task."""
     found, here = versions(), machine()
-    complaints = unmet_requirements(found)
+    complaints = unmet_requirements()
     gl, frame, gl_complaint = _drawing()
     complaints += [gl_complaint] if gl_complaint else []
     free_gib = shutil.disk_usage(Path.cwd()).free / 2**30
@@ -71,18 +72,18 @@ def examine() -> Examination:
     return Examination(facts=tuple(facts.items()), complaints=tuple(complaints), notes=tuple(notes))
 
 
-def unmet_requirements(found: dict[str, str]) -> list[str]:
-    """A sentence for each package that is missing or not of a version that works.
+def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str]:
+    """A sentence for each package that is missing or not of a version that works; extras are not looked for.
 
     Args:
-        found: Installed versions by package name, ``"missing"`` where there is none.
+        version_of: The installed version of a package, ``"missing"`` where there is none.
     """
     complaints = []
     for text in metadata.requires("imagine-bench") or []:
         wanted = Requirement(text)
-        version = found.get(wanted.name)
-        if version is None or (wanted.marker is not None and not wanted.marker.evaluate({"extra": ""})):
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
             continue
+        version = version_of(wanted.name)
         if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
             state = "is missing" if version == "missing" else f"{version} is installed"
             complaints.append(

@@ -55,12 +55,15 @@ def commit() -> str | None:
 def versions() -> dict[str, str]:
     """Versions of Python, this package and the packages that decide its numbers, read without importing them."""
     found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = "missing"
-    return found
+    return {**found, **{package: installed(package) for package in PACKAGES}}
+
+
+def installed(package: str) -> str:
+    """The version of a package, read without importing it; ``"missing"`` where there is none."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "missing"
 
 
 def machine() -> dict[str, Any]:

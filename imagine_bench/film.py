@@ -16,7 +16,7 @@ from imagine_bench.interfaces import SceneReader
 from imagine_bench.seeding import episode_seed
 
 WIDTH_PX, HEIGHT_PX = 560, 420
-"""Size of the view of the whole scene; the agent's frame stands to its right, a third as high."""
+"""Size of the view of the whole scene; the agent's frame stands to its right, half as high."""
 _EYE_PX = 210
 _FPS = 10
 _HOLD = 8

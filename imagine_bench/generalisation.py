@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench import statistics
+from imagine_bench.calibration import auroc
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome, TaskSpec
@@ -165,7 +165,7 @@ def summarise(probe: Probing, answers: Answers) -> Generalisation:
         unseen=float(right[terminal].mean()),
         unseen_legal=float(right[legal_ends].mean()) if legal_ends.any() else float("nan"),
         seen=float(right[~terminal].mean()),
-        auroc=statistics.auroc(answers.epistemic[terminal], answers.epistemic[~terminal]),
+        auroc=auroc(answers.epistemic, terminal),
         consequences=_by_consequence(probe, answers),
     )
 

@@ -127,7 +127,9 @@ def _detection(correct: NDArray[np.bool_], answers: list[ImaginedRollout]) -> di
     return found
 
 
-def examples(agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree) -> tuple[ComparedRollout, ...]:
+def examples(
+    agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
+) -> tuple[ComparedRollout, ...]:
     """A handful of rollouts the greedy controller chooses, each beside its real counterpart.
 
     Args:
@@ -135,8 +137,9 @@ def examples(agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTre
         spec: The task; the starts are the same for every agent and seed.
         appearance: Appearance level of the real frames (kinematic mode).
         seeds: Names the generators that imagination draws from.
+        purpose: What the starts are drawn for.
     """
-    rng = SeedTree(0).child("evaluation", "examples", spec.id).generator()
+    rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
     known = len(spec.rules.start_states)
     picks = rng.choice(known, size=EXAMPLES, replace=known < EXAMPLES)
     states = np.array([spec.rules.start_states[index] for index in picks], dtype=np.int64)
@@ -160,7 +163,7 @@ def is_random(rules: Rules) -> bool:
 
 
 def imagine_courses(
-    agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree
+    agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
 ) -> tuple[ComparedRollout, ...]:
     """Imagine the same beginning several times, the agent's greedy controller choosing; none if nothing is random.
 
@@ -169,10 +172,11 @@ def imagine_courses(
         spec: The task; the beginning is the same for every agent and seed.
         appearance: Appearance level of the real frame (kinematic mode).
         seeds: Names the generators that imagination draws from.
+        purpose: What the beginning is drawn for.
     """
     if not is_random(spec.rules):
         return ()
-    rng = SeedTree(0).child("evaluation", "courses", spec.id).generator()
+    rng = SeedTree(0).child(purpose, "courses", spec.id).generator()
     start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
     frame = spec.render_macrostates(start[None], appearance, rng)[0]
     return courses_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)

@@ -184,7 +184,9 @@ def fewest_actions(rules: Rules, start: State) -> int:
 def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     """Why a plan must not be carried out, or an empty string."""
     doubt = rollout.epistemic
-    if max_epistemic is not None and float(doubt.max()) > max_epistemic:
+    if max_epistemic is not None:
+        if float(doubt.max()) <= max_epistemic:
+            return ""
         step = int((doubt > max_epistemic).argmax())
         return f"epistemic uncertainty {doubt[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
     if not rollout.accepted.all():

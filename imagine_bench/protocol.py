@@ -12,7 +12,7 @@ from typing import Any, Self
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.registry import agent_entry, task, task_entry
-from imagine_bench.seeding import TUNING_SEEDS, tunes
+from imagine_bench.seeding import SEEDS, TUNING_SEEDS, tunes
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -120,8 +120,7 @@ class Protocol(ProtocolData):
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)
-        require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
-        require_unmixed(self.seeds)
+        require_seeds(self.seeds)
         if not self.agents or len(set(self.agents)) != len(self.agents):
             raise InvalidValueError(f"agents {self.agents} must be at least one name, none of them twice.")
         if self.evaluation_episodes < 1:
@@ -131,10 +130,9 @@ class Protocol(ProtocolData):
             raise InvalidValueError(
                 f"after_episodes is {self.after_episodes} with after {self.after}; give at least 1, and the tasks."
             )
-        if self.demonstrations < 0:
-            raise InvalidValueError(f"demonstrations is {self.demonstrations}; give at least 0 episodes.")
-        if self.questions < 0:
-            raise InvalidValueError(f"questions is {self.questions}; give at least 0, the most in one episode.")
+        for name in ("demonstrations", "questions", "open_loop_starts", "sampled_futures", "recorded_episodes"):
+            if getattr(self, name) < 0:
+                raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least 0.")
 
     def work(self, agent: str, until: int | None = None) -> int:
         """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
@@ -245,8 +243,11 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
                 )
 
 
-def require_unmixed(seeds: tuple[int, ...]) -> None:
-    """Raise InvalidValueError for tuning seeds among reported ones."""
+def require_seeds(seeds: tuple[int, ...]) -> None:
+    """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
+    require_ascending("seeds", tuple(sorted(seeds)), at_least=0)
+    if max(seeds) >= SEEDS:
+        raise InvalidValueError(f"seeds {seeds} must be below 2**24 = {SEEDS}.")
     if len({tunes(seed) for seed in seeds}) > 1:
         raise InvalidValueError(
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "

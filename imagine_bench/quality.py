@@ -13,12 +13,13 @@ from imagine_bench.environment import describe_environment
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.generalisation import answer, probing, summarise
 from imagine_bench.interfaces import EXECUTIONS
+from imagine_bench.kinds import kind_of
 from imagine_bench.plans import make_plans
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import plan_table, write_plans
 from imagine_bench.seeding import SeedTree, exam
 from imagine_bench.store import load_bench, newest_bench
-from imagine_bench.trained import Trained, best_run, imagining, load_trained
+from imagine_bench.trained import Trained, best_run, imagining, load_trained, require_control
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -57,7 +58,7 @@ def plan_report(
     if recorded < 0 or count < 1:
         raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
     if run is None:
-        run = best_run(load_bench(newest_bench(root, _known(task)))).folder
+        run = best_run(load_bench(newest_bench(root, _control(task)))).folder
     trained = load_trained(run, encoder=encoder)
     plans = list(
         tqdm(
@@ -98,7 +99,8 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     Raises:
         ImagineBenchError: No bench, or none that imagines.
     """
-    result = load_bench(folder or newest_bench(root, _known(task)))
+    result = load_bench(folder or newest_bench(root, _control(task)))
+    require_control(result.protocol.task, result.folder)
     protocol = result.protocol
     spec = registry.task(protocol.task)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
@@ -114,10 +116,13 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     return "\n".join([head, "", generalisation_table(asked, probe, spec), "", f"Answers:    {where}"])
 
 
-def _known(task: str | None) -> str | None:
-    if task is not None:
-        registry.task_entry(task)
-    return task
+def _control(task: str | None) -> tuple[str, ...]:
+    """The tasks whose newest bench is meant; regressors neither plan nor imagine transitions."""
+    if task is None:
+        return tuple(registry.TASKS)
+    kind_of(task)  # knows every name
+    require_control(task, Path(task))
+    return (task,)
 
 
 def _title(trained: Trained) -> str:

@@ -40,6 +40,7 @@ class AgentEntry:
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
         settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
+        trains_itself: Whether it is a :class:`.capabilities.SelfTrainer`, whose run cannot rest before its end.
     """
 
     make: str
@@ -48,6 +49,7 @@ class AgentEntry:
     encoder_kind: str = "latents"
     settings: str = "imagine_bench.agents.presets"
     privileged: bool = False
+    trains_itself: bool = False
 
 
 TASKS: dict[str, TaskEntry] = {
@@ -97,13 +99,21 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.imagine.settings",
     ),
     "sb3_dqn": AgentEntry(
-        make="imagine_bench.agents.peers:make_dqn", needs_encoder=False, settings="imagine_bench.agents.peer_settings"
+        make="imagine_bench.agents.peers:make_dqn",
+        needs_encoder=False,
+        settings="imagine_bench.agents.peer_settings",
+        trains_itself=True,
     ),
     "sb3_qrdqn": AgentEntry(
-        make="imagine_bench.agents.peers:make_qrdqn", needs_encoder=False, settings="imagine_bench.agents.peer_settings"
+        make="imagine_bench.agents.peers:make_qrdqn",
+        needs_encoder=False,
+        settings="imagine_bench.agents.peer_settings",
+        trains_itself=True,
     ),
     "sb3_dqn_latents": AgentEntry(
-        make="imagine_bench.agents.peers:make_dqn", settings="imagine_bench.agents.peer_settings"
+        make="imagine_bench.agents.peers:make_dqn",
+        settings="imagine_bench.agents.peer_settings",
+        trains_itself=True,
     ),
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
     "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),

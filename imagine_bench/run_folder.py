@@ -11,6 +11,7 @@ import csv
 import dataclasses
 import io
 import json
+import shutil
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -86,6 +87,12 @@ def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
         values = [getattr(row, name) for name in (*_INTEGERS, *_NUMBERS)]
         table.writerow([*values, *(row.diagnostics.get(name, "") for name in names)])
     write_bytes(folder / _METRICS, text.getvalue().encode())
+
+
+def forget(folder: Path) -> None:
+    """Remove the results and checkpoints of an unfinished run, which begins anew."""
+    (folder / _METRICS).unlink(missing_ok=True)
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
 
 
 def finish(

@@ -84,8 +84,9 @@ class _Run:
             require_able(self.agent, spec.agent, spec.protocol)
         self.counters = Counters()
         run_folder.check_config(folder, self._config())
-        by_itself = isinstance(self.agent, SelfTrainer)
-        snapshot = None if by_itself else load_newest(folder / "checkpoints")
+        if self.entry.trains_itself:
+            run_folder.forget(folder)  # an earlier attempt cannot be gone on with
+        snapshot = load_newest(folder / "checkpoints")
         if snapshot is not None:
             self.agent.restore(snapshot.agent)
             self.counters = Counters.of(snapshot)
@@ -281,10 +282,12 @@ class _Run:
         if not isinstance(self.agent, Imaginer):
             return (), ()
         self._tell("imagining", at_once=True)
-        appearance = self.spec.protocol.appearance
+        appearance, purpose = self.spec.protocol.appearance, exam(self.spec.seed)
         return (
-            examples(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("examples")),
-            imagine_courses(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("courses")),
+            examples(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("examples"), purpose=purpose),
+            imagine_courses(
+                self.agent, self.task, appearance=appearance, seeds=self.seeds.child("courses"), purpose=purpose
+            ),
         )
 
     def _record(self) -> None:

@@ -18,6 +18,8 @@ Purpose = Literal[
 ]
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
 _SEED_BITS, _EPISODE_BITS = 24, 32
+SEEDS = 1 << _SEED_BITS
+"""Seeds of runs lie below."""
 TUNING_SEEDS = 1000
 """Runs with a seed from here on are for choosing settings; reported runs have smaller ones."""
 
@@ -83,7 +85,7 @@ def episode_seed(purpose: Purpose, seed: int, episode: int) -> int:
         InvalidValueError: A number out of range.
     """
     require_known("seed purpose", purpose, _PURPOSES)
-    if not (0 <= seed < 1 << _SEED_BITS and 0 <= episode < 1 << _EPISODE_BITS):
+    if not (0 <= seed < SEEDS and 0 <= episode < 1 << _EPISODE_BITS):
         raise InvalidValueError(
             f"seed {seed} and episode {episode} must lie in [0, 2**{_SEED_BITS}) and [0, 2**{_EPISODE_BITS})."
         )

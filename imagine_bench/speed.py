@@ -209,7 +209,7 @@ def _kinematic(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
     assert isinstance(scene, SceneReader)
 
     def thousand_steps() -> None:
-        for action in actions:  # ends by rule are ignored: every call is a step, none a reset
+        for action in actions:  # ends by rule are ignored, only the time limit resets
             *_, truncated, _ = env.step(action)
             if truncated:
                 env.reset()

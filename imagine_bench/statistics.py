@@ -193,20 +193,6 @@ def gain(
     return Estimate(value, *_percentiles(draws[~np.isnan(draws)], level))
 
 
-def auroc(positive: ArrayLike, negative: ArrayLike) -> float:
-    """Area under the ROC curve: the probability that a positive's score is above a negative's; a tie counts half.
-
-    Args:
-        positive: Scores of what is to be found. Shape (P,).
-        negative: Scores of the rest. Shape (N,).
-
-    Raises:
-        InvalidValueError: A side is empty or not finite.
-    """
-    ours, theirs = _finite("positive scores", positive).ravel(), _finite("negative scores", negative).ravel()
-    return float(stats.mannwhitneyu(ours, theirs).statistic) / (ours.size * theirs.size)
-
-
 def _summary(draws: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:
     """The statistic of each row: (resamples, scores) to (resamples,)."""
     if statistic == "mean":

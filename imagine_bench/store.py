@@ -7,6 +7,7 @@ overwritten by another protocol, for its hash is in the name.
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -130,19 +131,21 @@ def bench_facts(folder: Path) -> dict[str, Any]:
     return {"environment": environment, "folder": folder, "wall_s": sum(sitting["wall_s"] for sitting in sittings)}
 
 
-def newest_bench(root: Path, task: str | None = None) -> Path:
-    """The bench folder below ``root`` that was worked on last, of any task or of one.
+def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
+    """The bench folder below ``root`` that was worked on last, of any task or of some.
 
     Raises:
         ArtefactError: There is none.
     """
-    found = sorted(root.glob(f"{task or '*'}/*/{_SITTINGS}"), key=lambda path: path.stat().st_mtime)
+    found = [path for path in root.glob(f"*/*/{_SITTINGS}") if not tasks or path.parts[-3] in tasks]
     if not found:
-        where = f"{root / task if task else root}"
+        some = next(iter(tasks), "arrow_puzzle")
+        where = root / some if len(tasks) == 1 else root
         raise ArtefactError(
-            f"There is no bench below {where}; run one with 'imagine-bench bench --task {task or 'arrow_puzzle'}'."
+            f"There is no {'such ' if tasks else ''}bench below {where}; "
+            f"run one with 'imagine-bench bench --task {some}'."
         )
-    return found[-1].parent
+    return max(found, key=lambda path: path.stat().st_mtime).parent
 
 
 def newest_recording(root: Path) -> Path:

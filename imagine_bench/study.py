@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import statistics
-from imagine_bench.bench import bench, plan
+from imagine_bench.bench import Encoders, bench, plan
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.launchers import Launcher
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, tunes
@@ -155,7 +155,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     )
 
 
-def _plan(study: Study, task: str, variant: Variant) -> tuple[Any, Path | None]:
+def _plan(study: Study, task: str, variant: Variant) -> tuple[Any, Encoders]:
     return plan(
         task,
         "quick",

@@ -59,10 +59,11 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
         encoder: Bundled name or path, where the run used an encoder that is not bundled.
 
     Raises:
-        ArtefactError: No run, no checkpoint, another encoder, or a snapshot that does not fit this version.
+        ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
         UnknownNameError: No such encoder.
     """
     config = read_json(folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
+    require_control(config["protocol"]["task"], folder)
     protocol = Protocol.from_dict(config["protocol"])
     spec = RunSpec(
         protocol=protocol,
@@ -78,6 +79,14 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
     agent.restore(snapshot.agent)
     return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
+
+
+def require_control(task: str, folder: Path) -> None:
+    """Raise ArtefactError for what is left of a task in which nothing is done, so that nothing can be planned."""
+    if task not in registry.TASKS:
+        raise ArtefactError(
+            f"{folder} is of a regression task, and no transitions are imagined there; give one of agents."
+        )
 
 
 def imagining(result: BenchResult) -> tuple[RunResult, ...]:

@@ -194,8 +194,6 @@ SPEC = RegressionSpec(
         "A planar arm of three links moves at random and sees where its tip ends; from that it learns which joint "
         "angles lead to a place. Then it may choose one of 20 places to reach for: does it choose one it can reach?"
     ),
-    input_names=("x1 (m)", "x2 (m)"),
-    output_names=("q1 (rad)", "q2 (rad)", "q3 (rad)"),
     variants=("1000", "2000", "3000"),
     require_variant=require_variant,
     training=training,

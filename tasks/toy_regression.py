@@ -127,8 +127,6 @@ SPEC = RegressionSpec(
         "A number x leads to one of three curves, plus noise; the variants take data away in a region, or add noise "
         "there. What is uncertain, and why, is known exactly, so it can be seen whether a model knows it too."
     ),
-    input_names=("x",),
-    output_names=("y",),
     variants=VARIANTS,
     require_variant=require_variant,
     training=training,

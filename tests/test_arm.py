@@ -5,8 +5,8 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.scenes.arm import ARM_GEOM_GROUP, ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, arm_root
-from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, OBSERVATION_QPOS_RAD
+from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, arm_root
+from imagine_bench.tasks.scenes.constants import ARM_GROUP, HOME_QPOS_RAD, OBSERVATION_QPOS_RAD
 
 # RethinkRobotics/sawyer_robot, sawyer_base.urdf.xacro, commit 2fe61d9: origin xyz (m) and rpy (rad), limits (rad),
 # effort (N m), speed (rad/s), mass (kg), centre of mass (m) and inertia xx yy zz xy xz yz (kg m2) per joint and link.
@@ -126,7 +126,7 @@ def test_arm_carries_itself(model):
 def test_only_the_fingertips_touch(model):
     touching = {model.geom(index).name for index in range(model.ngeom) if model.geom_contype[index]}
     assert touching == {f"finger_{side}_tip_{end}" for side in ("left", "right") for end in ("front", "back")}
-    assert set(model.geom_group) == {ARM_GEOM_GROUP}
+    assert set(model.geom_group) == {ARM_GROUP}
 
 
 def test_wrist_camera_sees_the_human_above_and_right_at_the_right(model):

@@ -75,7 +75,7 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         (["report", "--out", str(tmp_path)], "There is no bench below"),
         (["report", str(tmp_path)], "protocol.json is not a bench's protocol"),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
-        (["view", str(tmp_path / "x.rrd")], "There is no recording"),
+        (["view", str(tmp_path / "x.rrd")], "No recording"),
         (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
     ):
         assert main(words) == 2

@@ -16,7 +16,6 @@ from imagine_bench.generalisation import Probing, answer, consequence, probing, 
 from imagine_bench.interfaces import Frame, Outcome, TaskSpec
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.seeding import SeedTree
-from imagine_bench.statistics import auroc
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +102,6 @@ def test_a_task_without_terminal_macrostates_says_so(spec: TaskSpec) -> None:
     endless = dataclasses.replace(spec, id="endless", rules=Endless())  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="'endless' has no terminal macrostates in its rules"):
         probing(endless, appearance="clean")
-
-
-def test_area_under_the_curve_by_hand() -> None:
-    assert auroc([3.0, 1.0], [2.0, 0.0]) == 0.75  # of four pairs, (1, 2) is the wrong way round
-    assert auroc([1.0], [1.0]) == 0.5
-    with pytest.raises(InvalidValueError, match="negative scores must hold at least one number"):
-        auroc([1.0], [])
 
 
 def test_table_and_files(spec: TaskSpec, probe: Probing, tmp_path: Path) -> None:

@@ -101,13 +101,16 @@ def test_rehearsing_twice_from_the_same_experience_gives_the_same_bits(monkeypat
     assert all(np.array_equal(first[name], second[name]) for name in first if name.startswith("rehearsal/"))
 
 
-def test_an_interrupted_rehearsal_goes_on_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = make(monkeypatch)
+@pytest.mark.parametrize("rate", [1.0, 0.1])
+def test_an_interrupted_rehearsal_goes_on_to_the_same_bits(monkeypatch: pytest.MonkeyPatch, rate: float) -> None:
+    """With a target network and without."""
+    overrides = {"controller.target_rate": rate}
+    agent = make(monkeypatch, **overrides)
     live(agent, range(5), np.random.default_rng(0))
     assert rehearse(agent, 3) == 3
     saved = copy.deepcopy(agent.state())
     assert rehearse(agent) == 5
-    resumed = make(monkeypatch)
+    resumed = make(monkeypatch, **overrides)
     resumed.restore(saved)
     assert rehearse(resumed) == 5
     one, other = agent.state().arrays, resumed.state().arrays

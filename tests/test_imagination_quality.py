@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.imagination_quality import EXAMPLES, Question, ask, examples, open_loop
 from imagine_bench.interfaces import Outcome, TaskSpec
-from imagine_bench.seeding import SeedTree
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, exam
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +128,14 @@ def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
         assert np.array_equal(one.real_frames, other.real_frames)
         assert one.real_frames.shape == (10, 64, 64, 3) and one.real_macrostates.shape == (10, 4)
         assert one.real_terminated[-1]  # always turning the left cube ends in two arrows alike
+
+
+def test_examples_of_a_run_that_tunes_begin_elsewhere(spec: TaskSpec) -> None:
+    agent = bench_fakes.RulesImaginer(context())
+    reported, tuning = (
+        examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=exam(seed)) for seed in (0, TUNING_SEEDS)
+    )
+    assert [e.start_macrostate.tolist() for e in reported] != [e.start_macrostate.tolist() for e in tuning]
 
 
 class _Coin:

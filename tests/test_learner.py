@@ -14,7 +14,7 @@ from imagine_bench.agents import dqn, imagination_agents, imagination_only
 from imagine_bench.agents.learner import Learner
 
 from imagine_bench.capabilities import Imaginer, ValueReader
-from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError
+from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.seeding import SeedTree
 
@@ -254,7 +254,7 @@ def test_a_context_that_cannot_work_is_one_clear_error(monkeypatch: pytest.Monke
             InvalidValueError,
             "reads frames as 'gray_strips', the task declares 'whole_rgb'",
         ),
-        ({"device": "tpu"}, InvalidValueError, "No device 'tpu'. Known: cpu, cuda"),
+        ({"device": "tpu"}, UnknownNameError, "No device 'tpu'. Did you mean 'cpu'? Known: cpu, cuda"),
     ):
         with pytest.raises(error, match=message):
             dqn.make(context(monkeypatch, **changes))

@@ -11,7 +11,8 @@ import pytest
 from test_runner import same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
-from imagine_bench import encoders, registry, runner
+from imagine_bench import encoders, registry, run_folder, runner
+from imagine_bench.capabilities import SelfTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.evaluation import TrainingStarts
 from imagine_bench.interfaces import AgentState
@@ -65,9 +66,22 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(runner.run_folder, "finish", killed)
         do(tmp_path / "run")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runner.Tally, "add_episode", killed)
+        do(tmp_path / "run")
+    assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
     assert same_but_for_time(whole, do(tmp_path / "run"))
     other = do(tmp_path / "other", seed=1)
     assert whole.training_length.tolist() != other.training_length.tolist()
+
+
+def test_the_registry_knows_which_agents_train_themselves() -> None:
+    for name, entry in registry.AGENTS.items():
+        if entry.settings == "imagine_bench.agents.peer_settings":
+            agent = registry.make_agent(name, spec(name).context())
+            assert isinstance(agent, SelfTrainer) and entry.trains_itself
+        else:
+            assert not entry.trains_itself
 
 
 def test_its_episodes_start_where_every_agent_of_that_seed_starts() -> None:

@@ -140,6 +140,12 @@ def test_a_doubted_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[s
     assert summarise([plan]).refused == 1
 
 
+def test_a_bound_on_uncertainty_replaces_the_agents_own_filter() -> None:
+    dreamer = Dreamer(choose=TASK.rules.optimal_action, doubt=0.9, accepts=False)
+    (refused,), (carried,) = carried_out(dreamer, 1), carried_out(dreamer, 1, max_epistemic=1.0)
+    assert refused.refused and not carried.refused and carried.solved
+
+
 def test_the_starts_are_the_same_for_every_agent_and_others_for_tuning() -> None:
     def starts(seed: int) -> list[State]:
         dreamer = Dreamer(choose=lambda state: 0)

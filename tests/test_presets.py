@@ -145,6 +145,7 @@ def test_an_unknown_preset_lists_what_exists() -> None:
         ("imagination.reduction", "median", "No uncertainty reduction 'median'"),
         ("imagination.depth", 0, "imagination.depth is 0; it must be at least 1"),
         ("imagination.temperature", float("nan"), "imagination.temperature is nan; it must be at least 0"),
+        ("imagination.termination_threshold", 0.9, r"is 0.9; it must lie in \[0, 0.5\]: it bounds the less likely"),
         ("memory.real", -5, "memory.real is -5; it must be at least 1"),
     ],
 )

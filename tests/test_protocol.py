@@ -106,7 +106,10 @@ def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_wo
         ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
         ({"seeds": (1, 1)}, InvalidValueError, "seeds"),
         ({"seeds": (999, 1000)}, InvalidValueError, "mix tuning seeds .from 1000 on"),
+        ({"seeds": (2**24,)}, InvalidValueError, r"must be below 2\*\*24"),
         ({"evaluation_episodes": 0}, InvalidValueError, "evaluation_episodes is 0"),
+        ({"open_loop_starts": -1}, InvalidValueError, "open_loop_starts is -1; give at least 0"),
+        ({"recorded_episodes": -1}, InvalidValueError, "recorded_episodes is -1; give at least 0"),
     ],
 )
 def test_bad_fields_say_what_is_allowed(changes, error, message):

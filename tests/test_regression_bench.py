@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,15 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.kinds import KINDS
-from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext
+from imagine_bench.quality import generalisation_report
+from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext, runner
 from imagine_bench.regression.results import RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report import regression as page
 from imagine_bench.report import robot_ik, toy_regression
 from imagine_bench.runs import Progress, RunSpec
 from imagine_bench.seeding import SeedTree
+from imagine_bench.trained import load_trained
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 
@@ -98,9 +101,39 @@ def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) ->
     for mine, theirs in zip(whole.rows, parts.rows, strict=True):
         for name in set(mine) - {"train_cpu_s", "measure_cpu_s"}:
             assert mine[name] == theirs[name] or (np.isnan(mine[name]) and np.isnan(theirs[name])), name
+    assert list(parts.evaluations) == list(whole.evaluations) == list(spec.protocol.variants)
     for variant, arrays in whole.evaluations.items():
         for name, array in arrays.items():
             np.testing.assert_array_equal(array, parts.evaluations[variant][name], err_msg=name)
+
+
+def test_a_checkpoint_gives_the_variants_back_in_the_order_of_the_protocol(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of arrays has no order; recordings and figures do."""
+    spec = tiny("toy_regression", variants=("base", "low_data", "high_noise"), recorded=False)
+
+    def observe(progress: Progress) -> None:
+        if progress.detail.startswith("high_noise"):
+            raise _Killed
+
+    with pytest.raises(_Killed):
+        run(spec, tmp_path / "run", observe)
+    load = runner.load_newest
+
+    def other_order(folder: Path) -> Any:
+        found = load(folder)
+        return replace(found, arrays=dict(sorted(found.arrays.items(), reverse=True)))
+
+    monkeypatch.setattr(runner, "load_newest", other_order)
+    assert list(run(spec, tmp_path / "run", silent).evaluations) == ["base", "low_data", "high_noise"]
+
+
+def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="is of a regression task, and no transitions are imagined there"):
+        load_trained(toy.folder)
+    with pytest.raises(ArtefactError, match="toy_regression is of a regression task"):
+        generalisation_report(None, root=tmp_path, task="toy_regression", encoder=None)
 
 
 def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:

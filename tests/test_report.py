@@ -9,6 +9,7 @@ import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.protocol import Protocol
 from imagine_bench.report import plots, summary_table, words, write_report
 from imagine_bench.report.data import collect
+from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.words import percent, signed_percent
 from imagine_bench.results import BenchResult
 
@@ -305,6 +307,24 @@ def test_learning_cost_counts_every_step(result: BenchResult) -> None:
     assert timing.env_steps == 3 * 6000
     assert timing.learner_cpu_s == pytest.approx(0.022 * 3 * 6000)
     assert math.isnan(collect(result).timing["random"].learner_cpu_s)
+
+
+def test_the_one_test_of_an_agent_that_does_not_learn_is_counted_once(result: BenchResult) -> None:
+    timing, runs = collect(result).timing, result.of("random")
+    assert timing["random"].faults == sum(run.checkpoints[0].faults for run in runs)
+    assert timing["random"].eval_cpu_s == pytest.approx(np.mean([run.checkpoints[0].eval_cpu_s for run in runs]))
+    every = [row for run in result.of("dqn") for row in run.checkpoints]
+    assert timing["dqn"].faults == sum(row.faults for row in every)
+
+
+def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult) -> None:
+    both = dataclasses.replace(
+        result.protocol, agents=("random", "dqn", "imagine"), encoder="a@0123456789ab", codes="b@0123456789ab"
+    )
+    views = encoder_views(SimpleNamespace(protocol=both))  # type: ignore[arg-type]
+    assert [(view.identity, view.agents) for view in views] == [
+        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("imagine",)),
+    ]  # fmt: skip
 
 
 def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) -> None:

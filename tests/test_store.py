@@ -83,6 +83,8 @@ def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
 def test_no_bench_and_no_recording(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="There is no bench below"):
         newest_bench(tmp_path)
+    with pytest.raises(ArtefactError, match=r"no such bench below .*robot_ik; run one with .* --task robot_ik"):
+        newest_bench(tmp_path, ("robot_ik",))
     with pytest.raises(ArtefactError, match="There is no recording below"):
         newest_recording(tmp_path)
 

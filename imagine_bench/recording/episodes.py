@@ -117,6 +117,7 @@ def open_in_viewer(path: Path) -> None:
             f"No display here to open {path}; copy it to a machine with one and run 'rerun {path.name}' there, "
             f"or run 'rerun --serve-web {path}' here and open the address it prints."
         )
+    print(f"Recording: {path}")
     subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
 
 

@@ -188,8 +188,6 @@ class RegressionSpec:
         id: Registry name.
         title: A few words for headings.
         description: Two sentences for a reader of the report.
-        input_names: With units. Length X.
-        output_names: With units. Length D.
         variants: The variants of the thesis, in its order.
         require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
         training: Data of a variant, drawn from a generator.
@@ -208,8 +206,6 @@ class RegressionSpec:
     id: str
     title: str
     description: str
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
     variants: tuple[str, ...]
     require_variant: Callable[[str], None]
     training: Callable[[str, np.random.Generator], Dataset]

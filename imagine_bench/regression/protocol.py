@@ -9,7 +9,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.protocol import ProtocolData, digest, require_ascending, require_unmixed
+from imagine_bench.protocol import ProtocolData, digest, require_seeds
 
 _SETTINGS = "imagine_bench.agents.regressor_settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
@@ -60,8 +60,7 @@ class RegressionProtocol(ProtocolData):
             if not values or len(set(values)) != len(values):
                 raise InvalidValueError(f"{name} {values} must be at least one name, none of them twice.")
         require_known("device", self.device, DEVICES)
-        require_ascending("seeds", tuple(sorted(self.seeds)), at_least=0)
-        require_unmixed(self.seeds)
+        require_seeds(self.seeds)
         for name, value, low, high in (
             ("networks", self.networks, 1, 1000),
             ("test_points", self.test_points, 2, 10**5),

@@ -61,7 +61,8 @@ class _Run:
         self.snapshot = load_newest(folder / "checkpoints")
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
-            self.evaluations = run_folder.grouped(self.snapshot.arrays)
+            found = run_folder.grouped(self.snapshot.arrays)  # files give arrays back in any order
+            self.evaluations = {variant: found[variant] for variant in self.protocol.variants if variant in found}
         self.saved_s = time.monotonic()
 
     def to_the_end(self) -> None:

@@ -51,7 +51,7 @@ class Comparison:
 
     Attributes:
         difference: Difference of the interquartile means of the success shares, with its 95 % interval.
-        gain: (P_aug - P_base) / P_base of the means, paired by seed, with its interval.
+        gain: (P_aug - P_base) / P_base of the means over seeds, with its interval.
         thesis_gain: The thesis' gain at this budget, or None.
     """
 
@@ -168,7 +168,7 @@ def collect(result: BenchResult) -> ReportData:
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
         reached={agent: _reached(result.of(agent), spec.mastery) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
-        timing={agent: _timing(result.of(agent)) for agent in agents},
+        timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
         thesis_random=reference.random_success(spec.reference) if spec.reference else None,
@@ -380,13 +380,14 @@ def _areas(result: BenchResult, agent: str, chance_level: float) -> dict[int, st
     }
 
 
-def _timing(runs: tuple[RunResult, ...]) -> Timing:
-    tests = [checkpoint for run in runs for checkpoint in run.checkpoints]
+def _timing(runs: tuple[RunResult, ...], *, learns: bool) -> Timing:
+    """What runs of one agent cost; the one test of an agent that does not learn stands at every budget."""
+    tests = [checkpoint for run in runs for checkpoint in (run.checkpoints if learns else run.checkpoints[:1])]
     last = [run.checkpoints[-1] for run in runs]
     return Timing(
         train_cpu_s=float(np.mean([checkpoint.train_cpu_s for checkpoint in last])),
         learner_cpu_s=float(np.mean([_learner_cpu_s(run) for run in runs])),
-        eval_cpu_s=float(np.mean([sum(checkpoint.eval_cpu_s for checkpoint in run.checkpoints) for run in runs])),
+        eval_cpu_s=sum(checkpoint.eval_cpu_s for checkpoint in tests) / len(runs),
         env_steps=float(np.mean([checkpoint.env_steps for checkpoint in last])),
         test_steps=round(sum(checkpoint.mean_length * checkpoint.test_episodes for checkpoint in tests)),
         faults=sum(checkpoint.faults for checkpoint in tests),

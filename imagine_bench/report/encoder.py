@@ -1,4 +1,4 @@
-"""The card of the encoder that a bench used, as the report shows it."""
+"""The cards of the encoders that a bench used, as the report shows them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imagine_bench import encoders
+from imagine_bench import encoders, registry
 from imagine_bench.files import read_json
 from imagine_bench.results import BenchResult
 
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderView:
-    """What the report knows of the encoder.
+    """What the report knows of an encoder.
 
     Attributes:
+        agents: Those that see through it.
         identity: As in the protocol: name and beginning of the digest.
         card: The card's contents; empty where the file is not among the bundled ones.
         picture: Real and reconstructed frames, a PNG file, or None.
     """
 
+    agents: tuple[str, ...]
     identity: str
     card: dict[str, Any]
     picture: Path | None
+
+    @property
+    def file(self) -> str:
+        """What the picture's copy is called beside the report."""
+        return f"encoder-{self.identity.partition('@')[0]}.png"
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -42,25 +49,33 @@ _NAMES = {
 _HIDDEN = {"format", "cardinalities"}
 
 
-def encoder_view(result: BenchResult) -> EncoderView | None:
-    """The encoder's card and picture, found beside the bundled artefact of the same content; None if none was used.
+def encoder_views(result: BenchResult) -> list[EncoderView]:
+    """Card and picture of every encoder used, found beside the bundled artefact of the same content.
 
     Raises:
-        ArtefactError: The bundled card is damaged.
+        ArtefactError: A bundled card is damaged.
     """
-    identity = result.protocol.encoder
-    if identity is None:
-        return None
+    readers: dict[str, list[str]] = {}
+    for agent in result.protocol.agents:
+        entry = registry.agent_entry(agent)
+        identity = result.protocol.encoder_of(entry.encoder_kind)
+        if entry.needs_encoder and identity is not None:
+            readers.setdefault(identity, []).append(agent)
+    return [_view(identity, tuple(agents)) for identity, agents in readers.items()]
+
+
+def _view(identity: str, agents: tuple[str, ...]) -> EncoderView:
     for path in encoders.bundled().values():
         if encoders.identity(path) == identity:
             card = path.with_suffix(".json")
             picture = path.with_suffix(".png")
             return EncoderView(
+                agents=agents,
                 identity=identity,
                 card=read_json(card, "an encoder's card") if card.is_file() else {},
                 picture=picture if picture.is_file() else None,
             )
-    return EncoderView(identity=identity, card={}, picture=None)
+    return EncoderView(agents=agents, identity=identity, card={}, picture=None)
 
 
 def _rows(name: str, key: str, value: Any) -> list[tuple[str, str]]:

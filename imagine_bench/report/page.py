@@ -15,7 +15,7 @@ from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.pictures import first_cut, png, rollout_strip
 from imagine_bench.report import plots, words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
-from imagine_bench.report.encoder import encoder_view
+from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.sections import Picture
 from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
@@ -39,19 +39,18 @@ def write_report(result: BenchResult) -> Path:
     data = collect(result)
     drawn = plots.all_plots(data)
     strips, courses = _strips(data), _courses(data)
-    encoder = encoder_view(result)
-    picture = encoder.picture.read_bytes() if encoder and encoder.picture else b""
+    seen_through = encoder_views(result)
+    shown = [(each, each.picture.read_bytes()) for each in seen_through if each.picture]
     context = {
         **_words(data),
         "plots": {plot.name: plot for plot in drawn},
         "strips": strips,
         "courses": courses,
-        "encoder": encoder,
-        "encoder_picture": base64.b64encode(picture).decode(),
+        "encoders": seen_through,
+        "encoder_pictures": {each.identity: base64.b64encode(picture).decode() for each, picture in shown},
     }
     files = {f"{each.name}.png": each.png for each in (*drawn, *strips, *courses)}
-    if picture:
-        files["encoder.png"] = picture
+    files |= {each.file: picture for each, picture in shown}
     files["results.csv"] = results_csv(result).encode()
     if data.open_loop:
         files["open_loop.csv"] = open_loop_csv(result).encode()

@@ -207,24 +207,14 @@ def _thesis_points(axes: Axes, data: ReportData) -> None:
     for agent, rows in data.thesis.items():
         episodes = np.array(list(rows))
         means, stds = 100.0 * np.array(list(rows.values())).T
-        axes.errorbar(
-            *(episodes, means, stds), color=color(agent), marker="D", markersize=5, markerfacecolor="none",
-            linestyle=":", linewidth=1.0, elinewidth=0.8, capsize=2, zorder=2,
-        )  # fmt: skip
+        axes.errorbar(*(episodes, means, stds), color=color(agent), elinewidth=0.8, capsize=2, zorder=2, **_THESIS_LINE)
 
 
 def _success_legend(axes: Axes, data: ReportData) -> None:
     """What the kinds of line mean; which agent a colour is, the right margin says."""
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     if data.thesis:
-        style: dict[str, Any] = {
-            "marker": "D",
-            "markersize": 5,
-            "markerfacecolor": "none",
-            "linestyle": ":",
-            "linewidth": 1.0,
-        }
-        axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **style)
+        axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **_THESIS_LINE)
     levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
     axes.plot([], [], label=levels, **_REFERENCE_LINE)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)

@@ -16,8 +16,6 @@ from imagine_bench.seeding import SeedTree
 Values = NDArray[np.float64]
 _JOINTS = ("q1", "q2", "q3")
 _KINDS = ("epistemic", "modal", "aleatoric")
-BEST_GOAL = 0.45
-"""The ratio to a random choice that the best estimator should reach."""
 
 
 def sections(result: RegressionResult) -> list[Section]:
@@ -74,18 +72,17 @@ def _decisions(result: RegressionResult) -> Section:
     rng = SeedTree(int(protocol.hash, 16)).child("report").generator()
     errors, ratios, answers = [], [], []
     for agent in protocol.agents:
-        title, best = registry.regressor_entry(agent).title, {}
+        title = registry.regressor_entry(agent).title
         for variant in protocol.variants:
             found = totals(result, agent, variant)
             errors.append([f"{title}, {variant}", *(mean_std(found[name].tolist()) for name in columns)])
             against = {name: ratio_to_random(found[name], found["random"], rng) for name in SCORES}
             ratios.append([f"{title}, {variant}", *(_interval(against[name]) for name in SCORES)])
-            best[variant] = min((estimate.value, name) for name, estimate in against.items())
+            least, best = min((estimate.value, name) for name, estimate in against.items())
             answers.append(
                 f"{title}, {variant} samples: choosing the least epistemic uncertainty leaves "
                 f"{against['epistemic'].value:.2f} of the error of a random choice"
-                f"{_printed_ratio(printed, variant)}; best is {best[variant][1].replace('_', ' ')} with "
-                f"{best[variant][0]:.2f}."
+                f"{_printed_ratio(printed, variant)}; best is {best.replace('_', ' ')} with {least:.2f}."
             )
     for variant in protocol.variants:
         if variant in printed["random"]:

@@ -15,7 +15,7 @@ from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.sections import Picture, Section, Table, number, picture
 
 _REGION, _EDGE = (-10.0, 10.0), 30.0
-_SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00", "base": "#f0e442"}
+_SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00"}
 _KINDS = (("epistemic", "true_epistemic"), ("modal", "true_modal"), ("aleatoric", "true_aleatoric"))
 _TITLES = {"base": "base", "low_data": "little data in the region", "high_noise": "much noise in the region"}
 
@@ -42,7 +42,7 @@ def sections(result: RegressionResult) -> list[Section]:
         ),
         Section(
             title="Figure 4.1: what is uncertain, and why",
-            words=("Grey: the region where the datasets differ is yellow, red is where the networks extrapolate.",),
+            words=("Shaded: yellow or orange where the datasets differ, red where the networks extrapolate.",),
             pictures=[_figure_4_1(result, agent) for agent in result.protocol.agents],
         ),
         Section(
@@ -187,7 +187,7 @@ def figure_4_1(result: RegressionResult, agent: str) -> Figure:
 
 
 def _shade(axes: Axes, variant: str) -> None:
-    if variant != "base":
+    if variant in _SHADE:
         axes.axvspan(*_REGION, color=_SHADE[variant], alpha=0.25, linewidth=0)
     axes.axvspan(_EDGE, 40.0, color="#d55e00", alpha=0.15, linewidth=0)
     axes.set_xlim(-30, 40)

@@ -135,7 +135,7 @@ def answers(data: ReportData) -> list[str]:
     elif 1 < len(data.result.protocol.seeds) < FEW_SEEDS:
         sentences.append(
             f"With only {len(data.result.protocol.seeds)} seeds an interval is hardly more than the range of its "
-            "seeds: read it as a hint. The presets thesis (5 seeds) and full (20) settle more."
+            "seeds: read it as a hint. More seeds settle more."
         )
     return sentences
 

@@ -15,11 +15,6 @@ FINGER_JOINTS = ("finger_left_slide", "finger_right_slide")
 TCP_SITE = "tcp"
 """Between the pads: +z along the tool, the fingers open along y."""
 
-WRIST_CAMERA = "wrist"
-
-ARM_GEOM_GROUP = 2
-"""Every geom of the arm is in it, so that a view can leave the arm out."""
-
 JOINT_SPEED_LIMITS_RAD_S = (1.74, 1.328, 1.957, 1.957, 3.485, 3.485, 4.545)
 """Per arm joint, from the same URDF as ``assets/sawyer.xml``."""
 

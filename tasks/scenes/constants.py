@@ -22,9 +22,6 @@ SLOT_SPACING_M = 0.09
 SLOTS_XY_M = ((ROW_X_M, SLOT_SPACING_M), (ROW_X_M, 0.0), (ROW_X_M, -SLOT_SPACING_M))
 """Nominal cube centres, left to right in the agent's frame."""
 
-DIRECTIONS = ("toward_human", "right", "toward_agent", "left")
-"""Arrow directions 0..3; each next one is a quarter turn clockwise as seen in the frame."""
-
 OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 """Arm configuration from which the wrist camera sees the whole row; every macro-action starts and ends here."""
 
@@ -32,8 +29,8 @@ HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
 SCENE_GROUP, ARM_GROUP, SETTING_GROUP, COLLISION_GROUP = 0, 2, 3, 5
-"""Geom groups: table top, loose objects and hands; the arm; what only the human's view shows (floor, legs, person);
-what only contact sees."""
+"""Geom groups: table top, loose objects and hands; the arm, so that a view can leave it out; what only the human's view
+shows (floor, legs, person); what only contact sees."""
 
 AGENT_CAMERA, HUMAN_CAMERA = "wrist", "human"
 
