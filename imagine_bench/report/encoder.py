@@ -39,6 +39,7 @@ class EncoderView:
 
 
 _NAMES = {
+    "code_sizes": "values of each part",
     "cpu_s": "CPU seconds",
     "kl_nats": "KL from the prior (nats a frame)",
     "reconstruction": "reconstruction error",
