@@ -100,16 +100,19 @@ class Imagination:
         seeds: SeedTree,
         device: torch.device,
     ) -> None:
-        if filtered and settings.model.dropout == 0.0 and settings.model.members == 1:
+        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
+        if filtered and samples * settings.model.members == 1:
             raise InvalidValueError(
-                "The filter compares what several networks say, and with model.dropout 0 and model.members 1 there is "
-                "one. Set model.dropout above 0 or model.members above 1, or choose the agent without the filter."
+                "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
+                "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
+                "above 1, or model.members above 1, or choose the agent without the filter."
             )
         self._reads_reward = filtered and settings.imagination.reward_threshold is not None
-        if self._reads_reward and settings.model.dropout == 0.0:
+        if self._reads_reward and samples == 1:
             raise InvalidValueError(
                 "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
-                "there is one. Set model.dropout above 0, or imagination.reward_threshold to null."
+                "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
+                "imagination.weight_samples above 1, or imagination.reward_threshold to null."
             )
         self.settings, self.filtered = settings.imagination, filtered
         self._generators = {

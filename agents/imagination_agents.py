@@ -18,6 +18,7 @@ from .controller import Controller
 from .futures import sample_futures
 from .imagination import TERMINAL, Imagination, Imagined
 from .learner import Learner
+from .meters import Meters
 from .perception import load_perception, prepare_torch
 from .presets import settings_of
 from .uncertainty import decompose
@@ -39,6 +40,7 @@ class ImaginingLearner(Learner):
         size, settings = self.perception.latent_size, self.settings.controller
         self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
         self.real.clear()
+        self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
         self.steps = 0
 
     def imagine(

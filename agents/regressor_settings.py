@@ -10,6 +10,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError, require_kn
 
 from .bayesian_mdn import MDNSettings
 from .family import Deviation
+from .layers import dropout_bits
 from .precision import PRECISIONS
 from .presets import checked
 from .ranges import NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, between, require_ranges
@@ -66,6 +67,7 @@ ENSEMBLE: dict[str, Deviation] = {
     "members": Deviation(5, "as many as Lakshminarayanan et al. (2017) recommend"),
     "dropout": Deviation(0.0, "in an ensemble the members are the weight samples"),
     "batch_size": Deviation(250, "so few epochs want more steps in each"),
+    "divergence_draws": Deviation(10, "five members then give as many values as 50 dropout samples"),
 }
 """What a deep ensemble changes of every preset; its epochs are those of :func:`_ensemble_epochs`."""
 ENSEMBLE_SHARE = 10
@@ -93,7 +95,8 @@ def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> Reg
 
     Args:
         preset: A name of :data:`PRESETS`.
-        overrides: Values by name, such as ``{"epochs": 100}``; what is given here holds for every regressor.
+        overrides: Values by name, such as ``{"epochs": 100}``, for every regressor; but ``dropout`` is the one
+            network's and ``members`` the ensemble's, and the other goes without.
         ensemble: Whether they are for a deep ensemble.
 
     Raises:
@@ -111,18 +114,18 @@ def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> Reg
     for name, value in overrides.items():
         if name not in known:
             raise UnknownNameError("setting", name, sorted(known))
-        values[name] = checked(name, hints[name], value)
+        given = checked(name, hints[name], value)
+        if name != ("dropout" if ensemble else "members"):
+            values[name] = given
     settings = replace(RegressorSettings(), **values)
     _require_ranges(settings)
+    _require_samples(settings, ensemble=ensemble)
     return settings
 
 
 def resolve_all(preset: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, RegressorSettings]:
     """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
-    one, ensemble = (resolve(preset, overrides, ensemble=ensemble) for ensemble in (False, True))
-    if ensemble.members < 2:
-        raise InvalidValueError("Setting members is 1 in an ensemble; it must be at least 2: the spread of one is 0.")
-    return one, ensemble
+    return resolve(preset, overrides, ensemble=False), resolve(preset, overrides, ensemble=True)
 
 
 def _ensemble_epochs(epochs: int) -> int:
@@ -139,3 +142,14 @@ def _require_ranges(settings: RegressorSettings) -> None:
             "them. Add one, or set dropout=0."
         )
     require_ranges({field.name: getattr(settings, field.name) for field in fields(settings)}, _RANGES)
+
+
+def _require_samples(settings: RegressorSettings, *, ensemble: bool) -> None:
+    """Epistemic uncertainty is what weight samples disagree about, so there must be different ones."""
+    if ensemble and settings.members < 2:
+        raise InvalidValueError("Setting members is 1 in an ensemble; it must be at least 2: the spread of one is 0.")
+    if not ensemble and dropout_bits(settings.dropout) == 0:
+        raise InvalidValueError(
+            f"Setting dropout is {settings.dropout}, which counts as 0 (in steps of 1/256): all weight samples of one "
+            "network would be the same. Give at least 0.002; the regressor 'ensemble' goes without by itself."
+        )

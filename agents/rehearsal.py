@@ -25,7 +25,7 @@ class Rehearsal:
     whether earlier ones took place or not.
 
     Args:
-        imagination: The world model that stands for the world, and its filter; neither is changed.
+        imagination: The world model that stands for the world, and its filter; only a threshold that moves is changed.
         n_actions: A.
         settings: All hyperparameters of the learner.
         seeds: This rehearsal's node of the seed tree.

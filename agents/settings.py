@@ -40,7 +40,7 @@ class WorldModelSettings:
             fails rarely, and a model that has forgotten what fails imagines that nothing does.
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
-        gradient_clip: Largest gradient norm of each network; None clips nothing.
+        gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
         precision: In which hidden layers train: float32, bfloat16, or auto, which is bfloat16 where the device has
             instructions for it. Weights, moments, output layers, losses and predictions are always float32.
     """

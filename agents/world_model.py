@@ -31,7 +31,7 @@ from .settings import WorldModelSettings
 
 @dataclass(frozen=True, slots=True)
 class ModelLosses:
-    """Means over a batch: negative log-likelihood (nats), log-cosh (of reward units), cross-entropy (nats)."""
+    """Means over a batch: negative log-likelihood (nats, members summed), log-cosh (of reward units), cross-entropy."""
 
     dynamics: float
     reward: float
@@ -132,7 +132,7 @@ class WorldModel(nn.Module):
         likelihood = mdn.log_likelihood(mixture, self._to_members(batch.next_z)).mean(dim=1)  # [S E]
         return torch.stack(
             [
-                -likelihood.view(seeds, -1).sum(dim=1),  # each member descends as if it were alone
+                -likelihood.view(seeds, -1).sum(dim=1),  # no member's loss reads another; a clip does
                 log_cosh(reward - batch.reward / self.settings.reward_scale).mean(dim=1),
                 functional.binary_cross_entropy_with_logits(logit, batch.terminated, reduction="none").mean(dim=1),
             ]

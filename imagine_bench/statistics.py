@@ -183,14 +183,17 @@ def gain(
         resamples: Bootstrap samples.
 
     Returns:
-        The gain, 0.5 for half as much again; NaN where the base never succeeds.
+        The gain, 0.5 for half as much again; NaN where the base never succeeds. Its ends are NaN where too many
+        resamples of the base never do, so that the interval has no upper end.
     """
     a, b = _table(treated), _table(base)
     value = float(_relative(a[None], b[None])[0])
     if min(len(a), len(b)) < 2 or np.isnan(value):
         return Estimate(value, float("nan"), float("nan"))
     draws = _relative(_resample(a, rng, resamples), _resample(b, rng, resamples))
-    return Estimate(value, *_percentiles(draws[~np.isnan(draws)], level))
+    if np.isnan(draws).mean() > (1.0 - level) / 2.0:  # where the base is 0 the gain is boundless
+        return Estimate(value, float("nan"), float("nan"))
+    return Estimate(value, *_percentiles(np.where(np.isnan(draws), np.inf, draws), level))
 
 
 def _summary(draws: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:

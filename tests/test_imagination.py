@@ -136,6 +136,13 @@ def test_a_reward_threshold_without_dropout_is_refused() -> None:
         Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
 
 
+def test_a_filter_with_a_single_weight_sample_is_refused() -> None:
+    settings = Settings(model=WorldModelSettings(dropout=0.5), imagination=ImaginationSettings(weight_samples=1))
+    with pytest.raises(InvalidValueError, match=r"there is one\. Set model\.dropout above 0 and imagination\.weight"):
+        Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
+    Imagination(2, 2, settings, filtered=False, seeds=SeedTree(0), device=CPU)
+
+
 @pytest.mark.parametrize(("reduction", "accepted"), [("max", 12), ("mean", 30)])
 def test_the_threshold_is_compared_with_the_named_reduction(reduction: str, accepted: int) -> None:
     # The epistemic variance at the doubtful step is (5, 0): 5 at most, 2.5 on average.

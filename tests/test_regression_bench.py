@@ -186,6 +186,7 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
         (["--task", "toy_regression", "--set", "weight_samples=1"], "Setting weight_samples is 1; it must lie in [2,"),
         (["--task", "toy_regression", "--set", "components=0"], "Setting components is 0; it must lie in [1, 1000]."),
         (["--task", "toy_regression", "--set", "dropout=0.96"], "Setting dropout is 0.96; it must lie in [0, 0.95]."),
+        (["--task", "toy_regression", "--set", "dropout=0.001"], "Setting dropout is 0.001, which counts as 0"),
         (["--task", "toy_regression", "--set", "epochs=0"], "Setting epochs is 0; it must be at least 1."),
         (["--task", "toy_regression", "--set", "learning_rate=0"], "Setting learning_rate is 0.0; it must lie in (0,"),
         (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
@@ -218,6 +219,29 @@ def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int 
     regressor = registry.make_regressor("mc_dropout", context)
     regressor.train(2)
     assert regressor.state().values["batches"] == 2 * updates
+
+
+def test_dropout_is_the_one_networks_and_members_are_the_ensembles() -> None:
+    one, ensemble = regressor_settings.resolve_all("quick", {"dropout": 0.1, "members": 3})
+    assert (one.dropout, one.members) == (0.1, 1)
+    assert (ensemble.dropout, ensemble.members) == (0.0, 3)
+
+
+def test_an_ensemble_draws_as_many_values_for_its_divergence_as_dropout_does() -> None:
+    one, ensemble = regressor_settings.resolve_all("thesis", {})
+    assert ensemble.members * ensemble.divergence_draws == one.weight_samples * one.divergence_draws
+
+
+def test_an_ensembles_two_distributions_are_one_and_score_alike(tmp_path: Path) -> None:
+    """Members side by side are what it predicts with; scored at the same points, both must have one CRPS."""
+    found = run(
+        tiny("toy_regression", "ensemble", variants=("base",), test_points=80, recorded=False), tmp_path, silent
+    )
+    alone, pooled = found.values("base", "crps_shared"), found.values("base", "pooled_crps_shared")
+    np.testing.assert_allclose(alone, pooled, rtol=1e-5)
+    assert not np.allclose(found.values("base", "crps"), pooled, rtol=1e-3), (
+        "all 80 points are others than the first 50"
+    )
 
 
 def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:

@@ -327,6 +327,11 @@ def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult)
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("count", "warned"), [(1, False), (2, True), (4, True), (5, False)])
+def test_few_seeds_are_called_few(count: int, warned: bool) -> None:
+    assert bool(words.few_words(count)) is warned
+
+
 def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(SetupError, match=r"Cannot write .*a part of that path is a file"):

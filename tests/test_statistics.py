@@ -112,6 +112,14 @@ def test_gain_resamples_both_sides() -> None:
     assert statistics.gain([0.6, 0.6], [0.2, 0.4], rng()) == pytest.approx((1.0, 0.5, 2.0))
 
 
+def test_a_gain_without_bound_has_no_interval() -> None:
+    """8 of 27 resamples of the base never succeed: leaving them out would cut off the upper end."""
+    value, low, high = statistics.gain([0.3, 0.4, 0.5], [0.0, 0.0, 0.1], rng())
+    assert value == pytest.approx(11.0) and math.isnan(low) and math.isnan(high)
+    scarce = statistics.gain([0.3] * 8, [0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1], rng())
+    assert 0.0 < scarce.low < scarce.high < math.inf, "so few that the upper end is not among them"
+
+
 def test_gain_over_nothing_is_not_a_number() -> None:
     assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0], rng()).value)
 

@@ -9,7 +9,7 @@ from typing import Any
 from imagine_bench.errors import require_known
 
 from ..presets import FAMILIES, checked_values, flatten
-from ..ranges import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, require_ranges
+from ..ranges import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, require_ranges
 
 EXPLORATIONS = ("curiosity", "optimism", "random")
 
@@ -109,6 +109,7 @@ _RANGES = {
     "outcomes.pseudo_tests": POSITIVE,
     "outcomes.pseudo_conjunctions": POSITIVE,
     "outcomes.leak": INSIDE,
+    "outcomes.order_factor": RATE,
     "outcomes.sweeps": COUNT,
     "planning.depth": COUNT,
     "planning.branches": COUNT,

@@ -17,8 +17,8 @@ from imagine_bench.regression import SCORES, Floats, Mixtures, RegressionSpec, R
 from imagine_bench.regression.results import Arrays, Row
 from imagine_bench.seeding import SeedTree
 
-POOLED_CRPS_POINTS = 50
-"""Points of each network at which the score of all weight samples together is computed: it costs (T K)^2 a point."""
+CRPS_POINTS = 50
+"""Points of each network at which both distributions are scored: all weight samples together cost (T K)^2 a point."""
 _CHUNK = 100
 
 
@@ -60,9 +60,11 @@ def calibrate(
         own = Mixtures(**{n: getattr(said.predictive, n)[e] for n in ("weights", "means", "sigmas")})
         wrong = error[e] > task.wrong_above
         row: Row = {"error_mean": error[e].mean(), "error_median": np.median(error[e]), "wrong": wrong.mean()}
-        row |= {"log_score": log_score(own, targets[e]).mean(), "crps": crps(own, targets[e]).mean()}
+        own_crps = crps(own, targets[e])  # [N, D]
+        row |= {"log_score": log_score(own, targets[e]).mean(), "crps": own_crps.mean()}
+        row |= {"crps_shared": own_crps[:CRPS_POINTS].mean(), "pooled_crps_shared": pooled_crps[e].mean()}
         row |= {f"coverage_{level:g}": coverage(transform[e], level) for level in LEVELS}
-        row |= {"transform_distance": transform_distance(transform[e]), "pooled_crps": pooled_crps[e].mean()}
+        row |= {"transform_distance": transform_distance(transform[e])}
         row |= {f"pooled_coverage_{level:g}": coverage(pooled_transform[e], level) for level in LEVELS}
         row |= {"pooled_transform_distance": transform_distance(pooled_transform[e])}
         row |= {f"auroc_{name}": auroc(values[e], wrong) for name, values in scores.items()}
@@ -71,13 +73,13 @@ def calibrate(
 
 
 def _pooled(regressor: Regressor, inputs: Floats, targets: Floats) -> tuple[Floats, Floats]:
-    """Transforms (E, N, D), and scores at the first points (E, POOLED_CRPS_POINTS, D), of all weight samples pooled."""
+    """Transforms (E, N, D), and scores at the first points (E, CRPS_POINTS, D), of all weight samples pooled."""
     transforms, scores = [], []
     for start in range(0, inputs.shape[1], _CHUNK):
         part = slice(start, start + _CHUNK)
         mixtures = regressor.pooled(inputs[:, part])
         transforms.append(probability_transform(mixtures, targets[:, part]))
-        for point in range(start, min(start + _CHUNK, POOLED_CRPS_POINTS, inputs.shape[1])):
+        for point in range(start, min(start + _CHUNK, CRPS_POINTS, inputs.shape[1])):
             one = Mixtures(**{n: getattr(mixtures, n)[:, point - start] for n in ("weights", "means", "sigmas")})
             scores.append(crps(one, targets[:, point]))  # [E, D]; a point at a time: (T K)^2 numbers each
     return np.concatenate(transforms, axis=1), np.stack(scores, axis=1)

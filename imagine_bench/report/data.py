@@ -293,7 +293,7 @@ def _comparisons(result: BenchResult, thesis: str | None) -> dict[str, dict[int,
 
 
 def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:
-    """Mean share of imagined transitions kept while training up to each budget."""
+    """Mean share of imagined transitions kept while training to each budget from the one before."""
     rates: dict[int, list[float]] = {}
     for run in runs:
         for checkpoint in run.checkpoints:

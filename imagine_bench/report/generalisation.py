@@ -16,7 +16,7 @@ from imagine_bench import reference, statistics
 from imagine_bench.files import make_folder, write_bytes, write_json
 from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.report.words import agent_words, percent
+from imagine_bench.report.words import agent_words, few_words, percent
 from imagine_bench.seeding import SeedTree
 
 _ROWS = {
@@ -45,7 +45,7 @@ def generalisation_table(asked: Sequence[Asked], probe: Probing, task: TaskSpec)
     unseen = int(probe.terminal.sum())
     lines = [
         f"{unseen} transitions out of terminal macrostates, {len(probe.terminal) - unseen} others; mean of {seeds} "
-        f"seed(s) [95 % interval over seeds]",
+        f"seed(s) [95 % interval over seeds]. {' '.join(few_words(seeds))}".rstrip(),
         "",
         f"| {task.title} |{''.join(f' {agent_words(agent).title} |' for agent in agents)} thesis |",
         f"|---|{'---|' * len(agents)}---|",

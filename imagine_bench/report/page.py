@@ -124,7 +124,7 @@ def _words(data: ReportData) -> dict[str, Any]:
 def _interval_words(data: ReportData) -> str:
     if len(data.result.protocol.seeds) == 1:
         return "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
-    return "95 % interval over seeds (bootstrap)"
+    return "95 % interval over seeds (bootstrap), given the test episodes, which are the same for every agent"
 
 
 def _thesis_only(data: ReportData) -> list[int]:

@@ -15,6 +15,7 @@ from imagine_bench import registry
 from imagine_bench.calibration import LEVELS
 from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.regression import SCORES
+from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult, rows_csv
 from imagine_bench.report.page import aligned, facts, flat
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
@@ -93,7 +94,8 @@ def _calibration(result: RegressionResult) -> Section:
                 inside = [f"{100 * values[f'{prefix}coverage_{level:g}'].mean():.1f}" for level in LEVELS]
                 rows.append([
                     f"{title}, {variant}: {kind}", *inside,
-                    number(float(values[f"{prefix}transform_distance"].mean()), 2), mean_std(values[f"{prefix}crps"]),
+                    number(float(values[f"{prefix}transform_distance"].mean()), 2),
+                    mean_std(values[f"{prefix}crps_shared"]),
                 ])  # fmt: skip
             found = [result.values(agent, variant, f"auroc_{name}") for name in SCORES]
             detectors.append([
@@ -106,7 +108,8 @@ def _calibration(result: RegressionResult) -> Section:
         words=(
             f"Each network is asked about {protocol.test_points} unseen points. An interval that is said to hold 80 % "
             "of the outcomes should hold 80 %; the probability integral transform should be uniform (its distance "
-            "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better. "
+            "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better, "
+            f"computed at the first {min(CRPS_POINTS, protocol.test_points)} of the points. "
             "Two distributions are judged: the one predictions are drawn from, and all weight samples side by side.",
             f"A prediction is called wrong where its error, the {spec.error_name}, is above {spec.wrong_above:g}. The "
             "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
@@ -126,7 +129,7 @@ def _calibration(result: RegressionResult) -> Section:
 _MEASURES = tuple(
     f"{prefix}{name}"
     for prefix in ("", "pooled_")
-    for name in (*(f"coverage_{level:g}" for level in LEVELS), "transform_distance", "crps")
+    for name in (*(f"coverage_{level:g}" for level in LEVELS), "transform_distance", "crps_shared")
 )
 
 

@@ -11,6 +11,7 @@ from imagine_bench import reference, registry, statistics
 from imagine_bench.regression import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, picture
+from imagine_bench.report.words import few_words
 from imagine_bench.seeding import SeedTree
 
 Values = NDArray[np.float64]
@@ -99,6 +100,7 @@ def _decisions(result: RegressionResult) -> Section:
             "misses is cumulated over 50 choices. Mean (standard deviation) over networks, in metres; lower is better. "
             "Random is the expectation of a choice by chance, min and max are the best and the worst choice in "
             "hindsight, mink is the error of inverse kinematics with a known model of the arm, the ceiling.",
+            *few_words(len(protocol.seeds) * protocol.networks, "networks"),
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
             "is measured. Here no place outside of the workspace is asked for; the maps below show the distance there.",
         ),

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from imagine_bench import statistics
 from imagine_bench.files import make_folder, write_bytes, write_json
 from imagine_bench.report.plots import STYLE
-from imagine_bench.report.words import estimate_text, percent
+from imagine_bench.report.words import estimate_text, few_words, percent
 from imagine_bench.study import Line, Study
 
 _HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's palette
@@ -51,7 +51,8 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
     head = (
         f"# {study.question}\n\n{study.execution}, {study.appearance}, tuning seeds "
         f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, "
-        "differences in points with 95 % bootstrap intervals over seeds.\n\n![Differences](study.png)\n\n"
+        f"differences in points with 95 % bootstrap intervals over seeds. {' '.join(few_words(len(study.seeds)))}\n\n"
+        "![Differences](study.png)\n\n"
     )
     write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
     write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())

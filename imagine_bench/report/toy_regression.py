@@ -51,7 +51,8 @@ def sections(result: RegressionResult) -> list[Section]:
                 "Inside the training range [−30, 30]: medians over x of the estimated and of the true standard "
                 "deviations, of the absolute difference between the two, and the rank correlation along x, each "
                 "averaged over networks. True epistemic uncertainty is equation 4.6, the squared error of the mean "
-                "plus its variance.",
+                "plus its variance, which is the estimate itself: the rank correlation is with the error alone, and "
+                "the difference can have one sign only.",
             ),
             tables=truth,
         ),
@@ -140,9 +141,11 @@ def _against_truth(result: RegressionResult, agent: str) -> Table:
             estimate = np.sqrt(result.arrays(agent, variant, kind)[:, inside])
             known = first[name] if first[name].ndim == 1 else result.arrays(agent, variant, name)
             truth = np.broadcast_to(np.sqrt(known[..., inside]), estimate.shape)
-            varies = np.ptp(truth, axis=1).max() > 0
+            # equation 4.6 contains the estimate, which would agree with itself: the rest is the error of the mean
+            target = truth**2 - estimate**2 if kind == "epistemic" else truth
+            varies = np.ptp(target, axis=1).max() > 0
             along = (
-                np.mean([stats.spearmanr(*pair).statistic for pair in zip(estimate, truth, strict=True)])
+                np.mean([stats.spearmanr(*pair).statistic for pair in zip(estimate, target, strict=True)])
                 if varies
                 else np.nan
             )

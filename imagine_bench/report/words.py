@@ -132,12 +132,16 @@ def answers(data: ReportData) -> list[str]:
         sentences.append(
             "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
         )
-    elif 1 < len(data.result.protocol.seeds) < FEW_SEEDS:
-        sentences.append(
-            f"With only {len(data.result.protocol.seeds)} seeds an interval is hardly more than the range of its "
-            "seeds: read it as a hint. More seeds settle more."
-        )
+    else:
+        sentences += few_words(len(data.result.protocol.seeds))
     return sentences
+
+
+def few_words(count: int, noun: str = "seeds") -> list[str]:
+    """A sentence of warning where a bootstrap interval rests on few."""
+    if not 1 < count < FEW_SEEDS:
+        return []
+    return [f"With only {count} {noun} an interval is hardly more than their range, and too narrow: read it as a hint."]
 
 
 def _largest_area(data: ReportData) -> str:
@@ -179,18 +183,18 @@ def _verdict(data: ReportData, agent: str) -> str:
         verdict = "so at this budget it is behind"
     else:
         verdict = "which includes zero, so at this budget no difference is shown"
-    return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons)}"
+    return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons, len(data.result.protocol.seeds))}"
 
 
-def _over_budgets(comparisons: dict[int, Comparison]) -> str:
+def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
     if len(comparisons) < 2:
         return ""
     ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
     behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
-    parts = []
+    parts, clearly = [], "clearly " if seeds >= FEW_SEEDS else ""
     for budgets, word in ((ahead, "ahead"), (behind, "behind")):
         if budgets:
-            parts.append(f"clearly {word} at {_listing([f'{budget:,}' for budget in budgets])}")
+            parts.append(f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}")
     if not parts:
         return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
     return f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets)."
