@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class ImagineBenchError(Exception):
@@ -27,6 +28,9 @@ class UnknownNameError(ImagineBenchError, ValueError):
         hint = f" Did you mean {closest[0]!r}?" if closest else ""
         super().__init__(f"No {kind} {str(given)!r}.{hint} Known: {', '.join(names) or 'none'}.")
         self.kind, self.given, self.known = kind, given, tuple(names)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.kind, self.given, self.known)  # worker processes send errors back
 
 
 class InvalidValueError(ImagineBenchError, ValueError):

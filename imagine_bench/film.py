@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import gymnasium
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from imagine_bench import registry
-from imagine_bench.errors import SetupError
+from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.files import make_folder
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.seeding import episode_seed
 
@@ -34,15 +36,18 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
 
     Raises:
         UnknownNameError: No such task or appearance.
+        InvalidValueError: ``out`` is no GIF.
         SetupError: ``out`` exists or cannot be written, or there is no GL.
     """
+    if out.suffix.lower() != ".gif":
+        raise InvalidValueError(f"{out} does not end in .gif, the only format of films; give such an --out.")
     if out.exists():
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
+    make_folder(out.parent)
     pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
     colours = pictures[0].quantize(128)
     frames = [picture.quantize(palette=colours, dither=Image.Dither.NONE) for picture in pictures]
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
         frames[0].save(out, save_all=True, append_images=frames[1:], duration=1000 // _FPS, loop=0, optimize=True)
     except OSError as error:
         raise SetupError(f"{out} cannot be written: {error.strerror or error}.") from error
@@ -55,16 +60,16 @@ def _episode(task: str, seed: int, appearance: str) -> Iterator[NDArray[np.uint8
     scene = env.unwrapped
     assert isinstance(scene, SceneReader)
     scene.capture_motion_hz = float(_FPS)
-    frame, info = env.reset(seed=episode_seed("recording", seed, 0))
-    over = False
-    while not over:
-        yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(_HOLD))
-        action = spec.rules.optimal_action(tuple(int(value) for value in info["macrostate"]))
-        after, _, terminated, truncated, info = env.step(action)
-        yield from (_side_by_side(picture, frame) for picture in scene.film(WIDTH_PX, HEIGHT_PX))
-        frame, over = after, terminated or truncated
-    yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(2 * _HOLD))
-    env.close()
+    with closing(env):
+        frame, info = env.reset(seed=episode_seed("recording", seed, 0))
+        over = False
+        while not over:
+            yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(_HOLD))
+            action = spec.rules.optimal_action(tuple(int(value) for value in info["macrostate"]))
+            after, _, terminated, truncated, info = env.step(action)
+            yield from (_side_by_side(picture, frame) for picture in scene.film(WIDTH_PX, HEIGHT_PX))
+            frame, over = after, terminated or truncated
+        yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(2 * _HOLD))
 
 
 def _side_by_side(scene: NDArray[np.uint8], frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.environment import describe_environment
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.fidelity import measure_fidelity
 from imagine_bench.interfaces import Promises, SceneReader, TaskSpec
 from imagine_bench.seeding import SeedTree
@@ -82,7 +83,12 @@ def speed_report(out: Path, turns: int = TURNS, show: Callable[[str], None] = pr
 
     Returns:
         Whether every promise held.
+
+    Raises:
+        InvalidValueError: Not a single macro-action.
     """
+    if turns < 1:
+        raise InvalidValueError(f"turns is {turns}; give at least 1 macro-action.")
     show("| what | required | measured | |\n|---|---|---|---|")
     figures = []
     for figure in measure(turns):

@@ -5,15 +5,25 @@ from __future__ import annotations
 import os
 import sys
 
+from imagine_bench.errors import SetupError
+
+PLATFORMS = ("", "egl", "glfw", "osmesa")
+"""What ``MUJOCO_GL`` may be on Linux where pictures are wanted."""
+
 
 def choose_platform() -> None:
-    """Choose headless EGL where Linux has no display, unless the user chose already.
+    """Choose headless EGL on Linux, unless the user chose already.
 
-    Software GL draws on the calling thread: 64x64 pixels gain nothing from more, and threads do not survive a fork.
+    With a display too: a window system's connection survives neither a fork nor a second thread. Software GL draws on
+    the calling thread: 64x64 pixels gain nothing from more, and threads do not survive a fork.
+
+    Raises:
+        SetupError: ``MUJOCO_GL`` names no platform.
     """
     if sys.platform != "linux":
         return
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if not display and not os.environ.get("MUJOCO_GL"):
-        os.environ["MUJOCO_GL"] = "egl"
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if chosen.lower() not in PLATFORMS:
+        raise SetupError(f"MUJOCO_GL is {chosen!r}; unset it, or give one of {', '.join(filter(None, PLATFORMS))}.")
+    os.environ["MUJOCO_GL"] = chosen or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Rules, Shape3D, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Shape3D, TaskSpec
 
 from .rendering import Renderer, View
 from .scene_reader import body_names, poses_of, shapes_of
@@ -122,7 +123,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
     ) -> None:
         self.render_mode = None if render_mode is None else _known_render_mode(render_mode)
         self._execution = require_known("execution", execution, EXECUTIONS)
-        self._rules: Rules = spec.rules
+        self._id, self._rules = spec.id, spec.rules
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
         self._world = make_world(appearance_level(appearance))
@@ -132,7 +133,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._picture = Renderer(self._world.model, picture_view(camera, *_picture_size(width, height)))
         self._human: Renderer | None = None
         self.capture_motion_hz = 0.0
-        self._macrostate = self._starts[0]
+        self._begun, self._macrostate = False, self._starts[0]
         self._latest: MacroResult | None = None
         self._people = self._mocap()
 
@@ -150,7 +151,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             InvalidValueError: Not a macrostate of this task.
         """
         super().reset(seed=seed)
-        start = self._start(options or {})
+        start = self._start({} if options is None else options)
+        self._begun = True
         self._latest = None
         self._world.place(start, self.np_random)
         self._world.vary(self.np_random)
@@ -163,9 +165,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
 
         Raises:
-            InvalidValueError: No such action.
+            InvalidValueError: No such action, or no episode was begun.
             DivergedError: The simulation blew up.
         """
+        if not self._begun:
+            raise InvalidValueError("There is no episode to go on with; call reset() first.")
         chosen = self._checked(action)
         start = self._macrostate
         intended = self._intended(start, chosen)
@@ -256,6 +260,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return self._world.data.mocap_pos.copy(), self._world.data.mocap_quat.copy()
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
+        if not isinstance(options, Mapping):
+            raise InvalidValueError(f"Reset options {options!r} are no mapping; give {{'macrostate': ...}} or nothing.")
         for key in options:
             if key != "macrostate":
                 raise UnknownNameError("reset option", key, ("macrostate",))
@@ -268,19 +274,23 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         except (TypeError, ValueError):
             known = False
         if not known:
-            top = tuple(max(state[index] for state in self._known) for index in range(len(self._starts[0])))
-            raise InvalidValueError(
-                f"No macrostate {given!r}; give {len(top)} integers from 0 to at most {top}, such as {self._starts[0]}."
-            )
+            raise InvalidValueError(f"No macrostate {given!r}; give {self._allowed()}, such as {self._starts[0]}.")
         return start
+
+    def _allowed(self) -> str:
+        """The macrostates in words; where not every combination of values is one, only their list says which."""
+        top = tuple(max(state[index] for state in self._known) for index in range(len(self._starts[0])))
+        if len(self._known) == math.prod(value + 1 for value in top):
+            return f"{len(top)} integers from 0 to at most {top}"
+        return f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
 
     def _checked(self, action: np.int64 | int) -> int:
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         try:
-            chosen = int(action)
-        except (TypeError, ValueError):
+            chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1
+        except (TypeError, ValueError, OverflowError):
             chosen = -1
-        if chosen != action or not 0 <= chosen < n_actions:
+        if not 0 <= chosen < n_actions:
             raise InvalidValueError(f"Action {action!r} does not exist; give an integer from 0 to {n_actions - 1}.")
         return chosen
 

@@ -178,9 +178,10 @@ class PickWorld:
         self._executor.rest(self.data, held_object(self._objects()[0]))
         self._update()
         after = self._objects()[0]
-        as_asked = after == intended[:N_OBJECTS]
-        self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
-        self._update()
+        if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
+            as_asked = after == intended[:N_OBJECTS]
+            self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
+            self._update()
         moving = {index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])}
         return replace(result, fault=result.fault or self._bystander_problem(moving, poses))
 

@@ -12,20 +12,17 @@ import contextlib
 import ctypes
 import os
 import sys
+import threading
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from .graphics import choose_platform
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
-choose_platform()
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-
-from imagine_bench.errors import SetupError, UnknownNameError  # noqa: E402
+from imagine_bench.errors import SetupError, UnknownNameError
 
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -33,8 +30,10 @@ _N_GROUPS = 6
 _EXTRA_GEOMS = 32
 _MISSING_GL = (
     "No OpenGL for headless rendering ({reason}): on Debian or Ubuntu install it with "
-    "'apt-get install libegl1 libgl1-mesa-dri', elsewhere set MUJOCO_GL to a platform that works."
+    "'apt-get install libegl1 libgl1-mesa-dri', elsewhere set MUJOCO_GL to a platform that works.{chosen}"
 )
+_CHOICES = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", "PYOPENGL_PLATFORM")
+"""Variables by which a user, or a cluster's profile, decides how to draw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +81,9 @@ def _new_gl_context(width: int, height: int) -> Any:
 
 def _missing_gl(error: Exception) -> SetupError:
     reason = str(error).strip().splitlines()
-    return SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__))
+    set_now = [f"{name}={os.environ[name]}" for name in _CHOICES if os.environ.get(name)]
+    chosen = f" Set now, and perhaps the cause: {', '.join(set_now)}." if set_now else ""
+    return SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__, chosen=chosen))
 
 
 def gl_renderer() -> str:
@@ -116,7 +117,7 @@ class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
-        self.pid = os.getpid()
+        self.pid, self.thread = os.getpid(), threading.get_ident()
         self.gl: Any = _new_gl_context(view.width, view.height)
         try:
             with _quality(model, view):
@@ -126,16 +127,25 @@ class _Canvas:
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
 
     def make_current(self) -> None:
-        """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
+        """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything.
+
+        Raises:
+            SetupError: Another thread has drawn with it.
+        """
+        if self.thread != threading.get_ident():
+            raise SetupError(
+                "This environment drew its first frame in another thread, whose OpenGL context no other may use. Make "
+                "and use each environment in one thread."
+            )
         if not _is_current(self.gl):
             self.gl.make_current()
 
     def close(self) -> None:
-        """Free everything; nothing if that was done before or belongs to a parent process."""
+        """Free everything; nothing if that was done before or belongs to a parent process or another thread."""
         gl, mjr, self.gl, self.mjr = self.gl, self.mjr, None, None
         if gl is None:
             return
-        if self.pid != os.getpid():
+        if (self.pid, self.thread) != (os.getpid(), threading.get_ident()):
             _inherited.append((gl, mjr))
             return
         gl.make_current()
@@ -161,14 +171,13 @@ def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
 
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
 _inherited: list[Any] = []
-"""Contexts of a parent process: never used and never freed, since their context belongs to the parent."""
+"""Contexts of a parent process or another thread: never used here and never freed, since they belong there."""
 _exit_hook_pid: int | None = None
 
 
 def _close_all() -> None:
     for renderer in list(_open):
-        with contextlib.suppress(Exception):  # a context of another thread cannot be closed from here
-            renderer.close()
+        renderer.close()
 
 
 def _close_all_at_exit() -> None:

@@ -1,8 +1,9 @@
-"""Frames of macrostates that nobody acted for: one scene and one eye a process, world and appearance level."""
+"""Frames of macrostates that nobody acted for: one scene and one eye a thread, world and appearance level."""
 
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -20,7 +21,7 @@ MakeWorld = Callable[[Appearance], World]
 
 
 @functools.lru_cache(maxsize=8)
-def _studio(make_world: MakeWorld, level: Appearance) -> tuple[World, Renderer]:
+def _studio(make_world: MakeWorld, level: Appearance, thread: int) -> tuple[World, Renderer]:
     world = make_world(level)
     return world, agent_eye(world.model)
 
@@ -45,7 +46,7 @@ def frames_of(
         InvalidValueError: Macrostates of another shape or type, or none of the rules'.
     """
     macrostates = require_macrostates(rules, macrostates)
-    world, eye = _studio(make_world, appearance_level(appearance))
+    world, eye = _studio(make_world, appearance_level(appearance), threading.get_ident())
     frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
     for row, macrostate in enumerate(macrostates.tolist()):
         world.place(tuple(macrostate), rng)

@@ -76,6 +76,8 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         (["report", str(tmp_path)], "protocol.json is not a bench's protocol"),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
         (["view", str(tmp_path / "x.rrd")], "No recording"),
+        (["film", "--task", "arrow_puzzle", "--out", str(tmp_path / "film.mp4")], "does not end in .gif"),
+        (["speed", "--turns", "0"], "turns is 0; give at least 1"),
         (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
     ):
         assert main(words) == 2

@@ -251,7 +251,27 @@ def test_an_unknown_reset_option_is_refused(kinematic):
         kinematic.reset(options={"macrostat": (0, 1, 2, 0)})
 
 
-@pytest.mark.parametrize("action", [6, -1, 1.5, "left", None])
+@pytest.mark.parametrize("options", [5, "abc", [1]])
+def test_reset_options_that_are_no_mapping_are_refused(kinematic, options):
+    with pytest.raises(InvalidValueError, match="are no mapping; give {'macrostate'"):
+        kinematic.reset(options=options)
+
+
+def test_where_not_every_combination_is_a_macrostate_the_list_is_named():
+    env = gymnasium.make("imagine_bench/PickPlace-v0", **KINEMATIC)
+    with pytest.raises(InvalidValueError, match=r"one of the 19 of .*task\('pick_place'\)\.rules\.states, such as"):
+        env.reset(options={"macrostate": (0, 1, 2, 0)})
+    env.close()
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = make(**KINEMATIC).unwrapped
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.step(0)
+    env.close()
+
+
+@pytest.mark.parametrize("action", [6, -1, 1.5, "left", None, float("inf"), np.array([1, 2]), np.array([])])
 def test_a_wrong_action_is_refused(kinematic, action):
     with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 5"):
         kinematic.step(action)

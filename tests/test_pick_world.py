@@ -264,6 +264,22 @@ def test_the_handed_over_object_rests_in_the_palm(world):
         assert np.abs(world._poses()[index, :3] - before).max() < 2e-3
 
 
+@pytest.mark.parametrize("seed", [83393, 3046])
+def test_the_palm_stays_where_it_varied_to_under_what_was_laid_into_it(seed: int) -> None:
+    """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
+    env = gymnasium.make("imagine_bench/PickPlace-v0", appearance="strong")
+    env.reset(seed=seed, options={"macrostate": (0, 1, 0, OPEN_PALM)})
+    data = env.unwrapped._world.data
+    before_m = data.mocap_pos.copy()
+    _, reward, terminated, _, info = env.step(HAND_OVER)
+    assert (reward, terminated, info["is_success"], info["fault"]) == (5.0, True, True, False)
+    assert np.array_equal(data.mocap_pos, before_m)
+    lies = data.qpos.copy()
+    *_, info = env.step(0)
+    assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
+    env.close()
+
+
 def test_unasked_render_arguments_are_refused():
     with pytest.raises(
         InvalidValueError, match=r"No macrostate \(1, 1, 0, 0\); give one of 19, such as \(0, 0, 0, 0\)"

@@ -214,6 +214,16 @@ def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monkey
         episodes.open_in_viewer(there)
 
 
+def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = tmp_path / "there.rrd"
+    there.write_bytes(b"")
+    monkeypatch.setenv("DISPLAY", ":99")
+    failed = subprocess.CompletedProcess[str]([], returncode=1)
+    monkeypatch.setattr(episodes.subprocess, "run", lambda *_, **__: failed)
+    with pytest.raises(SetupError, match=r"the viewer failed; copy it .* or run 'rerun --serve-web"):
+        episodes.open_in_viewer(there)
+
+
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     rows = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
     assert rows[1].startswith("  left")

@@ -7,11 +7,13 @@ import pickle
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks import rendering
+from imagine_bench.tasks.arrow_puzzle import SPEC
 from imagine_bench.tasks.arrow_world import ArrowWorld
 from imagine_bench.tasks.macro_env import agent_eye, picture_view
 from imagine_bench.tasks.rendering import Renderer, View
@@ -195,3 +197,35 @@ def test_a_headless_script_draws_and_exits_in_silence(before, after):
     assert done.returncode == 0
     assert done.stdout.strip() == "True"
     assert done.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
+def test_a_stale_display_is_not_drawn_with():
+    done = run_script(_FRAME.format(before="", after="env.close()"), DISPLAY=":99")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other platforms")
+def test_a_platform_that_does_not_exist_is_named():
+    done = run_script(_FRAME.format(before="", after=""), MUJOCO_GL="elg")
+    assert "SetupError: MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa." in done.stderr
+
+
+def test_drawing_in_another_thread_is_one_clear_error(world):
+    eye = agent_eye(world.model)
+    eye.frame(world.data)
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(SetupError, match="drew its first frame in another thread"):
+            pool.submit(eye.frame, world.data).result()
+        theirs = agent_eye(world.model)
+        assert np.array_equal(pool.submit(theirs.frame, world.data).result(), eye.frame(world.data))
+    theirs.close()  # its thread has ended: nothing to free it with, and nothing is said
+    eye.close()
+
+
+def test_frames_of_macrostates_may_be_drawn_in_any_thread():
+    states = np.array([[0, 1, 2, 1]])
+    here, there = (np.random.default_rng(0) for _ in range(2))
+    expected = SPEC.render_macrostates(states, "clean", here)
+    with ThreadPoolExecutor(1) as pool:
+        assert np.array_equal(pool.submit(SPEC.render_macrostates, states, "clean", there).result(), expected)

@@ -112,13 +112,12 @@ def open_in_viewer(path: Path) -> None:
     """
     if not path.is_file():
         raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    displayed = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or not sys.platform.startswith("linux")
+    if not displayed or subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode:
         raise SetupError(
-            f"No display here to open {path}; copy it to a machine with one and run 'rerun {path.name}' there, "
-            f"or run 'rerun --serve-web {path}' here and open the address it prints."
+            f"No display here to open {path}, or the viewer failed; copy it to a machine with one and run "
+            f"'rerun {path.name}' there, or run 'rerun --serve-web {path}' here and open the address it prints."
         )
-    print(f"Recording: {path}")
-    subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
 
 
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
