@@ -20,7 +20,7 @@ from imagine_bench.seeding import SeedTree
 from . import mixture as mdn
 from . import snapshot
 from .controller import Controller
-from .layers import Masks
+from .layers import Masks, dropout_bits
 from .memory import Batch, ImaginedMemory, RealMemory
 from .mixture import Mixture
 from .settings import Settings
@@ -100,7 +100,7 @@ class Imagination:
         seeds: SeedTree,
         device: torch.device,
     ) -> None:
-        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
+        samples = settings.imagination.weight_samples if dropout_bits(settings.model.dropout) else 1
         if filtered and samples * settings.model.members == 1:
             raise InvalidValueError(
                 "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "

@@ -139,7 +139,7 @@ def _require_ranges(settings: RegressorSettings) -> None:
     if settings.dropout > 0.0 and len(settings.hidden) < 2:
         raise InvalidValueError(
             f"Setting hidden is {settings.hidden}; dropout acts between hidden layers, so it needs at least two of "
-            "them. Add one, or set dropout=0."
+            "them. Add one."
         )
     require_ranges({field.name: getattr(settings, field.name) for field in fields(settings)}, _RANGES)
 

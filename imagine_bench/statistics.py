@@ -191,7 +191,7 @@ def gain(
     if min(len(a), len(b)) < 2 or np.isnan(value):
         return Estimate(value, float("nan"), float("nan"))
     draws = _relative(_resample(a, rng, resamples), _resample(b, rng, resamples))
-    if np.isnan(draws).mean() > (1.0 - level) / 2.0:  # where the base is 0 the gain is boundless
+    if np.isnan(draws).mean() >= (1.0 - level) / 2.0:  # where the base is 0 the gain is boundless
         return Estimate(value, float("nan"), float("nan"))
     return Estimate(value, *_percentiles(np.where(np.isnan(draws), np.inf, draws), level))
 

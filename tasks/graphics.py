@@ -7,8 +7,9 @@ import sys
 
 from imagine_bench.errors import SetupError
 
-PLATFORMS = ("", "egl", "glfw", "osmesa")
-"""What ``MUJOCO_GL`` may be on Linux where pictures are wanted."""
+PLATFORMS = ("egl", "glfw", "osmesa")
+_ALSO = {"", "glx", *("disable", "disabled", "off", "false", "0"), *("enable", "enabled", "on", "true", "1")}
+"""What MuJoCo takes too: drawing switched off, which the first picture then says, or left to it."""
 
 
 def choose_platform() -> None:
@@ -22,8 +23,8 @@ def choose_platform() -> None:
     """
     if sys.platform != "linux":
         return
-    chosen = os.environ.get("MUJOCO_GL", "")
-    if chosen.lower() not in PLATFORMS:
-        raise SetupError(f"MUJOCO_GL is {chosen!r}; unset it, or give one of {', '.join(filter(None, PLATFORMS))}.")
+    chosen = os.environ.get("MUJOCO_GL", "").strip()
+    if chosen.lower() not in {*PLATFORMS, *_ALSO}:
+        raise SetupError(f"MUJOCO_GL is {chosen!r}; unset it, or give one of {', '.join(PLATFORMS)}.")
     os.environ["MUJOCO_GL"] = chosen or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")

@@ -146,7 +146,8 @@ class _Canvas:
         if gl is None:
             return
         if (self.pid, self.thread) != (os.getpid(), threading.get_ident()):
-            _inherited.append((gl, mjr))
+            _inherited.append((gl, gl._context, mjr))
+            gl._context = None  # its destructor would free it from here, or after the display was closed
             return
         gl.make_current()
         mjr.free()

@@ -136,8 +136,10 @@ def test_a_reward_threshold_without_dropout_is_refused() -> None:
         Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
 
 
-def test_a_filter_with_a_single_weight_sample_is_refused() -> None:
-    settings = Settings(model=WorldModelSettings(dropout=0.5), imagination=ImaginationSettings(weight_samples=1))
+@pytest.mark.parametrize(("dropout", "samples"), [(0.5, 1), (0.001, 10)], ids=["one", "dropout_rounds_to_0"])
+def test_a_filter_with_a_single_weight_sample_is_refused(dropout: float, samples: int) -> None:
+    model, imagination = WorldModelSettings(dropout=dropout), ImaginationSettings(weight_samples=samples)
+    settings = Settings(model=model, imagination=imagination)
     with pytest.raises(InvalidValueError, match=r"there is one\. Set model\.dropout above 0 and imagination\.weight"):
         Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
     Imagination(2, 2, settings, filtered=False, seeds=SeedTree(0), device=CPU)

@@ -211,6 +211,29 @@ def test_a_platform_that_does_not_exist_is_named():
     assert "SetupError: MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa." in done.stderr
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
+def test_scenes_of_several_threads_end_in_silence():
+    script = """
+        from concurrent.futures import ThreadPoolExecutor
+        import numpy as np
+        from imagine_bench.tasks.arrow_puzzle import SPEC
+        from imagine_bench.tasks.macro_env import agent_eye
+        from imagine_bench.tasks.arrow_world import ArrowWorld
+        from imagine_bench.tasks.scenes.appearance import appearance
+        states, world = np.array([[0, 1, 2, 1]]), ArrowWorld(appearance("clean"))
+        world.place((0, 1, 2, 1), np.random.default_rng(0))
+        eye = agent_eye(world.model)
+        with ThreadPoolExecutor(3) as pool:
+            drawn = [pool.submit(SPEC.render_macrostates, states, "clean", np.random.default_rng(0)) for _ in range(3)]
+            frames = [job.result() for job in drawn]
+            pool.submit(eye.frame, world.data).result()
+        eye.close()
+        print(all(np.array_equal(frames[0], frame) for frame in frames))
+    """
+    done = run_script(script)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
+
+
 def test_drawing_in_another_thread_is_one_clear_error(world):
     eye = agent_eye(world.model)
     eye.frame(world.data)

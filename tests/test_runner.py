@@ -27,7 +27,7 @@ from imagine_bench.interfaces import AgentContext, Transition
 from imagine_bench.protocol import Protocol, protocol
 from imagine_bench.results import Checkpoint, RunResult
 from imagine_bench.runs import Progress, RunSpec
-from imagine_bench.seeding import SeedTree, episode_seed
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, episode_seed
 
 _TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
 
@@ -56,6 +56,20 @@ def same_but_for_time(a: RunResult, b: RunResult) -> bool:
 
     arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
     return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
+
+
+@pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
+def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
+) -> None:
+    asked = []
+    for name in ("examples", "imagine_courses", "ask"):
+        real = getattr(runner, name)
+        monkeypatch.setattr(
+            runner, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
+        )
+    do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
+    assert set(asked) == {("examples", purpose), ("imagine_courses", purpose), ("ask", purpose)}
 
 
 def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:

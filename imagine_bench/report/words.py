@@ -97,7 +97,7 @@ def score_text(score: Score) -> str:
 
 
 def estimate_text(estimate: Estimate) -> str:
-    """``+6.3 [−2.0, +14.1]``, or without the brackets where one seed allows no interval."""
+    """``+6.3 [−2.0, +14.1]``, or without the brackets where there is no interval: one seed, or a boundless gain."""
     if math.isnan(estimate.low):
         return signed_percent(estimate.value)
     return f"{signed_percent(estimate.value)} [{signed_percent(estimate.low)}, {signed_percent(estimate.high)}]"
