@@ -1,5 +1,6 @@
 """A bench as it is kept for good: ``protocol.json``, ``environment.json``, ``sittings.json`` and the report's
 ``results.csv``, without run folders. Every success rate, length and cost is in it; pictures and imaginations are not.
+What was not finished when it was kept is read like any unfinished bench.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench.errors import ArtefactError
+from imagine_bench.partial import largest_part
 from imagine_bench.results import BenchResult, Checkpoint, RunResult
-from imagine_bench.store import bench_facts, read_protocol
+from imagine_bench.store import read_protocol
 
 _RESULTS = "results.csv"
 _COUNTS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
@@ -32,8 +34,7 @@ def load_archive(folder: Path) -> BenchResult:
     Raises:
         ArtefactError: It is damaged, or not of agents; the message names the file.
     """
-    path = folder / _RESULTS
-    protocol = read_protocol(folder)
+    path, whole = folder / _RESULTS, read_protocol(folder)
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     try:
         for row in csv.DictReader(io.StringIO(path.read_text())):
@@ -42,8 +43,9 @@ def load_archive(folder: Path) -> BenchResult:
         raise ArtefactError(
             f"{path} is not the table of a bench of agents: {error!r}. It was left untouched."
         ) from error
-    runs = tuple(_run(folder, agent, seed, tuple(points)) for (agent, seed), points in rows.items())
-    return BenchResult(protocol=protocol, runs=runs, **bench_facts(folder))
+    wanted = [(agent, seed) for agent in whole.agents for seed in whole.seeds]
+    reached = {pair: rows[pair][-1].episodes if pair in rows else 0 for pair in wanted}
+    return largest_part(whole, reached, lambda agent, seed: _run(folder, agent, seed, tuple(rows[agent, seed])), folder)
 
 
 def _checkpoint(row: Mapping[str, str]) -> Checkpoint:

@@ -101,8 +101,8 @@ class Report:
     folder: Annotated[Path | None, tyro.conf.Positional] = None
     """The bench's folder; by default the newest."""
     beside: tuple[Path, ...] = ()
-    """Folders of other benches, or of results that were kept, whose agents are shown beside it; all else in their
-    protocols must be the same."""
+    """Folders of other benches, or of results that were kept, whose agents are shown beside it, or where those are
+    the same, whose seeds; all else in their protocols must be the same."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 

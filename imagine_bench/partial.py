@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from imagine_bench import run_folder
@@ -29,17 +30,35 @@ def load_so_far(folder: Path) -> BenchResult:
     if not store.missing():
         return load_bench(folder)
     reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
+    return largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
+
+
+def largest_part(
+    whole: Protocol, reached: Mapping[tuple[str, int], int], load: Callable[[str, int], RunResult], folder: Path
+) -> BenchResult:
+    """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
+
+    Args:
+        whole: Its protocol.
+        reached: The last budget with results of every agent and seed; 0 where there are none.
+        load: Reads the run of an agent and seed.
+        folder: Where the bench's files lie.
+
+    Raises:
+        ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
+    """
     part = _largest_table(whole, reached)
+    missing = tuple(
+        f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
+        for (agent, seed), at in reached.items()
+        if at < whole.budgets[-1]
+    )
     return BenchResult(
         protocol=part,
-        runs=tuple(_load(store.run_folder(agent, seed), part) for agent in part.agents for seed in part.seeds),
+        runs=tuple(cut(load(agent, seed), part) for agent in part.agents for seed in part.seeds),
         **bench_facts(folder),
-        whole=whole,
-        missing=tuple(
-            f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
-            for (agent, seed), at in reached.items()
-            if at < whole.budgets[-1]
-        ),
+        whole=whole if missing else None,
+        missing=missing,
     )
 
 
@@ -49,7 +68,7 @@ def _reached(store: BenchStore, agent: str, seed: int) -> int:
     return run_folder.reached(folder) if run_folder.is_done(folder) or load_newest(folder / "checkpoints") else 0
 
 
-def _largest_table(whole: Protocol, reached: dict[tuple[str, int], int]) -> Protocol:
+def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:
     """The protocol that is complete: among all cuts through the budgets, the one that leaves most results."""
 
     def seeds_at(budget: int) -> tuple[int, ...]:
@@ -66,8 +85,8 @@ def _largest_table(whole: Protocol, reached: dict[tuple[str, int], int]) -> Prot
     return dataclasses.replace(whole, seeds=seeds, budgets=budgets[:count])
 
 
-def _load(folder: Path, part: Protocol) -> RunResult:
-    return cut(run_folder.load_run(folder) if run_folder.is_done(folder) else _unfinished(folder), part)
+def _load(folder: Path) -> RunResult:
+    return run_folder.load_run(folder) if run_folder.is_done(folder) else _unfinished(folder)
 
 
 def cut(result: RunResult, part: Protocol) -> RunResult:

@@ -1,4 +1,7 @@
-"""Several benches as one: different agents on the same test, each measured by its own command."""
+"""Several benches as one, each measured by its own command: other agents on the same test, or other seeds of the same.
+
+The latter is how a bench is shared out among machines that have no disk in common.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,22 @@ from imagine_bench.partial import cut, load_so_far
 from imagine_bench.protocol import Protocol, digest
 from imagine_bench.results import BenchResult
 
-_OWN = ("agents", "settings_digest", "encoder", "codes")
+_OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
 def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
-    """Read several benches, finished or not or in the form they are kept in, that differ only in their agents.
+    """Read several benches, finished or not or in the form they are kept in, that differ only in agents or in seeds.
 
-    Seeds and budgets are those that all of them have.
+    Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that
+    any has. Budgets are those of all.
 
     Args:
         folders: Theirs.
         root: Folder of all benches; the result's own is a new one in it, named by what was compared.
 
     Raises:
-        InvalidValueError: They differ in more, an agent is in two of them, or no seed or budget is in all.
+        InvalidValueError: They differ in more, an agent's seed is in two of them, or no seed or budget is in all.
         ArtefactError: One is no bench of control, has nothing to show, or is damaged.
     """
     results = [load_archive(folder) if is_archive(folder) else load_so_far(folder) for folder in folders]
@@ -45,34 +49,46 @@ def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
 
 
 def _joined(protocols: Sequence[Protocol], folders: Sequence[Path]) -> Protocol:
-    agents = tuple(agent for protocol in protocols for agent in protocol.agents)
-    if len(set(agents)) < len(agents):
-        raise InvalidValueError(f"The benches have an agent in common ({', '.join(agents)}); give each agent once.")
-    first = protocols[0]
+    first, same = protocols[0], len({protocol.agents for protocol in protocols}) == 1
+    agents = first.agents if same else _all([protocol.agents for protocol in protocols], "an agent")
+    digests = [protocol.settings_digest for protocol in protocols]  # empty, so unknown, in the oldest ones
+    seeds = [protocol.seeds for protocol in protocols]
     for protocol, folder in zip(protocols, folders, strict=True):
         for field in dataclasses.fields(Protocol):
             ours, theirs = getattr(first, field.name), getattr(protocol, field.name)
-            if field.name not in (*_OWN, "seeds", "budgets") and ours != theirs:
+            if field.name not in _OWN and ours != theirs:
                 raise InvalidValueError(
                     f"{folder} has {field.name} {theirs!r} where {folders[0]} has {ours!r}; benches that are shown "
-                    "together differ in their agents only."
+                    "together differ in their agents or in their seeds only."
                 )
     return dataclasses.replace(
         first,
         agents=agents,
-        settings_digest=digest([protocol.settings_digest for protocol in protocols]),
-        seeds=_common([protocol.seeds for protocol in protocols], "seeds"),
+        settings_digest=_one(digests, "are of different settings") or "" if same else digest(digests),
+        seeds=tuple(sorted(_all(seeds, "a seed"))) if same else _common(seeds, "seeds"),
         budgets=_common([protocol.budgets for protocol in protocols], "budgets"),
-        encoder=_one([protocol.encoder for protocol in protocols]),
-        codes=_one([protocol.codes for protocol in protocols]),
+        encoder=_one([protocol.encoder for protocol in protocols], "see through different encoders"),
+        codes=_one([protocol.codes for protocol in protocols], "see through different encoders"),
     )
 
 
-def _one(encoders: Sequence[str | None]) -> str | None:
-    found = sorted({encoder for encoder in encoders if encoder is not None})
+def _one(values: Sequence[str | None], complaint: str) -> str | None:
+    found = sorted({value for value in values if value is not None})
     if len(found) > 1:
-        raise InvalidValueError(f"The benches see through different encoders ({', '.join(found)}); give those of one.")
+        raise InvalidValueError(
+            f"The benches {complaint} ({', '.join(value or 'unknown' for value in found)}); give those of one."
+        )
     return found[0] if found else None
+
+
+def _all(values: Sequence[tuple[Any, ...]], name: str) -> tuple[Any, ...]:
+    found = tuple(value for each in values for value in each)
+    if len(set(found)) < len(found):
+        raise InvalidValueError(
+            f"The benches have {name} in common ({', '.join(map(str, found))}). Give benches of different agents, or "
+            "of different seeds of the same agents."
+        )
+    return found
 
 
 def _common(values: Sequence[tuple[int, ...]], name: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Benches of different agents, shown as one."""
+"""Benches of different agents, or of different seeds of the same agents, shown as one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_runner import small
 
+from imagine_bench.archive import load_archive
 from imagine_bench.bench import bench
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
@@ -46,7 +47,8 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("agents", "changes", "words"),
     [
-        (("oracle",), {}, "an agent in common"),
+        (("oracle",), {}, "a seed in common"),
+        (("oracle", "random"), {}, "an agent in common"),
         (("random",), {"appearance": "mild"}, "has appearance 'mild' where .* has 'clean'"),
         (("random",), {"seeds": (5,)}, "have no seeds in common"),
         (("random",), {"budgets": (3,)}, "have no budgets in common"),
@@ -59,6 +61,24 @@ def test_what_cannot_be_compared_is_refused(
     other = do(tmp_path / "other", *agents, **changes)
     with pytest.raises(InvalidValueError, match=words):
         load_together([first, other], tmp_path)
+
+
+def test_seeds_of_two_benches_are_those_of_one(tmp_path: Path) -> None:
+    whole = load_bench(do(tmp_path / "whole", "oracle", "random", seeds=(0, 1, 2)))
+    late = do(tmp_path / "there", "oracle", "random", seeds=(2,))
+    early = do(tmp_path / "here", "oracle", "random", seeds=(0, 1))
+    joined = load_together([late, early], tmp_path)
+    assert joined.protocol == whole.protocol
+    for agent in ("oracle", "random"):
+        assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
+
+
+@pytest.mark.parametrize("digest", ["another", ""])
+def test_seeds_of_other_settings_are_refused(tmp_path: Path, digest: str) -> None:
+    here = do(tmp_path, "random", seeds=(0,), settings_digest="one")
+    there = do(tmp_path, "random", seeds=(1,), settings_digest=digest)
+    with pytest.raises(InvalidValueError, match=rf"of different settings \(.*{digest or 'unknown'}"):
+        load_together([here, there], tmp_path)
 
 
 def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,6 +104,17 @@ def test_kept_results_say_what_their_run_folders_said(tmp_path: Path) -> None:
     for mine, theirs in zip(with_runs.of("random"), without.of("random"), strict=True):
         assert mine.checkpoints == theirs.checkpoints
     assert write_report(without).is_file()
+
+
+def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Path) -> None:
+    folder = do(tmp_path, "oracle", "random", seeds=(0, 1), budgets=(4, 9))
+    assert main(["report", str(folder)]) == 0
+    rows = (folder / "report/results.csv").read_text().splitlines(keepends=True)
+    (folder / "results.csv").write_text("".join(row for row in rows if not row.startswith("random,1,9,")))
+    part = load_archive(folder)
+    assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (4, 9))
+    assert part.whole == load_bench(folder).protocol
+    assert part.missing == ("random seed 1: 4 of 9 real episodes",)
 
 
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
