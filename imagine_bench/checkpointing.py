@@ -7,6 +7,7 @@ complete.
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,13 +80,23 @@ def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
 
 
 def load_newest(folder: Path) -> Snapshot | None:
-    """The newest checkpoint below ``folder``, or None where there is none yet.
+    """The newest checkpoint below ``folder``, or None where there is none yet; the run may go on meanwhile.
 
     Raises:
         ArtefactError: It is damaged or not a checkpoint; the message names the file, which is left untouched.
     """
-    found = _checkpoints(folder)
-    return load_snapshot(found[-1]) if found else None
+    while found := _checkpoints(folder):
+        try:
+            return load_snapshot(found[-1])
+        except ArtefactError:
+            if found[-1].is_dir():  # else a newer one has replaced it
+                raise
+    return None
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether there is a checkpoint below ``folder``."""
+    return bool(_checkpoints(folder))
 
 
 def load_snapshot(checkpoint: Path) -> Snapshot:
@@ -125,13 +136,17 @@ def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def _unpacked(path: Path, digests: Mapping[str, str]) -> dict[str, NDArray[Any]]:
-    if sha256(path) != digests[path.name]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ArtefactError(f"Cannot read {path}: {error.strerror}.") from error
+    if hashlib.sha256(content).hexdigest() != digests[path.name]:
         raise ArtefactError(
             f"{path} is damaged: its content is not what was written. It was left untouched; delete the run's folder "
             "to start that run anew."
         )
     try:
-        arrays: dict[str, NDArray[Any]] = load(path.read_bytes())
+        arrays: dict[str, NDArray[Any]] = load(content)
     except SafetensorError as error:
         raise ArtefactError(f"{path} is not a safetensors file: {error}. It was left untouched.") from error
     return arrays

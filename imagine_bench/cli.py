@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from imagine_bench import registry
+from imagine_bench.archive import is_archive
 from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
 from imagine_bench.encoders import bundled
@@ -19,13 +20,13 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_k
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
-from imagine_bench.protocol import PRESETS
 from imagine_bench.store import newest_bench, newest_recording, read_protocol
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
 _TOGETHER = "imagine_bench.together:load_together"
+_ARCHIVED = "imagine_bench.archive:load_archive"
 _ABREAST = "(default: equal shares for local workers; with ray 1)"
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
@@ -270,7 +271,7 @@ class List:
         for title, names in {
             **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
             **{f"{name} learners": kind.learners for name, kind in KINDS.items()},
-            "presets": PRESETS,
+            **{f"{name} presets": registry.load(kind.presets) for name, kind in KINDS.items()},
             "studies": STUDIES,
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
@@ -379,7 +380,7 @@ def _value(text: str) -> Any:
 def _show(folder: Path, result: Any = None) -> None:
     """Write a bench's report, or that of another result of its kind, and print its table and where everything lies."""
     kind = kind_of(read_protocol(folder).task)
-    result = result or registry.load(kind.load_so_far)(folder)
+    result = result or registry.load(_ARCHIVED if is_archive(folder) else kind.load_so_far)(folder)
     page = registry.load(kind.write_report)(result)
     print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")

@@ -119,7 +119,8 @@ def _notes(gpu: str | None, gl: str) -> list[str]:
     cuda = any((found.name or "").startswith("nvidia-") for found in metadata.distributions())
     if gpu is None and cuda:
         notes.append(
-            "torch is a CUDA build of several GB and there is no NVIDIA GPU: 'make setup' takes the CPU build."
+            "torch is a CUDA build of several GB and there is no NVIDIA GPU: in a new .venv, "
+            "'TORCH_INDEX=https://download.pytorch.org/whl/cpu make setup' takes the CPU build."
         )
     if gpu is not None and any(name in gl.lower() for name in _SOFTWARE_GL):
         notes.append(f"Frames are drawn in software ({gl}) although there is a GPU; its driver's EGL is not installed.")

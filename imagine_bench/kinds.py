@@ -23,6 +23,7 @@ class Kind:
         tasks: Its registered tasks.
         learners: Its registered agents or regressors.
         protocol: The class of its protocols.
+        presets: What each protocol preset changes, by name.
         plan: Function from task, preset and options to a protocol and the encoders it needs, by kind.
         run: Function that carries out a RunSpec in a folder.
         load_run: Function that reads a finished run folder.
@@ -35,6 +36,7 @@ class Kind:
     tasks: Mapping[str, Any]
     learners: Mapping[str, Any]
     protocol: str
+    presets: str
     plan: str
     run: str
     load_run: str
@@ -49,6 +51,7 @@ KINDS: dict[str, Kind] = {
         tasks=registry.TASKS,
         learners=registry.AGENTS,
         protocol="imagine_bench.protocol:Protocol",
+        presets="imagine_bench.protocol:PRESETS",
         plan="imagine_bench.bench:plan_control",
         run="imagine_bench.runner:run",
         load_run="imagine_bench.run_folder:load_run",
@@ -61,6 +64,7 @@ KINDS: dict[str, Kind] = {
         tasks=registry.REGRESSIONS,
         learners=registry.REGRESSORS,
         protocol="imagine_bench.regression.protocol:RegressionProtocol",
+        presets="imagine_bench.regression.protocol:PRESETS",
         plan="imagine_bench.regression.protocol:plan",
         run="imagine_bench.regression.runner:run",
         load_run="imagine_bench.regression.results:load_run",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from imagine_bench import run_folder
-from imagine_bench.checkpointing import load_newest
+from imagine_bench.checkpointing import has_checkpoint, load_newest
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import read_json
 from imagine_bench.protocol import Protocol
@@ -65,7 +65,7 @@ def largest_part(
 def _reached(store: BenchStore, agent: str, seed: int) -> int:
     """The last budget of which a run has results; they lie in its newest checkpoint until it is done."""
     folder = store.run_folder(agent, seed)
-    return run_folder.reached(folder) if run_folder.is_done(folder) or load_newest(folder / "checkpoints") else 0
+    return run_folder.reached(folder) if run_folder.is_done(folder) or has_checkpoint(folder / "checkpoints") else 0
 
 
 def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:

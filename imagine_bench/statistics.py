@@ -17,6 +17,8 @@ from imagine_bench.errors import InvalidValueError
 
 LEVEL = 0.95
 RESAMPLES = 4000
+_DIGITS = 12
+"""Decimals of differences: success rates lie on a lattice, and two equal sums in another order must not differ."""
 
 Statistic = Literal["iqm", "mean"]
 
@@ -160,11 +162,11 @@ def difference(
         resamples: Bootstrap samples.
     """
     a, b = _table(treated), _table(base)
-    value = iqm(a) - iqm(b)
+    value = round(iqm(a) - iqm(b), _DIGITS)
     if min(len(a), len(b)) < 2:
         return Estimate(value, float("nan"), float("nan"))
     sides = [_summary(_resample(side, rng, resamples).reshape(resamples, -1), "iqm") for side in (a, b)]
-    return Estimate(value, *_percentiles(sides[0] - sides[1], level))
+    return Estimate(value, *_percentiles(np.round(sides[0] - sides[1], _DIGITS), level))
 
 
 def gain(

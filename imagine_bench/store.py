@@ -48,7 +48,7 @@ class BenchStore:
         path = self.folder / _PROTOCOL
         if not path.exists():
             write_json(path, self.protocol.as_dict())
-        elif read_protocol(self.folder) != self.protocol:
+        elif read_protocol(self.folder).as_dict() != self.protocol.as_dict():  # a list in a file may be a tuple
             raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
 
     def lock(self) -> AbstractContextManager[None]:
@@ -149,12 +149,12 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
 
 
 def newest_recording(root: Path) -> Path:
-    """The recording below ``root`` that was written last.
+    """The recording below ``root`` that was written last, of a run or of a plan.
 
     Raises:
         ArtefactError: There is none.
     """
-    found = sorted(root.glob("*/*/*/*/recording.rrd"), key=lambda path: path.stat().st_mtime)
+    found = sorted(root.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
     if not found:
         raise ArtefactError(
             f"There is no recording below {root}; run a bench with 'imagine-bench bench --task arrow_puzzle'."

@@ -76,7 +76,7 @@ def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
         learner.observe(transition((2, 0, 1), 2, (2, 1, 1), -1.0, ended=False), episode=1)
     after = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
     assert after.rewards[0] < 1.0
-    assert before > -6.0
+    assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by hint alone, too"
 
 
 def transition(code, action, following, reward, *, ended):  # type: ignore[no-untyped-def]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from imagine_bench import checkpointing
 from imagine_bench.checkpointing import Snapshot, load_newest, load_snapshot, save_snapshot
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentState
@@ -49,6 +50,23 @@ def test_the_newest_is_kept_alone(tmp_path: Path) -> None:
     newest = load_newest(tmp_path)
     assert newest is not None and newest.episode == 2
     assert load_newest(tmp_path / "nothing") is None
+
+
+def test_a_checkpoint_that_is_replaced_while_it_is_read_is_no_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_snapshot(tmp_path, snapshot(1))
+    real, calls = checkpointing.load_snapshot, []
+
+    def overtaken(checkpoint: Path) -> Snapshot:
+        calls.append(checkpoint)
+        if len(calls) == 1:
+            save_snapshot(tmp_path, snapshot(2))
+        return real(checkpoint)
+
+    monkeypatch.setattr(checkpointing, "load_snapshot", overtaken)
+    newest = load_newest(tmp_path)
+    assert newest is not None and newest.episode == 2 and len(calls) == 2
 
 
 def test_a_save_that_fails_half_way_keeps_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

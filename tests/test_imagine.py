@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 
 import fake_codes
 import numpy as np
@@ -15,6 +16,7 @@ from imagine_bench.agents.imagine.model import StructuredModel
 from imagine_bench.agents.imagine.outcomes import Outcomes
 from imagine_bench.agents.imagine.planner import Planner
 from imagine_bench.agents.imagine.settings import DynamicsSettings, ImagineSettings, OutcomeSettings, resolve
+from numpy.typing import NDArray
 
 from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
@@ -107,6 +109,36 @@ def test_plans_are_optimal_where_everything_is_known() -> None:
         assert exact[planner.worth(code).argmax()] == pytest.approx(max(exact))
         assert planner.worth(code) == pytest.approx(exact, abs=1.3), "a noisy-OR is never quite certain"
         assert planner.novelty(code).max() < 0.1
+
+
+class _Chain:
+    """Codes (0,) to (length - 1,): the only macro-action goes one further; the last is rewarded, unknown, and ends."""
+
+    n_actions = 1
+    outcomes = SimpleNamespace(rewards=np.array([10.0]))
+
+    def __init__(self, length: int, branches: int) -> None:
+        self.length, self.branches = length, branches
+
+    def futures(self, codes: NDArray[np.int64]) -> SimpleNamespace:
+        last = codes[:, :1] == self.length - 1  # [N, A]
+        following = np.zeros((len(codes), 1, self.branches, 1), dtype=np.int64)
+        following[:, 0, 0] = codes + 1
+        goes_on = np.zeros((len(codes), 1, self.branches))
+        goes_on[:, :, 0] = ~last
+        ends = last.astype(float)
+        return SimpleNamespace(following=following, goes_on=goes_on, reward=10.0 * ends, unknown=ends, terminates=ends)
+
+
+@pytest.mark.parametrize("depth", [1, 4, 5, 20])
+def test_values_are_discounted_once_a_macro_action_and_end_at_the_depth(depth: int) -> None:
+    settings = dataclasses.replace(ImagineSettings().planning, depth=depth, discount=0.9, novelty_discount=0.8)
+    planner = Planner(_Chain(5, settings.branches), settings)  # type: ignore[arg-type]
+    for place in range(5):
+        steps = 4 - place  # before the one that is rewarded
+        within = steps < depth
+        assert planner.worth((place,)) == pytest.approx([10.0 * 0.9**steps if within else 0.0], abs=1e-12)
+        assert planner.novelty((place,)) == pytest.approx([0.8**steps if within else 0.0], abs=1e-12)
 
 
 def _backed_up(code: tuple[int, ...], action: int, values: dict[tuple[int, ...], float]) -> float:

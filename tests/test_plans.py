@@ -207,6 +207,7 @@ def test_the_recording_shows_the_same_plans_with_the_arm_moving(
     for path_ in ("/real/frame", "/imagined/frame", "/imagined/strip", "/real/story"):
         assert timelines[path_] >= {"sim_time", "env_step", "plan"} and rows[path_] == steps + 2
     assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
+    assert timelines["/scene/right_l3"] >= {"sim_time", "env_step", "plan"}
 
 
 def test_of_runs_that_end_alike_the_one_that_was_there_first_is_asked(tmp_path: Path) -> None:

@@ -75,6 +75,39 @@ def test_entities_and_timelines(imagined: Path) -> None:
     assert all("imagined_depth" in found[path] for path in BY_DEPTH)
 
 
+def times(path: Path, entity: str, timeline: str) -> set[int]:
+    """When something was logged for an entity."""
+    return {
+        time
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and timeline in chunk.timeline_names
+        for time in chunk.to_record_batch().column(timeline).to_pylist()
+    }
+
+
+def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:
+    frames = {name: times(imagined, "/real/frame", name) for name in ("env_step", "sim_time")}
+    assert len(frames["env_step"]) >= 4
+    assert {name: times(imagined, "/scene/cube_0", name) for name in frames} == frames
+
+
+def cleared(path: Path, entity: str) -> list[int]:
+    """At which real steps an entity was taken away."""
+    return sorted(
+        step
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and any("Clear" in name for name in chunk.to_record_batch().schema.names)
+        for step in chunk.to_record_batch().column("env_step").to_pylist()
+    )
+
+
+def test_at_an_episode_s_end_nothing_more_is_expected(imagined: Path) -> None:
+    ends = cleared(imagined, "/real/q_table")
+    assert len(ends) == 2 and ends[-1] == max(times(imagined, "/real/frame", "env_step"))
+    for entity in ("/imagined/strip", "/imagined/uncertainty/modal"):
+        assert cleared(imagined, entity) == ends
+
+
 def test_on_the_depth_timeline_only_the_first_start_is_real(imagined: Path) -> None:
     depths = [
         depth
@@ -276,7 +309,7 @@ def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
     poses[:, 1, 0] = np.arange(4)
     motion = Motion(body_names=("still", "moves"), time_s=np.arange(4) / 20.0, poses_in_world=poses)
     with recording_file(tmp_path / "motion.rrd", "test", rrb.Blueprint()) as file:
-        log_motion(file, motion, start_s=1.0, sequences={"env_step": 3}, only_moved=True)
+        log_motion(file, motion, end_s=1.15, sequences={"env_step": 3}, only_moved=True)
     found = contents(tmp_path / "motion.rrd")
     assert "/scene/moves" in found
     assert "/scene/still" not in found

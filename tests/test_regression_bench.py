@@ -127,6 +127,9 @@ def test_a_checkpoint_gives_the_variants_back_in_the_order_of_the_protocol(
 
     monkeypatch.setattr(runner, "load_newest", other_order)
     assert list(run(spec, tmp_path / "run", silent).evaluations) == ["base", "low_data", "high_noise"]
+    run(spec, tmp_path / "whole", silent)
+    files = [tmp_path / name / "evaluation.npz" for name in ("run", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path: Path) -> None:

@@ -101,6 +101,14 @@ def test_difference_by_hand() -> None:
     assert (value, low, high) == (0.0, -1.0, 1.0)  # either side is 0 or 1 with 1/4 each: both ends have 1/16
 
 
+def test_a_difference_of_nothing_is_nothing() -> None:
+    """Success rates lie on a lattice: an end at exactly 0 must not be ahead by the rounding of its sums."""
+    ours, theirs = np.array([997, 999, 998]) / 1000, np.array([998, 995, 994]) / 1000
+    lows = [statistics.difference(ours, theirs, np.random.default_rng(seed)).low for seed in range(20)]
+    assert 0.0 in lows and all(low == 0.0 or abs(low) > 1e-6 for low in lows)
+    assert statistics.difference([0.1, 0.2, 0.3], [0.3, 0.1, 0.2], np.random.default_rng(0)).value == 0.0
+
+
 def test_gain_is_the_thesis_table() -> None:
     value, _, _ = statistics.gain([62.17], [42.18], rng())
     assert value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,12 @@ def test_two_benches_in_one_folder_are_refused(tmp_path: Path) -> None:
         pass  # and afterwards it is free
 
 
+def test_a_tuple_among_the_settings_is_the_list_of_its_file(tmp_path: Path) -> None:
+    protocol = small(overrides=(("controller.hidden", (64, 64)),))
+    for _ in range(2):
+        BenchStore(bench_folder(tmp_path, protocol), protocol).open()
+
+
 def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     store = opened(tmp_path)
     path = store.folder / "protocol.json"
@@ -87,6 +94,18 @@ def test_no_bench_and_no_recording(tmp_path: Path) -> None:
         newest_bench(tmp_path, ("robot_ik",))
     with pytest.raises(ArtefactError, match="There is no recording below"):
         newest_recording(tmp_path)
+
+
+def test_the_newest_recording_may_be_a_plan_s(tmp_path: Path) -> None:
+    run = tmp_path / "arrow_puzzle/quick-0123456789ab/imagine/seed_0/recording.rrd"
+    plan = run.parent / "plans/physics-100/recording.rrd"
+    for age_s, path in ((10.0, run), (0.0, plan)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        os.utime(path, (1e9 - age_s, 1e9 - age_s))
+    assert newest_recording(tmp_path) == plan
+    os.utime(run, (1e9 + 1.0, 1e9 + 1.0))
+    assert newest_recording(tmp_path) == run
 
 
 def test_imagined_rollouts_and_open_loop_come_back(tmp_path: Path) -> None:

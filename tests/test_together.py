@@ -28,6 +28,15 @@ def do(root: Path, *agents: str, **changes: Any) -> Path:
     return result.folder
 
 
+def kept_from(folder: Path, kept: Path) -> Path:
+    """What is kept of a bench for good."""
+    assert main(["report", str(folder)]) == 0
+    kept.mkdir()
+    for name in ("protocol.json", "environment.json", "sittings.json", "report/results.csv"):
+        (kept / Path(name).name).write_bytes((folder / name).read_bytes())
+    return kept
+
+
 def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
@@ -93,17 +102,18 @@ def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.Ca
 
 def test_kept_results_say_what_their_run_folders_said(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
-    assert main(["report", str(second)]) == 0
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    names = ("protocol.json", "environment.json", "sittings.json", "report/results.csv")
-    for name in names:
-        (kept / Path(name).name).write_bytes((second / name).read_bytes())
+    kept = kept_from(second, tmp_path / "kept")
     with_runs, without = (load_together([first, other], tmp_path / "joined") for other in (second, kept))
     assert with_runs.protocol == without.protocol and with_runs.folder == without.folder
     for mine, theirs in zip(with_runs.of("random"), without.of("random"), strict=True):
         assert mine.checkpoints == theirs.checkpoints
     assert write_report(without).is_file()
+
+
+def test_kept_results_have_a_report_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(kept_from(do(tmp_path, "oracle", "random"), tmp_path / "kept"))]) == 0
+    assert "oracle" in capsys.readouterr().out
+    assert (tmp_path / "kept/report/index.html").is_file()
 
 
 def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Path) -> None:

@@ -226,7 +226,6 @@ class ImagineAgent:
             "real_transitions": self.memory.real,
             "teacher/answers": self.memory.told,
             "model/outcomes": len(self.model.outcomes.kinds),
-            "planning/imagined_codes": self.planner.imagined,
         }
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 

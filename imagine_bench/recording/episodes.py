@@ -180,15 +180,15 @@ class _Story:
             self._recording.disable_timeline("imagined_depth")
             self._imagine(frame, macrostate, episode, step)
             frame, reward, terminated, truncated, info = env.step(np.int64(action))
-            began_s = self._clock_s
             self._clock_s += macro_duration_s(env.unwrapped)
             self._arrive(episode, frame)
-            self._move(env.unwrapped, episode, only_moved=True, began_s=began_s)
+            self._move(env.unwrapped, episode, only_moved=True)
             self._recording.log("/real/reward", rr.Scalars(float(reward)), strict=True)
             done, step = terminated or truncated, step + 1
             story = f"### Episode {episode}, after macro-action {step}\n\n{self._outcome(action, float(reward), info)}"
         ending = "**Solved.**" if info["is_success"] else "**Not solved.**"
         self._say(f"{story}\n\n{self._seen(np.asarray(info['macrostate']))}\n\n{ending}")
+        self._expect_no_more()
         self._clock_s += _STILL_S
 
     def _arrive(self, episode: int, frame: Frame) -> None:
@@ -199,13 +199,13 @@ class _Story:
         self._recording.set_time("episode", sequence=episode)
         self._recording.log("/real/frame", rr.Image(frame), strict=True)
 
-    def _move(self, scene: Any, episode: int, *, only_moved: bool, began_s: float | None = None) -> None:
+    def _move(self, scene: Any, episode: int, *, only_moved: bool) -> None:
         if isinstance(scene, SceneReader):
-            start_s = self._clock_s if began_s is None else began_s
             sequences = {"env_step": self._env_step, "episode": episode}
             if self._env_step == 0:
                 sequences["imagined_depth"] = 0
-            log_motion(self._recording, scene.motion(), start_s=start_s, sequences=sequences, only_moved=only_moved)
+            motion = scene.motion()
+            log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
 
     def _say(self, markdown: str) -> None:
         document = rr.TextDocument(f"*{self._spec.description}*\n\n{markdown}", media_type=rr.MediaType.MARKDOWN)
@@ -229,6 +229,15 @@ class _Story:
             self._recording.log(f"/real/q_values/{entity_name(name)}", rr.Scalars(float(value)), strict=True)
         table = rr.TextDocument(q_table(names, values, action), media_type=rr.MediaType.MARKDOWN)
         self._recording.log("/real/q_table", table, strict=True)
+
+    def _expect_no_more(self) -> None:
+        """Take away what was expected of the frame before: at an episode's end nothing more is carried out."""
+        stale = ["/real/q_table"] if isinstance(self._agent, ValueReader) else []
+        if isinstance(self._agent, Imaginer):
+            stale += ["/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in _KINDS)]
+            stale += ["/imagined/courses"] if is_random(self._spec.rules) else []
+        for path in stale:
+            self._recording.log(path, rr.Clear(recursive=False), strict=True)
 
     def _imagine(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
         """The agent's greedy plan, imagined from here and set beside what would really happen."""

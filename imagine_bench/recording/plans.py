@@ -67,12 +67,12 @@ class _PlanStory:
     ) -> None:
         self._recording, self._trained, self._env = recording, trained, env
         self._count, self._max_epistemic = count, max_epistemic
-        self._clock_s, self._env_step = 0.0, 0
+        self._clock_s, self._env_step, self._number = 0.0, 0, 0
 
     def tell(self, number: int) -> None:
         """One plan: the scene stands, the plan appears, the arm does it, and it is seen what came of it."""
-        recording, begins_s = self._recording, self._clock_s
-        recording.set_time("plan", sequence=number + 1)
+        recording, begins_s, self._number = self._recording, self._clock_s, number + 1
+        recording.set_time("plan", sequence=self._number)
         moments: list[tuple[float, int]] = []
 
         def on_plan(*_: object) -> None:
@@ -81,10 +81,9 @@ class _PlanStory:
             self._clock_s += _LOOK_S
 
         def on_step(_: int) -> None:
-            began_s = self._clock_s
             self._clock_s += macro_duration_s(self._env.unwrapped)
             self._env_step += 1
-            self._arrive(only_moved=True, began_s=began_s)
+            self._arrive(only_moved=True)
             moments.append((self._clock_s, self._env_step))
 
         plan = carry_out(
@@ -100,18 +99,13 @@ class _PlanStory:
         self._recording.set_time("sim_time", duration=clock_s)
         self._recording.set_time("env_step", sequence=env_step)
 
-    def _arrive(self, *, only_moved: bool, began_s: float | None = None) -> None:
+    def _arrive(self, *, only_moved: bool) -> None:
         scene: Any = self._env.unwrapped
         self._set_clocks(self._clock_s, self._env_step)
         if isinstance(scene, SceneReader):
-            start_s = self._clock_s if began_s is None else began_s
-            log_motion(
-                self._recording,
-                scene.motion(),
-                start_s=start_s,
-                sequences={"env_step": self._env_step},
-                only_moved=only_moved,
-            )
+            sequences = {"env_step": self._env_step, "plan": self._number}
+            motion = scene.motion()
+            log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
 
     def _show(self, plan: Plan, done: int) -> None:
         """What was imagined, and what is real so far."""

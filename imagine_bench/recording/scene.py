@@ -51,18 +51,19 @@ def log_shapes(recording: rr.RecordingStream, shapes: Sequence[Shape3D]) -> None
 
 
 def log_motion(
-    recording: rr.RecordingStream, motion: Motion, *, start_s: float, sequences: dict[str, int], only_moved: bool
+    recording: rr.RecordingStream, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool
 ) -> None:
     """Log the bodies' poses over one macro-action.
 
     Args:
         recording: Where to.
-        motion: K samples.
-        start_s: When it began on the timeline ``sim_time``, in seconds.
+        motion: K samples; a single one is how the scene stands, and logged whole.
+        end_s: When it was over on the timeline ``sim_time``, in seconds.
         sequences: Values of the sequence timelines, the same for all samples.
         only_moved: Leave out bodies that stood still.
     """
-    times = [rr.TimeColumn("sim_time", duration=start_s + motion.time_s)]
+    only_moved = only_moved and len(motion.time_s) > 1
+    times = [rr.TimeColumn("sim_time", duration=end_s - motion.time_s[-1] + motion.time_s)]
     times += [rr.TimeColumn(name, sequence=np.full(len(motion.time_s), value)) for name, value in sequences.items()]
     for index, body in enumerate(motion.body_names):
         poses = motion.poses_in_world[:, index]  # [K, 7]

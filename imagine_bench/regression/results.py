@@ -121,7 +121,9 @@ def rows_csv(rows: Sequence[Row]) -> str:
 def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
     """Write the results of a run and mark it as done."""
     write_rows(folder, rows)
-    flat = {f"{variant}/{name}": array for variant, arrays in evaluations.items() for name, array in arrays.items()}
+    flat = {  # sorted, for a checkpoint gives arrays back in any order
+        f"{variant}/{name}": array for variant, arrays in evaluations.items() for name, array in sorted(arrays.items())
+    }
     run_folder.write_arrays(folder / EVALUATION, flat)
     run_folder.mark_done(folder, ["config.json", METRICS, EVALUATION])
 
