@@ -81,6 +81,6 @@ def _rows(cards: list[EncoderCard]) -> dict[str, list[str]]:
 
 def _show(bar: tqdm, stage: str, done: float) -> None:
     if bar.desc != f"{stage}: ":
-        bar.set_description(stage)
+        bar.set_description(stage, refresh=False)
         bar.reset()
     bar.update(done - bar.n)

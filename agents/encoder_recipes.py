@@ -100,11 +100,11 @@ _CHAPTER_3 = Recipe(
     learning_rate=1e-4,
 )
 _BRIEF = Recipe(
-    name="thesis_brief",  # the thesis' network, latents and loss; a thousandth of its training
+    name="thesis_brief",  # the thesis' network, latents and loss; a thousandth of its pictures
     kl_warmup=0.2,
     frames=24_000,
     held_out_frames=4000,
-    steps=4000,
+    steps=1500,
     batch=64,
     learning_rate=1e-3,
     cosine=True,

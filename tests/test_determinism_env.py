@@ -11,6 +11,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
@@ -19,8 +20,6 @@ from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 SHADE = 16
 """Grey levels of 256: a ball that was turned a little is shaded differently all over."""
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
-WORLDS = tuple({registry.task(name).encoder: name for name in reversed(registry.TASKS)}.values())
-"""A task of each world; tasks of one world share its scene."""
 
 
 def make(task="arrow_puzzle", **options):

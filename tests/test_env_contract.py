@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
+from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
@@ -21,8 +22,6 @@ from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, SceneReader
 TASKS = tuple(registry.TASKS)
 INFO_KEYS = {"macrostate", "is_success", "success", "legal", "fault", "sim_time_s", "ik_error_m"}
 KINEMATIC = {"execution": "kinematic"}
-WORLDS = tuple({registry.task(name).encoder: name for name in reversed(TASKS)}.values())
-"""A task of each world; tasks of one world share its scene."""
 
 
 def make(task="arrow_puzzle", **options):
