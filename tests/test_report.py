@@ -148,6 +148,18 @@ def test_differences_and_gains_are_those_in_the_summary(folder: Path, page: Cell
     assert checked == 2 * 2 * 3
 
 
+def test_the_gain_s_plot_draws_the_table_and_the_thesis(result: BenchResult, folder: Path, tmp_path: Path) -> None:
+    data = collect(result)
+    assert set(data.thesis_gains) == {"imagination", "imagination_uncertainty"} < set(result.protocol.agents)
+    drawn = [list(zip(*line.get_data(), strict=True)) for line in plots.gain_figure(data).axes[0].get_lines()]
+    for agent, printed in data.thesis_gains.items():
+        assert [(budget, 100.0 * gain) for budget, gain in printed.items()] in drawn
+        assert [(budget, 100.0 * row.gain.value) for budget, row in data.comparisons[agent].items()] in drawn
+    assert (folder / "gain.png").is_file() and "](gain.png)" in (folder / "report.md").read_text(encoding="utf-8")
+    without = Protocol(task="arrow_puzzle", preset="thesis", agents=("imagination",), budgets=(2000,), seeds=(0,))
+    assert not (write_report(bench_result(tmp_path, protocol=without)).parent / "gain.png").exists()
+
+
 def test_areas_in_the_page_are_those_in_the_summary_and_in_the_markdown(folder: Path, page: Cells) -> None:
     summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv") if row["area"]}
     shown = {
@@ -223,7 +235,7 @@ def test_how_it_was_made_is_complete(result: BenchResult, folder: Path) -> None:
 
 def test_plots_take_the_pages_colour_and_do_not_share_ids(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
-    assert text.count("<svg") == 3
+    assert text.count("<svg") == 4  # success, gain, acceptance, open loop
     assert "currentColor" in text
     assert "#2b2b2f" not in text
     ids = re.findall(r'\bid="([^"]+)"', text)

@@ -136,6 +136,7 @@ class ReportData:
     areas: dict[str, dict[int, statistics.Estimate]]
     timing: dict[str, Timing]
     thesis: dict[str, dict[int, tuple[float, float]]]
+    thesis_gains: dict[str, dict[int, float]]
     thesis_source: str
     thesis_random: float | None
 
@@ -156,13 +157,14 @@ def collect(result: BenchResult) -> ReportData:
     facts, agents = spec.facts(), result.protocol.agents
     learners = [agent for agent in agents if registry.agent_entry(agent).learns]
     thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in agents}
+    thesis_gains = {agent: reference.gain(spec.reference, agent) if spec.reference else {} for agent in agents}
     open_loops = {agent: _open_loop(result.of(agent)) for agent in agents}
     return ReportData(
         result=result,
         spec=spec,
         facts=facts,
         scores={agent: _scores(result, agent, thesis[agent]) for agent in agents},
-        comparisons=_comparisons(result, spec.reference),
+        comparisons=_comparisons(result, thesis_gains),
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
@@ -170,6 +172,7 @@ def collect(result: BenchResult) -> ReportData:
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
+        thesis_gains={agent: gains for agent, gains in thesis_gains.items() if gains},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
         thesis_random=reference.random_success(spec.reference) if spec.reference else None,
     )
@@ -270,7 +273,7 @@ def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, floa
     return scores
 
 
-def _comparisons(result: BenchResult, thesis: str | None) -> dict[str, dict[int, Comparison]]:
+def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> dict[str, dict[int, Comparison]]:
     """Every learning agent against DQN, where DQN was run."""
     agents = result.protocol.agents
     if BASE_AGENT not in agents:
@@ -279,7 +282,6 @@ def _comparisons(result: BenchResult, thesis: str | None) -> dict[str, dict[int,
     base = result.success_rates(BASE_AGENT)
     comparisons: dict[str, dict[int, Comparison]] = {}
     for agent in learners:
-        printed = reference.gain(thesis, agent) if thesis else {}
         treated = result.success_rates(agent)
         comparisons[agent] = {}
         for index, budget in enumerate(result.protocol.budgets):
@@ -287,7 +289,7 @@ def _comparisons(result: BenchResult, thesis: str | None) -> dict[str, dict[int,
             comparisons[agent][budget] = Comparison(
                 difference=statistics.difference(treated[:, index], base[:, index], rng),
                 gain=statistics.gain(treated[:, index], base[:, index], rng),
-                thesis_gain=printed.get(budget),
+                thesis_gain=thesis[agent].get(budget),
             )
     return comparisons
 

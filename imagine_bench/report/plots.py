@@ -82,6 +82,8 @@ class Plot:
 def all_plots(data: ReportData) -> list[Plot]:
     """Success against real episodes, and where agents imagined, acceptance and open-loop error by depth."""
     plots = [_render("success", success_figure, data, "Success of each agent against real training episodes.")]
+    if set(data.thesis_gains) & set(data.comparisons):
+        plots.append(_render("gain", gain_figure, data, "Gain over DQN against real training episodes."))
     if data.acceptance:
         alt = "Share of imagined transitions kept, by real training episodes."
         plots.append(_render("acceptance", acceptance_figure, data, alt))
@@ -113,13 +115,34 @@ def success_figure(data: ReportData) -> Figure:
         axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
     _thesis_points(axes, data)
     _success_legend(axes, data)
-    printed = sorted({budget for rows in data.thesis.values() for budget in rows})
-    ticks = sorted({*data.budgets, *printed[:1], *printed[-1:]})  # more would overlap on the logarithmic axis
-    axes.set_xscale("log")
-    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
-    axes.minorticks_off()
-    axes.set(xlabel="real training episodes (logarithmic)", ylabel="test episodes solved (%)", ylim=(-2, 108))
-    _end_labels(axes, {a: 100.0 * s[data.budgets[-1]].value for a, s in data.scores.items()}, budgets[-1], ticks[-1])
+    axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
+    last = {agent: 100.0 * scores[data.budgets[-1]].value for agent, scores in data.scores.items()}
+    _end_labels(axes, last, budgets[-1], _episodes_axis(axes, data))
+    return figure
+
+
+def gain_figure(data: ReportData) -> Figure:
+    """Gain over DQN (%) against real training episodes, with 95 % intervals, beside the thesis' (figures 5.5 and 5.7).
+
+    Only agents of which the thesis gives a gain: others' may be tens of times as large.
+    """
+    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.axhline(0.0, **_REFERENCE_LINE)
+    last: dict[str, float] = {}
+    for agent, printed in data.thesis_gains.items():
+        axes.plot(list(printed), 100.0 * np.array(list(printed.values())), color=color(agent), **_THESIS_LINE)
+        gains = {budget: row.gain for budget, row in data.comparisons[agent].items() if np.isfinite(row.gain.value)}
+        if gains:
+            values = 100.0 * np.array([(gain.value, gain.low, gain.high) for gain in gains.values()])
+            axes.plot(list(gains), values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
+            axes.fill_between(list(gains), values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
+            last[agent] = values[-1, 0]
+    axes.set(ylabel="gain over DQN (%)")
+    axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
+    axes.plot([], [], color=_INK, label="thesis", **_THESIS_LINE)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=2, fontsize=9)
+    _end_labels(axes, last, data.budgets[-1], _episodes_axis(axes, data))
     return figure
 
 
@@ -202,6 +225,17 @@ def _log_if_positive(data: ReportData) -> str:
     values = [getattr(loop, name) for loop in data.open_loop.values() for name, _ in _KINDS]
     joined = np.concatenate(values)
     return "log" if (joined[np.isfinite(joined)] > 0).all() else "linear"
+
+
+def _episodes_axis(axes: Axes, data: ReportData) -> int:
+    """A logarithmic axis of real episodes, which ends at the budget that is returned."""
+    printed = sorted({budget for rows in data.thesis.values() for budget in rows})
+    ticks = sorted({*data.budgets, *printed[:1], *printed[-1:]})  # more would overlap
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
+    axes.minorticks_off()
+    axes.set_xlabel("real training episodes (logarithmic)")
+    return ticks[-1]
 
 
 def _thesis_points(axes: Axes, data: ReportData) -> None:
