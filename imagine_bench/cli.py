@@ -235,8 +235,8 @@ class Encoder:
     appearance: str = APPEARANCES[0]
     """Appearance level of the frames."""
     recipe: str = "default"
-    """How it is trained: default, thesis, thesis_brief (its network and loss in minutes; chapter 5 only), or
-    codes, for agents that read parts and their values."""
+    """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole picture), or codes,
+    for agents that read parts and their values."""
     seed: int = 0
     """Seed of data and training."""
     out: Path = Path("encoders")
