@@ -132,13 +132,22 @@ def test_strips_are_encoded_apart_with_shared_weights() -> None:
     assert not torch.allclose(mu.view(2, 3, 8)[:, 0], mu.view(2, 3, 8)[:, 1])
 
 
-def test_a_picture_is_read_whole_and_comes_back_whole() -> None:
-    recipe = replace(TINY, architecture="picture", latents=4)
-    vae = empty_vae(recipe, "small_rgb").to_empty(device="cpu")
+@pytest.mark.parametrize(
+    ("recipe", "preprocessing", "side", "latents"),
+    [
+        (replace(TINY, architecture="picture", latents=4), "small_rgb", (32, 32), 4),
+        (CHAPTER_5["joint"], "gray_strips", (64, 22), 8),
+    ],
+    ids=["small_rgb", "joint"],
+)
+def test_a_picture_is_read_whole_and_comes_back_whole(
+    recipe: Recipe, preprocessing: str, side: tuple[int, int], latents: int
+) -> None:
+    vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, torch.Generator().manual_seed(0))
-    batch = torch.rand(5, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    batch = torch.rand(5, 3, *side, generator=torch.Generator().manual_seed(1))
     mu, log_variance = vae.posterior(batch)
-    assert mu.shape == log_variance.shape == (5, 4)
+    assert mu.shape == log_variance.shape == (5, latents)
     assert vae.generate(mu).shape == vae.target(batch).shape == batch.shape
     torch.testing.assert_close(vae.target(batch).mean(dim=(1, 2, 3)), torch.zeros(5), rtol=0, atol=1e-5)
     other = batch.clone()
