@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import os
 import sys
 
@@ -19,12 +20,14 @@ def choose_platform() -> None:
     the calling thread: 64x64 pixels gain nothing from more, and threads do not survive a fork.
 
     Raises:
-        SetupError: ``MUJOCO_GL`` names no platform.
+        SetupError: ``MUJOCO_GL`` names no platform, or one whose library is missing.
     """
     if sys.platform != "linux":
         return
     chosen = os.environ.get("MUJOCO_GL", "").strip()
     if chosen.lower() not in {*PLATFORMS, *_ALSO}:
         raise SetupError(f"MUJOCO_GL is {chosen!r}; unset it, or give one of {', '.join(PLATFORMS)}.")
+    if chosen.lower() == "osmesa" and ctypes.util.find_library("OSMesa") is None:
+        raise SetupError("MUJOCO_GL is 'osmesa', but libOSMesa is not installed; install it or unset MUJOCO_GL.")
     os.environ["MUJOCO_GL"] = chosen or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
+from ctypes.util import find_library
 
 import mujoco
 import numpy as np
@@ -209,6 +210,12 @@ def test_a_stale_display_is_not_drawn_with():
 def test_a_platform_that_does_not_exist_is_named():
     done = run_script(_FRAME.format(before="", after=""), MUJOCO_GL="elg")
     assert "SetupError: MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa." in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux" or find_library("OSMesa") is not None, reason="OSMesa is installed")
+def test_a_platform_without_its_library_is_named():
+    done = run_script(_FRAME.format(before="", after=""), MUJOCO_GL="osmesa")
+    assert "SetupError: MUJOCO_GL is 'osmesa', but libOSMesa is not installed;" in done.stderr
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")

@@ -116,8 +116,8 @@ def success_figure(data: ReportData) -> Figure:
     _thesis_points(axes, data)
     _success_legend(axes, data)
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
-    last = {agent: 100.0 * scores[data.budgets[-1]].value for agent, scores in data.scores.items()}
-    _end_labels(axes, last, budgets[-1], _episodes_axis(axes, data))
+    last = {agent: (budgets[-1], 100.0 * scores[budgets[-1]].value) for agent, scores in data.scores.items()}
+    _end_labels(axes, last, _episodes_axis(axes, data))
     return figure
 
 
@@ -129,7 +129,7 @@ def gain_figure(data: ReportData) -> Figure:
     figure = Figure(figsize=(9.2, 3.6), layout="constrained")
     axes = figure.add_subplot()
     axes.axhline(0.0, **_REFERENCE_LINE)
-    last: dict[str, float] = {}
+    last: dict[str, tuple[float, float]] = {}
     for agent, printed in data.thesis_gains.items():
         axes.plot(list(printed), 100.0 * np.array(list(printed.values())), color=color(agent), **_THESIS_LINE)
         gains = {budget: row.gain for budget, row in data.comparisons[agent].items() if np.isfinite(row.gain.value)}
@@ -137,12 +137,12 @@ def gain_figure(data: ReportData) -> Figure:
             values = 100.0 * np.array([(gain.value, gain.low, gain.high) for gain in gains.values()])
             axes.plot(list(gains), values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
             axes.fill_between(list(gains), values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
-            last[agent] = values[-1, 0]
+            last[agent] = (max(gains), values[-1, 0])
     axes.set(ylabel="gain over DQN (%)")
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     axes.plot([], [], color=_INK, label="thesis", **_THESIS_LINE)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=2, fontsize=9)
-    _end_labels(axes, last, data.budgets[-1], _episodes_axis(axes, data))
+    _end_labels(axes, last, _episodes_axis(axes, data))
     return figure
 
 
@@ -155,9 +155,8 @@ def acceptance_figure(data: ReportData) -> Figure:
             list(rates), [100.0 * rate for rate in rates.values()], color=color(agent), marker="o", markersize=4.5
         )
     axes.set(xlabel="real training episodes", ylabel="transitions kept (%)", ylim=(-3, 106))
-    last = {agent: 100.0 * list(rates.values())[-1] for agent, rates in data.acceptance.items()}
-    end = max(max(rates) for rates in data.acceptance.values())
-    _end_labels(axes, last, end, end)
+    last = {agent: (max(rates), 100.0 * rates[max(rates)]) for agent, rates in data.acceptance.items()}
+    _end_labels(axes, last, max(end for end, _ in last.values()))
     axes.set_xlim(left=0)
     return figure
 
@@ -255,19 +254,19 @@ def _success_legend(axes: Axes, data: ReportData) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)
 
 
-def _end_labels(axes: Axes, last: dict[str, float], from_x: float, to_x: float) -> None:
+def _end_labels(axes: Axes, last: dict[str, tuple[float, float]], to_x: float) -> None:
     """Name each line in the right margin, spread so that no two names overlap, with a thin leader to its last point."""
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     placed: dict[str, float] = {}
     floor = -np.inf
-    for agent, value in sorted(last.items(), key=lambda item: item[1]):
+    for agent, (_, value) in sorted(last.items(), key=lambda item: item[1][1]):
         floor = max(value, floor + step)
         placed[agent] = floor
     excess = max(0.0, floor - high)
     for agent, y in placed.items():
         axes.annotate(
-            agent_words(agent).title, xy=(from_x, last[agent]), xycoords="data", xytext=(1.02, y - excess),
+            agent_words(agent).title, xy=last[agent], xycoords="data", xytext=(1.02, y - excess),
             textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
             arrowprops={**_LEADER, "color": color(agent)},
         )  # fmt: skip

@@ -1,7 +1,7 @@
 """The one import of ``dm_control.mjcf``: PyMJCF only composes here, and must not open a display of its own.
 
 dm_control initialises EGL while it is imported, which would leave a process with a display that neither survives a fork
-nor shuts down quietly. MuJoCo itself is imported first, with the platform that rendering chose.
+nor shuts down quietly. MuJoCo itself is imported first, with the platform that this package chose.
 """
 
 from __future__ import annotations
@@ -10,11 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from ..graphics import choose_platform
-
-choose_platform()
-
-import mujoco  # noqa: E402, F401
+import mujoco  # noqa: F401
 
 
 @contextmanager
