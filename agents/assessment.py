@@ -57,10 +57,6 @@ class Assessment(nn.Module):
         )
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
-    def draw_masks(self, rows: int, dropout: torch.Generator) -> list[Masks | None]:
-        """Fresh dropout masks for ``rows`` transitions, one entry a network."""
-        return [network.draw_masks(rows, dropout) for network in self.networks]
-
     @property
     def reward_network(self) -> MemberMLP:
         """The network whose first output is the reward."""
@@ -88,7 +84,7 @@ class Assessment(nn.Module):
             z: Shape (S, N, Z).
             action: Shape (S, N).
             next_z: Shape (S, N, Z).
-            masks: From :meth:`draw_masks`.
+            masks: Those of each network, or None where it drops nothing.
             parameters: Those of S networks, one network after the other, instead of its own.
         """
         read = self._read(z, action, next_z)

@@ -21,7 +21,7 @@ _BITS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 def dense_stack(
-    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], keep: Sequence[Tensor] | None, dropout: float,
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], keep: Sequence[Tensor] | None, scale: float,
     dtype: torch.dtype,
 ) -> Tensor:  # fmt: skip
     """A differentiable stack: ``relu(x W + b) * mask`` at each hidden layer, linear at the last.
@@ -31,14 +31,14 @@ def dense_stack(
         weights: One a layer, (E, in, out).
         biases: One a layer, (E, 1, out).
         keep: One a hidden layer, (E, N, out), int16: -1 keeps a unit, 0 drops it. None drops nothing.
-        dropout: The probability of 0 in ``keep``; what is kept is scaled by 1 / (1 - dropout).
+        scale: What a unit that is kept is multiplied by; not read without ``keep``.
         dtype: In which the hidden layers compute; the output layer computes in that of the weights.
 
     Returns:
         Shape (E, N, out).
     """
-    scale = 1.0 if keep is None else 1.0 / (1.0 - dropout)
-    output: Tensor = _Stack.apply(x, None if keep is None else tuple(keep), scale, dtype, *weights, *biases)
+    masks, scale = (None, 1.0) if keep is None else (tuple(keep), scale)
+    output: Tensor = _Stack.apply(x, masks, scale, dtype, *weights, *biases)
     return output
 
 

@@ -33,7 +33,7 @@ class FlatAdam:
         self._rate, self._clip = learning_rate, gradient_clip
         self._sizes = [sum(parameter.numel() for parameter in group) for group in groups]
         self.settle(torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters]).unsqueeze(0), 0)
-        self._gradient, self._mean, self._square = (torch.zeros_like(self.vector) for _ in range(3))
+        self._mean, self._square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         self._step = torch.zeros((), device=self.vector.device)
 
     def settle(self, home: Tensor, row: int) -> None:
@@ -50,7 +50,7 @@ class FlatAdam:
             DivergedError: A gradient is NaN or infinite; the parameters are left as they were.
         """
         gradients = torch.autograd.grad(loss, self.parameters)
-        self.descend(torch.cat([gradient.reshape(-1) for gradient in gradients], out=self._gradient))
+        self.descend(torch.cat([gradient.reshape(-1) for gradient in gradients]))
 
     def descend(self, gradient: Tensor) -> None:
         """Descend a gradient (P,) once; it is overwritten.

@@ -11,7 +11,7 @@ from imagine_bench.capabilities import Follow, SampledFutures
 from imagine_bench.interfaces import Frame
 
 from .encoder import Encoder
-from .imagination import TERMINAL, Imagination
+from .imagination import TERMINAL, Imagination, Weights
 
 _PREDICTIONS = 20_000
 """Mixtures predicted at once, over weight samples and rows, to bound memory."""
@@ -44,13 +44,14 @@ def sample_futures(
     z = encoder.encode(frames)[0].repeat_interleave(samples, dim=0)  # [R S, Z]
     action = np.repeat(actions, samples)  # [R S]
     macrostates, ended = encoder.read_macrostate(z), np.zeros(len(action), dtype=np.bool_)
+    weights = imagination.draw_weights(generator)
     read, earned, over = [], [], []
     for _ in range(depth):
         rewards = np.zeros(len(action), dtype=np.float32)
         alive = np.flatnonzero(~ended & (action >= 0))
         if alive.size:
             rows = torch.from_numpy(alive).to(z.device)
-            next_z, reward, p_terminated = _predict(imagination, z[rows], action[alive], generator)
+            next_z, reward, p_terminated = _predict(imagination, z[rows], action[alive], weights, generator)
             z[rows] = next_z
             macrostates[alive] = encoder.read_macrostate(next_z)
             rewards[alive], ended[alive] = reward.cpu().numpy(), (p_terminated > TERMINAL).cpu().numpy()
@@ -67,11 +68,10 @@ def sample_futures(
 
 
 def _predict(
-    imagination: Imagination, z: Tensor, action: NDArray[np.int64], generator: torch.Generator
+    imagination: Imagination, z: Tensor, action: NDArray[np.int64], weights: Weights, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Next latents (N, Z), rewards (N,) and P(terminal) (N,), under one draw of weight samples for all rows."""
+    """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""
     model, settings = imagination.model, imagination.settings
-    weights = imagination.draw_weights(generator)
     drawn = model.members * (1 if weights.dynamics is None else settings.weight_samples)
     size = max(1, _PREDICTIONS // drawn)
     parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)

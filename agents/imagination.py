@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 from . import mixture as mdn
@@ -149,10 +149,17 @@ class Imagination:
         return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self._reads_reward else None)
 
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
-        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'."""
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'.
+
+        Raises:
+            DivergedError: What the model predicts is NaN or infinite.
+        """
         model = self.model
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
-        next_z = mdn.sample(mdn.average(samples, model.members), self.settings.temperature, generator)
+        predicted = mdn.average(samples, model.members)
+        _require_finite(predicted.log_weights.exp())
+        next_z = mdn.sample(predicted, self.settings.temperature, generator)
+        _require_finite(next_z)
         reward, p_terminated = model.assess(z, action, next_z)
         doubt = None if weights.reward is None else model.reward_doubt(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, doubt)
@@ -242,3 +249,8 @@ class Imagination:
         self.threshold = float(arrays["threshold"])
         for name, generator in self._generators.items():
             snapshot.load_generator(generator, arrays[f"generator/{name}"])
+
+
+def _require_finite(imagined: Tensor) -> None:
+    if not bool(imagined.isfinite().all()):
+        raise DivergedError("What the world model imagines is no longer finite. Lower model.learning_rate.")

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.capabilities import Follow, ImaginedRollout, SampledFutures
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.capabilities import Follow, ImaginedRollout, SampledFutures, planned_actions
 from imagine_bench.interfaces import AgentContext, Frame
 
 from .controller import Controller
@@ -51,11 +50,7 @@ class ImaginingLearner(Learner):
         Raises:
             InvalidValueError: No depth to imagine, or actions that are none.
         """
-        planned = None if actions is None else [int(action) for action in actions[:depth]]
-        if depth < 1 or planned == []:
-            raise InvalidValueError(f"Asked to imagine depth {depth} along actions {actions}; give at least one.")
-        if planned is not None and not all(0 <= action < self.n_actions for action in planned):
-            raise InvalidValueError(f"Actions {planned} must lie in [0, {self.n_actions}).")
+        planned = planned_actions(actions, depth, self.n_actions)
         start, _ = self.perception.posterior(frame)
         steps = list(self._unroll(start.unsqueeze(0), planned, depth, rng))
         return self._picture(start.unsqueeze(0), steps)
@@ -97,9 +92,10 @@ class ImaginingLearner(Learner):
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
         kept = torch.cat([imagination.keeps(step) for step in imagined]).cpu().numpy()  # [D]
 
+        doubts = [decompose(step.samples) for step in imagined]
+
         def reduced(cause: str) -> NDArray[np.float32]:
-            parts = [imagination.score(getattr(decompose(step.samples), cause)) for step in imagined]
-            return torch.cat(parts).cpu().numpy()
+            return torch.cat([imagination.score(getattr(doubt, cause)) for doubt in doubts]).cpu().numpy()
 
         return ImaginedRollout(
             actions=torch.cat(actions).cpu().numpy(),

@@ -1,7 +1,7 @@
 """Chapter 3's second controller: the world model is learned on the side, and who is tested has never met the world.
 
-A first controller explores the world like a DQN and is not tested. Before each test a fresh one is trained for as many
-episodes in the learned model alone.
+A first controller explores the world like a DQN and is not tested. Before each test a fresh one is trained in the
+learned model alone, for ``imagination.rehearsal_episodes`` episodes however many real ones there were.
 """
 
 from __future__ import annotations

@@ -110,8 +110,7 @@ class MemberMLP(nn.Module):
         biases = self.biases if parameters is None else parameters[layers:]
         exact = weights[0].dtype
         dtype = self.hidden_dtype if torch.is_grad_enabled() and exact == torch.float32 else exact
-        dropout = dropout_bits(self.dropout) / 2**_PROBABILITY_BITS
-        return dense_stack(x, list(weights), list(biases), masks, dropout, dtype)
+        return dense_stack(x, list(weights), list(biases), masks, kept_scale(self.dropout), dtype)
 
 
 def by_network(networks: Iterable[MemberMLP], parameters: Sequence[Tensor]) -> list[Sequence[Tensor]]:

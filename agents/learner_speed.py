@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +15,7 @@ from .precision import hidden_dtype, settle
 from .presets import resolve
 from .products import product
 from .settings import WorldModelSettings
+from .speed import least_cpu_s
 from .world_model import Update, WorldModel, update_together
 
 LATENTS, ACTIONS = 24, 6
@@ -60,7 +59,7 @@ def measure(rounds: int = 25) -> ModelSpeed:
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
     models = {name: _model(settings, name) for name in ("float32", precision)}
     square = torch.randn(1, _SIDE, _SIDE, generator=draws).to(hidden_dtype(precision, device.type))
-    best = _least_cpu_s(
+    best = least_cpu_s(
         {
             "plain": lambda: plain.update(batch),
             "peak": lambda: product(square, square),
@@ -97,7 +96,7 @@ def measure_abreast(preset: str, seeds: int, rounds: int = 15) -> tuple[float, f
     lessons = [Update(model, _batch(settings.model.batch_size, draws), draws) for model in models]
     controllers = [Controller(LATENTS, ACTIONS, settings.controller, generator) for generator in weights]
     batches = [(controller, _batch(settings.controller.batch_size, draws)) for controller in controllers]
-    best = _least_cpu_s(
+    best = least_cpu_s(
         {
             "model": lambda: [update_together([lesson]) for lesson in lessons],
             "models": lambda: update_together(lessons),
@@ -127,14 +126,3 @@ def _flops(model: WorldModel, rows: int) -> float:
     """Two a weight and row forward, four backward, but that no gradient of the inputs is wanted."""
     weights = [[weight.numel() for weight in network.weights] for network in model.networks]
     return 2.0 * rows * sum(3 * sum(sizes) - sizes[0] for sizes in weights)
-
-
-def _least_cpu_s(actions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Least CPU seconds of each action: noise on a shared machine only ever adds."""
-    least = dict.fromkeys(actions, float("inf"))
-    for _ in range(rounds):
-        for name, action in actions.items():
-            start = time.process_time()
-            action()
-            least[name] = min(least[name], time.process_time() - start)
-    return least

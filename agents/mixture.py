@@ -6,6 +6,7 @@ Shapes: ``...`` any leading axes, ``K`` components, ``Z`` dimensions.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,10 @@ class Mixture:
     log_weights: Tensor
     means: Tensor
     log_sigmas: Tensor
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Mixture:
+        """The mixtures whose three tensors are changed alike, in their leading axes."""
+        return Mixture(change(self.log_weights), change(self.means), change(self.log_sigmas))
 
 
 def output_size(components: int, dimensions: int) -> int:
@@ -90,13 +95,6 @@ class _LogLikelihood(torch.autograd.Function):
 def mean(mixture: Mixture) -> Tensor:
     """Mean of each mixture. Shape (..., Z)."""
     return (mixture.log_weights.exp().unsqueeze(-1) * mixture.means).sum(dim=-2)
-
-
-def variance(mixture: Mixture) -> Tensor:
-    """Variance of each mixture, a dimension at a time: within components plus between them. Shape (..., Z)."""
-    weights = mixture.log_weights.exp().unsqueeze(-1)  # [..., K, 1]
-    between = (mixture.means - mean(mixture).unsqueeze(-2)).square()
-    return (weights * (torch.exp(2.0 * mixture.log_sigmas) + between)).sum(dim=-2)
 
 
 def sample(mixture: Mixture, temperature: float, generator: torch.Generator) -> Tensor:

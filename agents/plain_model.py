@@ -16,6 +16,7 @@ from torch.nn import functional
 from . import mixture as mdn
 from .memory import Batch
 from .settings import WorldModelSettings
+from .weights import initialise
 from .world_model import log_cosh
 
 
@@ -26,19 +27,19 @@ class PlainWorldModel:
         latent_size: Z.
         n_actions: A.
         settings: Sizes and rates; the defaults of the thesis, which clip no gradient and predict z', are required.
-        dropout: Draws the dropout masks.
+        generator: Draws the initial weights and the dropout masks.
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: WorldModelSettings, dropout: torch.Generator
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
     ) -> None:
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
         outputs = mdn.output_size(settings.components, latent_size)
         self.dynamics = _network(
-            (latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, dropout
+            (latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, generator
         )
-        self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout, dropout)
-        self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout, dropout)
+        self.reward = _network((latent_size, *settings.reward_hidden, 1), settings.dropout, generator)
+        self.termination = _network((latent_size, *settings.termination_hidden, 1), settings.dropout, generator)
         self.networks = (self.dynamics, self.reward, self.termination)
         self._adams = [torch.optim.Adam(net.parameters(), lr=settings.learning_rate) for net in self.networks]
 
@@ -83,4 +84,6 @@ def _network(sizes: tuple[int, ...], dropout: float, generator: torch.Generator)
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(sizes):
         layers += [nn.Linear(n_in, n_out), nn.ReLU(), _Dropout(dropout, generator)]
-    return nn.Sequential(*layers[:-2])
+    network = nn.Sequential(*layers[:-2])
+    initialise(network, generator)
+    return network

@@ -18,6 +18,7 @@ from .assessment import INPUTS
 from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
+from .layers import dropout_bits
 from .precision import PRECISIONS, settle
 from .ranges import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
 from .settings import START_STATES, Settings
@@ -118,6 +119,12 @@ def _require_ranges(settings: Settings) -> None:
     for name, (kind, known) in _WORDS.items():
         require_known(kind, flat[name], known)
     require_ranges(flat, _RANGES)
+    model = settings.model
+    if dropout_bits(model.dropout) and not (model.dynamics_hidden and (model.shared_hidden or model.reward_hidden)):
+        raise InvalidValueError(
+            "model.dropout acts on hidden layers: give model.dynamics_hidden and model.reward_hidden at least one each "
+            "or set it to 0."
+        )
 
 
 def checked_values(settings: Any, values: Mapping[str, Any]) -> Any:

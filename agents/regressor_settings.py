@@ -86,6 +86,7 @@ _RANGES = {
     "weight_samples": between(2, 10_000, "the spread of one sample is 0"),
     "components": between(1, 1_000),
     "members": between(1, 1_000),
+    "batch_size": between(8, 1e9, "layers are standardised over a batch"),
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 

@@ -127,7 +127,7 @@ class MixtureRegressor:
             arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
         values = {
             "settings": dataclasses.asdict(self.settings), "epoch": self._epoch,
-            "batches": self._model.network.batches, "filtered": False, "losses": self._losses,
+            "batches": self._model.network.batches, "losses": self._losses,
         }  # fmt: skip
         return AgentState(arrays=arrays, values=jsonable(values))
 
@@ -137,7 +137,7 @@ class MixtureRegressor:
         Raises:
             ArtefactError: The snapshot does not fit.
         """
-        require_fit(state, self.state())
+        require_fit(state, self.state(), equal=("settings",))
         arrays, names = state.arrays, ("value", "exp_avg", "exp_avg_sq", "step")
         self._model.optimiser.load({name: arrays[f"optimiser/{name}"] for name in names})
         for name, buffer in self._model.network.named_buffers():
@@ -198,17 +198,21 @@ class MixtureRegressor:
 def _require_data(datasets: tuple[Dataset, ...]) -> None:
     if not datasets:
         raise InvalidValueError("A regressor needs at least one dataset.")
-    rows, n_in = np.shape(datasets[0].inputs)
-    n_out = np.shape(datasets[0].targets)[-1]
+    first = _shapes(datasets[0])
+    if [len(shape) for shape in first] != [2, 2] or first[0][0] != first[1][0] or first[0][0] < 2:
+        raise InvalidValueError(f"Dataset 0 must have inputs (N, X) and targets (N, D), N at least 2, not {first}.")
     for index, data in enumerate(datasets):
-        shapes = (np.shape(data.inputs), np.shape(data.targets))
-        if shapes != ((rows, n_in), (rows, n_out)) or rows < 2:
+        if _shapes(data) != first:
             raise InvalidValueError(
-                f"Dataset {index} has inputs and targets of shapes {shapes}; all must have those of the first, "
-                f"{((rows, n_in), (rows, n_out))}, with at least 2 rows."
+                f"Dataset {index} has inputs and targets of shapes {_shapes(data)}; all must have those of the first, "
+                f"{first}."
             )
         if not (np.isfinite(data.inputs).all() and np.isfinite(data.targets).all()):
             raise InvalidValueError(f"Dataset {index} holds values that are not finite.")
+
+
+def _shapes(data: Dataset) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return np.shape(data.inputs), np.shape(data.targets)
 
 
 def _numpy(mixture: Mixture) -> Mixtures:

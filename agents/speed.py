@@ -38,7 +38,8 @@ def weight_samples(rows: int, samples: int, repeats: int) -> tuple[float, float]
         for t in range(samples):
             outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
 
-    return _least(lambda: sample_outputs(network, x, masks), loop, repeats)
+    least = least_cpu_s({"pass": lambda: sample_outputs(network, x, masks), "loop": loop}, repeats)
+    return least["pass"], least["loop"]
 
 
 def training(networks: int, rows: int, updates: int, repeats: int) -> tuple[float, float]:
@@ -62,16 +63,16 @@ def training(networks: int, rows: int, updates: int, repeats: int) -> tuple[floa
             for _ in range(updates):
                 model.update(x[index : index + 1], y[index : index + 1])
 
-    return _least(as_one, one_by_one, repeats)
+    least = least_cpu_s({"together": as_one, "alone": one_by_one}, repeats)
+    return least["together"], least["alone"]
 
 
-def _least(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Least CPU seconds of each, measured in turns so that neighbours disturb both alike."""
-    seconds: tuple[list[float], list[float]] = ([], [])
-    for repeat in range(repeats + 1):  # the first turn warms up
-        for work, times in zip((first, second), seconds, strict=True):
+def least_cpu_s(actions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Least CPU seconds of each action, taken in turn: noise on a shared machine only ever adds."""
+    least = dict.fromkeys(actions, float("inf"))
+    for _ in range(rounds):
+        for name, action in actions.items():
             start = time.process_time()
-            work()
-            if repeat:
-                times.append(time.process_time() - start)
-    return min(seconds[0]), min(seconds[1])
+            action()
+            least[name] = min(least[name], time.process_time() - start)
+    return least

@@ -13,6 +13,7 @@ on the unit of y, and it treats all dimensions of y together.
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -41,7 +42,7 @@ def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> 
     count, rows, components, size = samples.means.shape
     piece = max(1, _CHUNK // (draws * count * count * components * size))
     parts = [
-        _divergence(Mixture(*(part[:, start : start + piece] for part in _parts(samples))), draws, generator)
+        _divergence(samples.map(itemgetter((slice(None), slice(start, start + piece)))), draws, generator)
         for start in range(0, rows, piece)
     ]
     return torch.cat(parts)
@@ -49,15 +50,11 @@ def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> 
 
 def _divergence(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:
     count, rows = samples.means.shape[:2]
-    flat = Mixture(*(part.flatten(0, 1).repeat_interleave(draws, dim=0) for part in _parts(samples)))
+    flat = samples.map(lambda part: part.flatten(0, 1).repeat_interleave(draws, dim=0))
     values = mdn.sample(flat, 1.0, generator).view(count, rows, draws, -1).transpose(1, 2)  # [T, S, N, D]
     # every value under every mixture s: [S', T, S, N]
-    every = Mixture(*(part[:, None, None] for part in _parts(samples)))
+    every = samples.map(lambda part: part[:, None, None])
     log_p = mdn.log_likelihood(every, values.unsqueeze(0))
     log_mean = torch.logsumexp(log_p, dim=0) - math.log(count)  # [T, S, N]
     own = log_p.diagonal(dim1=0, dim2=1).movedim(-1, 0)  # [T, S, N]
     return (own - log_mean).mean(dim=(0, 1)).clamp(0.0, math.log(count))
-
-
-def _parts(mixture: Mixture) -> tuple[Tensor, Tensor, Tensor]:
-    return mixture.log_weights, mixture.means, mixture.log_sigmas

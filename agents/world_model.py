@@ -180,12 +180,7 @@ class WorldModel(nn.Module):
         samples = 1 if weights is None else weights[0].shape[1]
         masks = None if weights is None else tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
         mixture = self._mixture(z.repeat(1, samples, 1), action.repeat(1, samples), masks)  # [E, T N, ...]
-        return Mixture(
-            *(
-                values.reshape(-1, rows, *values.shape[2:])
-                for values in (mixture.log_weights, mixture.means, mixture.log_sigmas)
-            )
-        )
+        return mixture.map(lambda values: values.reshape(-1, rows, *values.shape[2:]))
 
     @torch.no_grad()
     def assess(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:

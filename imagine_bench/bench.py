@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,13 +72,13 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
     names = {"encoder": "latents", "codes": "codes"}
     filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
     whole = protocol(task, preset, **{**changes, **filled})
-    if whole.after or whole.demonstrations or whole.questions:
+    if encoder or whole.after or whole.demonstrations or whole.questions:
         _check_abilities(whole, paths)
     return whole, paths
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
-    """Build every learner once, to see whether it can do what only some can."""
+    """Build every learner once, to see whether it can use its encoder and do what only some can."""
     for agent in wanted.agents:
         entry = registry.agent_entry(agent)
         if entry.learns:
@@ -144,7 +145,8 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
     with store.lock():
         missing = len(store.missing())
         if missing:
-            gl_renderer()  # fails here, in one sentence, rather than in every run
+            if kind_of(store.protocol.task).draws:
+                gl_renderer()  # fails here, in one sentence, rather than in every run
             _warn(store.begin_sitting(describe_environment()), store.folder)
             failures = _in_waves(store, paths, launcher)
             store.note_time()
@@ -178,7 +180,8 @@ def _noting_time(store: BenchStore, show: Observer) -> Observer:
 
     def observe(progress: Progress) -> None:
         nonlocal noted_s
-        show(progress)
+        with suppress(OSError):  # nobody reads the screen any more; the runs go on
+            show(progress)
         if time.monotonic() - noted_s > _NOTE_EVERY_S:
             store.note_time()
             noted_s = time.monotonic()

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Observation
 
 
@@ -148,6 +149,20 @@ class Imaginer(Protocol):
             depth: Longest rollout.
             rng: Draws components, noise and dropout masks.
         """
+
+
+def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: int) -> list[int] | None:
+    """What an :class:`Imaginer` is to imagine: the first ``depth`` of the actions, or None for its own choice.
+
+    Raises:
+        InvalidValueError: No depth to imagine, or actions that are none.
+    """
+    planned = None if actions is None else [int(action) for action in actions[:depth]]
+    if depth < 1 or planned == []:
+        raise InvalidValueError(f"Asked to imagine depth {depth} along actions {actions}; give at least one.")
+    if planned is not None and not all(0 <= action < n_actions for action in planned):
+        raise InvalidValueError(f"Actions {planned} must lie in [0, {n_actions}).")
+    return planned
 
 
 Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]

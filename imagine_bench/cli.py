@@ -17,6 +17,7 @@ from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
 from imagine_bench.encoders import bundled
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_known
+from imagine_bench.files import require_writable
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
@@ -204,7 +205,8 @@ class StudyCommand:
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
         where = launcher(self.launcher, self.workers)
         lines = run_study(study, self.task, root=self.out, launcher=where)
-        folder = self.out / self.task / f"study-{study.name}"
+        part = f"-{'-'.join(self.variants)}".replace(" ", "_").replace(",", "") if self.variants else ""
+        folder = self.out / self.task / f"study-{study.name}{part}"
         write_study(folder, study, lines)
         print(study_table(study, lines))
         print(f"\nStudy:      {folder / 'study.md'}")
@@ -246,6 +248,7 @@ class Encoder:
         """Train."""
         retrain = registry.load(_RETRAIN)
         spec = registry.task(self.task)
+        require_writable(self.out)
         print(retrain(spec, recipe=self.recipe, appearance=self.appearance, seed=self.seed, out=self.out))
 
 
@@ -349,7 +352,9 @@ def main(words: Sequence[str] | None = None) -> int:
         print(f"imagine-bench: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("imagine-bench: interrupted; the same command goes on from the last checkpoints.", file=sys.stderr)
+        resumes = isinstance(command, Bench | StudyCommand)
+        then = "goes on from the last checkpoints" if resumes else "begins anew"
+        print(f"imagine-bench: interrupted; the same command {then}.", file=sys.stderr)
         return INTERRUPTED
     return 0
 

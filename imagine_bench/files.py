@@ -12,9 +12,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
-from imagine_bench.errors import ArtefactError, BusyError, SetupError
+from imagine_bench.errors import ArtefactError, BusyError, ImagineBenchError, SetupError
 
 _REASONS = {
     errno.EACCES: "you may not write there; choose another folder with --out or change its permissions",
@@ -54,6 +55,16 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
+def require_writable(folder: Path) -> None:
+    """Make sure, before long work whose result is to lie in ``folder``, that it can; the folder is made if need be.
+
+    Raises:
+        SetupError: It cannot be made or written to.
+    """
+    with writing(make_folder(folder)), TemporaryFile(dir=folder):
+        pass
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names in ``folder`` survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
@@ -91,20 +102,38 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1) + "\n").encode())
 
 
-def read_json(path: Path, what: str) -> Any:
+def read_json(path: Path, what: str, holds: type = dict) -> Any:
     """What a JSON file holds.
 
     Args:
         path: The file.
         what: What it should be, for the error.
+        holds: The type of what it should hold.
+
+    Raises:
+        ArtefactError: It is missing or damaged; it is left untouched.
+    """
+    with reading(path, what):
+        found = json.loads(path.read_bytes())
+        if not isinstance(found, holds):
+            raise TypeError(f"it holds a {type(found).__name__}")
+        return found
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one sentence.
 
     Raises:
         ArtefactError: It is missing or damaged; it is left untouched.
     """
     try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise ArtefactError(f"{path} is not {what}: {error}. It was left untouched.") from error
+        yield
+    except FileNotFoundError as error:
+        raise ArtefactError(f"There is no {path}, {what}.") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, ImagineBenchError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise ArtefactError(f"{path} is not {what}: {reason}. It was left untouched.") from error
 
 
 def sha256(path: Path) -> str:

@@ -43,8 +43,8 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
         raise InvalidValueError(f"{out} does not end in .gif, the only format of films; give such an --out.")
     if out.exists():
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
-    make_folder(out.parent)
     pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
+    make_folder(out.parent)
     colours = pictures[0].quantize(128)
     frames = [picture.quantize(palette=colours, dither=Image.Dither.NONE) for picture in pictures]
     try:

@@ -7,7 +7,7 @@ of those, by what the rules say comes of them, since a model that is right on av
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,16 +123,13 @@ def probing(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation")
     )
 
 
-def answer(
-    agent: Imaginer, probe: Probing, seeds: SeedTree, on_progress: Callable[[int], None] = lambda _: None
-) -> Answers:
+def answer(agent: Imaginer, probe: Probing, seeds: SeedTree) -> Answers:
     """Imagine every transition, one step each.
 
     Args:
         agent: It is not changed.
         probe: What is asked.
         seeds: Names the generators that imagination draws from.
-        on_progress: Told how many are done.
     """
     rows = []
     for index, (frame, action) in enumerate(zip(probe.frames, probe.actions, strict=True)):
@@ -145,7 +142,6 @@ def answer(
             min(abs(float(step.rewards[0]) - outcome.reward) for outcome in possible),
             bool(step.p_terminated[0] > 0.5) in {outcome.terminated for outcome in possible},
         ))  # fmt: skip
-        on_progress(index + 1)
     right, epistemic, reward_error, end_right = (np.array(column) for column in zip(*rows, strict=True))
     return Answers(right=right, epistemic=epistemic, reward_error=reward_error, end_right=end_right)
 

@@ -22,6 +22,7 @@ class Kind:
     Attributes:
         tasks: Its registered tasks.
         learners: Its registered agents or regressors.
+        draws: Whether its runs need OpenGL.
         protocol: The class of its protocols.
         presets: What each protocol preset changes, by name.
         plan: Function from task, preset and options to a protocol and the encoders it needs, by kind.
@@ -35,6 +36,7 @@ class Kind:
 
     tasks: Mapping[str, Any]
     learners: Mapping[str, Any]
+    draws: bool
     protocol: str
     presets: str
     plan: str
@@ -50,6 +52,7 @@ KINDS: dict[str, Kind] = {
     "control": Kind(
         tasks=registry.TASKS,
         learners=registry.AGENTS,
+        draws=True,
         protocol="imagine_bench.protocol:Protocol",
         presets="imagine_bench.protocol:PRESETS",
         plan="imagine_bench.bench:plan_control",
@@ -63,6 +66,7 @@ KINDS: dict[str, Kind] = {
     "regression": Kind(
         tasks=registry.REGRESSIONS,
         learners=registry.REGRESSORS,
+        draws=False,
         protocol="imagine_bench.regression.protocol:RegressionProtocol",
         presets="imagine_bench.regression.protocol:PRESETS",
         plan="imagine_bench.regression.protocol:plan",
@@ -93,5 +97,4 @@ def require_options(task: str, options: Mapping[str, Any]) -> None:
     fields = [field.name for field in dataclasses.fields(registry.load(kind_of(task).protocol))]
     for name in options:
         if name not in fields:
-            allowed = ", ".join(field for field in fields if field not in ("task", "preset"))
-            raise InvalidValueError(f"{task} takes no {name.replace('_', '-')}; a bench of it is made of: {allowed}.")
+            raise InvalidValueError(f"{task} takes no --{name.replace('_', '-')}; leave it out.")

@@ -150,8 +150,9 @@ class LocalPool:
                 wait([source for child in running for source in child.sources], timeout=_POLL_S)
                 for child in running:
                     child.forward(on_progress)
-                failures += [failure for child in running if child.ended for failure in child.failures()]
-                running = [child for child in running if not child.ended]
+                ended = [child for child in running if child.ended]
+                failures += [failure for child in ended for failure in child.failures()]
+                running = [child for child in running if child not in ended]
         finally:
             for child in running:
                 child.stop()
@@ -196,16 +197,20 @@ class _Child:
 
     def forward(self, on_progress: Observer) -> None:
         """Read what the process has sent so far."""
+        while (message := self._next()) is not None:
+            if isinstance(message, Progress):
+                on_progress(message)
+            else:
+                index, self._reasons[index] = message
+
+    def _next(self) -> Progress | tuple[int, str] | None:
+        """What it sent next, or None for now; after the last message the process is gone."""
         try:
-            while not self._receiver.closed and self._receiver.poll():
-                message = self._receiver.recv()
-                if isinstance(message, Progress):
-                    on_progress(message)
-                else:
-                    index, self._reasons[index] = message
+            return self._receiver.recv() if not self._receiver.closed and self._receiver.poll() else None
         except (EOFError, OSError):
             self._receiver.close()
             self.process.join(_PATIENCE_S)
+            return None
 
     def stop(self) -> None:
         """End the process: its newest checkpoint is whole at any moment."""

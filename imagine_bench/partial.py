@@ -9,7 +9,7 @@ from pathlib import Path
 from imagine_bench import run_folder
 from imagine_bench.checkpointing import has_checkpoint, load_newest
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import read_json
+from imagine_bench.files import read_json, reading
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import BenchResult, RunResult
 from imagine_bench.runs import Counters
@@ -30,7 +30,11 @@ def load_so_far(folder: Path) -> BenchResult:
     if not store.missing():
         return load_bench(folder)
     reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
-    return largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
+    part = largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
+    if part.missing:
+        return part
+    last = tuple(f"{agent} seed {seed}: its recording" for agent, seed in store.missing())  # tested, but not at its end
+    return dataclasses.replace(part, whole=whole, missing=last)
 
 
 def largest_part(
@@ -106,7 +110,9 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
 def _unfinished(folder: Path) -> RunResult:
     snapshot = load_newest(folder / "checkpoints")
     assert snapshot is not None, "a run that has reached a budget has a checkpoint"
-    config, counters = read_json(folder / "config.json", "a run's configuration"), Counters.of(snapshot)
+    config = read_json(folder / "config.json", "a run's configuration")
+    with reading(folder / "checkpoints", "a run's checkpoint"):
+        counters = Counters.of(snapshot)
     training = counters.training()
     return RunResult(
         agent=config["agent"],

@@ -126,9 +126,11 @@ class Protocol(ProtocolData):
         if self.evaluation_episodes < 1:
             raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
         require_same_world(self.task, self.after)
-        if self.after_episodes < 1 or (not self.after and self.after_episodes != _AFTER_EPISODES):
+        if self.after_episodes < 1:
+            raise InvalidValueError(f"after_episodes is {self.after_episodes}; give at least 1.")
+        if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(
-                f"after_episodes is {self.after_episodes} with after {self.after}; give at least 1, and the tasks."
+                f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
             )
         for name in ("demonstrations", "questions", "open_loop_starts", "sampled_futures", "recorded_episodes"):
             if getattr(self, name) < 0:
@@ -214,6 +216,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
     values = {"settings": spec.settings, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    if "seeds" in values:  # in whatever order they are given, it is the same bench
+        values["seeds"] = tuple(sorted(values["seeds"]))
     return Protocol(task=task_name, preset=preset, **values)
 
 
@@ -245,9 +249,8 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
 
 def require_seeds(seeds: tuple[int, ...]) -> None:
     """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
-    require_ascending("seeds", tuple(sorted(seeds)), at_least=0)
-    if max(seeds) >= SEEDS:
-        raise InvalidValueError(f"seeds {seeds} must be below 2**24 = {SEEDS}.")
+    if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
+        raise InvalidValueError(f"seeds {seeds} must be one or more different integers from 0 to {SEEDS - 1}.")
     if len({tunes(seed) for seed in seeds}) > 1:
         raise InvalidValueError(
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "

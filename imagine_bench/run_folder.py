@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import read_json, sha256, write_bytes, write_json
+from imagine_bench.files import read_json, reading, sha256, write_bytes, write_json
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 FORMAT = "imagine_bench run 1"
@@ -47,8 +47,9 @@ def is_done(folder: Path) -> bool:
 def reached(folder: Path) -> int:
     """The last budget at which the run in ``folder`` was tested, 0 before the first."""
     path = folder / _METRICS
-    rows = list(csv.DictReader(io.StringIO(path.read_text()))) if path.is_file() else []
-    return int(rows[-1]["episodes"]) if rows else 0
+    with reading(path, "the metrics of a run"):
+        rows = list(csv.DictReader(io.StringIO(path.read_text()))) if path.is_file() else []
+        return int(rows[-1]["episodes"]) if rows else 0
 
 
 def check_config(folder: Path, config: Mapping[str, Any]) -> None:
@@ -65,8 +66,7 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     then = read_json(path, "a run's configuration")
     if then == now:
         return
-    fields = sorted({*then, *now}) if isinstance(then, dict) else []
-    name = next((name for name in fields if then.get(name) != now.get(name)), "format")
+    name = next(name for name in sorted({*then, *now}) if then.get(name) != now.get(name))
     raise ArtefactError(
         f"{folder} was begun with another {name} than this version would use; it was left untouched. Finish it with "
         "the version that began it, or choose another folder with --out."
@@ -142,7 +142,7 @@ def require_done(folder: Path) -> dict[str, Any]:
         ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
     """
     done = read_json(folder / _DONE, "the mark of a finished run")
-    if not isinstance(done, dict) or done.get("format") != FORMAT or "sha256" not in done:
+    if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
     for name, digest in done["sha256"].items():
         if sha256(folder / name) != digest:

@@ -21,6 +21,7 @@ from imagine_bench import registry
 from imagine_bench.environment import describe_environment
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.fidelity import measure_fidelity
+from imagine_bench.files import require_writable, write_json
 from imagine_bench.interfaces import Promises, SceneReader, TaskSpec
 from imagine_bench.seeding import SeedTree
 
@@ -85,18 +86,21 @@ def speed_report(out: Path, turns: int = TURNS, show: Callable[[str], None] = pr
         Whether every promise held.
 
     Raises:
-        InvalidValueError: Too few macro-actions to time.
+        InvalidValueError: Too few macro-actions to time, or a folder to write to.
+        SetupError: The file cannot be written.
     """
     if turns < 2 * _BLOCK:
         raise InvalidValueError(f"turns is {turns}; give at least {2 * _BLOCK} macro-actions: two blocks are timed.")
+    if out.is_dir():
+        raise InvalidValueError(f"{out} is a folder; give the JSON file to write.")
+    require_writable(out.parent)
     show("| what | required | measured | |\n|---|---|---|---|")
     figures = []
     for figure in measure(turns):
         figures.append(figure)
         show(f"| {figure.what} | {figure.required} | {figure.measured} | {'met' if figure.met else 'NOT MET'} |")
-    out.parent.mkdir(parents=True, exist_ok=True)
     facts = {"environment": describe_environment(), "figures": [asdict(figure) for figure in figures]}
-    out.write_text(json.dumps(facts, indent=2))
+    write_json(out, facts)
     return all(figure.met for figure in figures)
 
 

@@ -127,28 +127,6 @@ def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> 
     return means
 
 
-def probability_of_improvement(
-    ours: ArrayLike, theirs: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
-) -> Estimate:
-    """Probability that a random run of ``ours`` beats a random run of ``theirs``; a tie counts half.
-
-    Args:
-        ours: Shape (runs,) or (runs, strata); averaged over strata.
-        theirs: Shape (other runs,) or (other runs, strata).
-        rng: Draws the resamples, of each side independently.
-        level: Coverage of the interval.
-        resamples: Bootstrap samples.
-    """
-    a, b = _table(ours), _table(theirs)
-    if a.shape[1] != b.shape[1]:
-        raise InvalidValueError(f"The two sides have {a.shape[1]} and {b.shape[1]} strata; compare the same tasks.")
-    value = float(_share_won(a[None], b[None])[0])
-    if min(len(a), len(b)) < 2:
-        return Estimate(value, float("nan"), float("nan"))
-    draws = _share_won(_resample(a, rng, resamples), _resample(b, rng, resamples))
-    return Estimate(value, *_percentiles(draws, level))
-
-
 def difference(
     treated: ArrayLike, base: ArrayLike, rng: np.random.Generator, *, level: float = LEVEL, resamples: int = RESAMPLES
 ) -> Estimate:
@@ -193,7 +171,7 @@ def gain(
     if min(len(a), len(b)) < 2 or np.isnan(value):
         return Estimate(value, float("nan"), float("nan"))
     draws = _relative(_resample(a, rng, resamples), _resample(b, rng, resamples))
-    if np.isnan(draws).mean() >= (1.0 - level) / 2.0:  # where the base is 0 the gain is boundless
+    if np.isnan(draws).mean() >= (1.0 - level) / 2.0 - 10**-_DIGITS:  # where the base is 0 the gain is boundless
         return Estimate(value, float("nan"), float("nan"))
     return Estimate(value, *_percentiles(np.where(np.isnan(draws), np.inf, draws), level))
 
@@ -210,13 +188,6 @@ def _relative(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.floa
     """Relative gains of mean ``a`` over mean ``b``: two tables with a leading resamples axis to (resamples,)."""
     treated, base = a.mean(axis=(1, 2)), b.mean(axis=(1, 2))
     return np.where(base > 0, (treated - base) / np.where(base > 0, base, 1.0), np.nan)
-
-
-def _share_won(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of pairs that ``a`` wins: two tables with a leading resamples axis to (resamples,)."""
-    difference = a[:, :, None, :] - b[:, None, :, :]  # [resamples, runs, other runs, strata]
-    won: NDArray[np.float64] = ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(1, 2, 3))
-    return won
 
 
 def _resample(table: NDArray[np.float64], rng: np.random.Generator, resamples: int) -> NDArray[np.float64]:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import run_folder
-from imagine_bench.errors import ArtefactError, ImagineBenchError
-from imagine_bench.files import lock, make_folder, read_json, write_json
+from imagine_bench.errors import ArtefactError
+from imagine_bench.files import lock, make_folder, read_json, reading, write_json
 from imagine_bench.kinds import kind_of
 from imagine_bench.registry import load
 
@@ -79,11 +79,9 @@ class BenchStore:
             Names of facts that decide the bits and are not as in the first sitting.
         """
         path, first = self.folder / _ENVIRONMENT, environment
-        if path.exists():
-            first = read_json(path, "a bench's environment")
-            self._sittings = read_json(self.folder / _SITTINGS, "a bench's sittings")
-        else:
-            write_json(path, environment)
+        begun = path.exists()
+        if begun:
+            first, self._sittings = read_json(path, "a bench's environment"), _read_sittings(self.folder)
         self._began_s = time.monotonic()
         changed = [name for name in _IDENTITY if first.get(name) != environment.get(name)]
         self._sittings.append({
@@ -93,6 +91,8 @@ class BenchStore:
             "changed": {name: environment.get(name) for name in changed},
         })  # fmt: skip
         self.note_time()
+        if not begun:
+            write_json(path, environment)  # last, so that a bench with an environment has sittings too
         return changed
 
     def note_time(self) -> None:
@@ -126,7 +126,7 @@ def bench_facts(folder: Path) -> dict[str, Any]:
     Raises:
         ArtefactError: A file is missing or damaged; the message names it.
     """
-    sittings = read_json(folder / _SITTINGS, "a bench's sittings")
+    sittings = _read_sittings(folder)
     environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings}
     return {"environment": environment, "folder": folder, "wall_s": sum(sitting["wall_s"] for sitting in sittings)}
 
@@ -162,6 +162,11 @@ def newest_recording(root: Path) -> Path:
     return found[-1]
 
 
+def _read_sittings(folder: Path) -> list[dict[str, Any]]:
+    sittings: list[dict[str, Any]] = read_json(folder / _SITTINGS, "a bench's sittings", holds=list)
+    return sittings
+
+
 def _run_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / agent / f"seed_{seed}"
 
@@ -173,9 +178,5 @@ def read_protocol(folder: Path) -> Any:
         ArtefactError: It is missing or damaged; the message names it.
     """
     data = read_json(folder / _PROTOCOL, "a bench's protocol")
-    try:
+    with reading(folder / _PROTOCOL, "a bench's protocol"):
         return load(kind_of(data["task"]).protocol).from_dict(data)
-    except (TypeError, KeyError, ValueError, AttributeError, ImagineBenchError) as error:
-        raise ArtefactError(
-            f"{folder / _PROTOCOL} is not a bench's protocol: {error}. It was left untouched."
-        ) from error

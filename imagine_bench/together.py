@@ -15,6 +15,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.partial import cut, load_so_far
 from imagine_bench.protocol import Protocol, digest
 from imagine_bench.results import BenchResult
+from imagine_bench.store import read_protocol
 
 _OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
@@ -34,10 +35,10 @@ def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no seed or budget is in all.
         ArtefactError: One is no bench of control, has nothing to show, or is damaged.
     """
+    for folder in folders:
+        if not isinstance(read_protocol(folder), Protocol):
+            raise ArtefactError(f"{folder} is no bench of agents; only those can be shown together.")
     results = [load_archive(folder) if is_archive(folder) else load_so_far(folder) for folder in folders]
-    for result in results:
-        if not isinstance(result, BenchResult):
-            raise ArtefactError(f"{result.folder} is no bench of agents; only those can be shown together.")
     protocol = _joined([result.protocol for result in results], folders)
     return BenchResult(
         protocol=protocol,

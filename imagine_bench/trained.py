@@ -12,7 +12,7 @@ from imagine_bench import encoders, registry
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.checkpointing import load_newest
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.files import read_json
+from imagine_bench.files import read_json, reading
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import BenchResult, RunResult
@@ -62,19 +62,18 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
         UnknownNameError: No such encoder.
     """
-    config = read_json(folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
-    require_control(config["protocol"]["task"], folder)
-    protocol = Protocol.from_dict(config["protocol"])
-    spec = RunSpec(
-        protocol=protocol,
-        agent=config["agent"],
-        seed=config["seed"],
-        encoder=_encoder(protocol, config["agent"], encoder),
-    )
+    path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
+    config = read_json(path, what)
+    with reading(path, what):
+        task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
+        settings = tuple(sorted(_flat(config["settings"]).items()))
+    require_control(task, folder)
+    with reading(path, what):
+        protocol = Protocol.from_dict(config["protocol"])
+    spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
-    settings = tuple(sorted(_flat(config["settings"]).items()))
     as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
     agent.restore(snapshot.agent)

@@ -49,7 +49,8 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
     learner, rng = agent(), np.random.default_rng(0)
     assert isinstance(learner, Transferable)
     live(learner, range(30), rng)
-    real = len(learner.memory)
+    assert learner.diagnostics()["real_transitions"] == len(learner.memory)
+    live(learner, range(30, 31), rng)
     learner.carry_over()
     known = Dynamics(learner.sizes, ACTIONS, learner.settings.dynamics)
     for row in learner.memory.since(0):
@@ -58,7 +59,9 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
         assert np.array_equal(mine, all_of_it.evidence)
     assert learner.model.outcomes.causes is None
     assert not learner.q_values(Observation(frame=frame((0, 1, 0)))).any(), "nothing is known of the new task"
-    assert learner.diagnostics()["real_transitions"] == real
+    measured = learner.diagnostics()
+    assert set(measured) == {"real_transitions", "teacher/answers", "model/outcomes"}, "nothing yet of this task"
+    assert measured["real_transitions"] == 0
 
 
 @pytest.mark.parametrize("carried", [0.0, 0.5])
@@ -159,13 +162,13 @@ def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics()
     assert learner.question(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
     learner._learn(len(learner.memory))  # what was no surprise too
-    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.memory.real
+    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.memory.real()
     doubt = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     asked = ask(learner, 200)
     assert 0 < len(asked) < 200
     assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
     assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
-    assert (learner.memory.real, learner.memory.told) == (real, len(asked))
+    assert (learner.memory.real(), learner.memory.told()) == (real, len(asked))
     assert learner.diagnostics()["teacher/answers"] == len(asked)
     after = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     assert after <= doubt
@@ -197,7 +200,7 @@ def test_what_has_no_answer_is_not_asked_again() -> None:
         asked.append((code, action))
         learner.learn_answer(seen, actions, None)
     assert len(set(asked)) == 5
-    assert learner.memory.told == 0
+    assert learner.memory.told() == 0
     assert learner.memory.in_vain == set(asked)
 
 

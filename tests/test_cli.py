@@ -48,7 +48,12 @@ def bench_words(out: Path, *more: str) -> list[str]:
         (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
         (["--encoder", "./none.safetensors"], "No encoder './none.safetensors'."),
         (["--budgets", "10", "5"], "budgets (10, 5) must be one or more different integers of at least 1, ascending."),
-        (["--seeds", "-1"], "seeds (-1,) must be one or more different integers of at least 0"),
+        (["--seeds", "-1"], "seeds (-1,) must be one or more different integers from 0 to 16777215."),
+        (
+            ["--encoder", "pick_place-clean"],
+            "Encoder 'pick_place-clean.safetensors' reads frames as 'small_rgb', the task declares",
+        ),
+        (["--variants", "base"], "arrow_puzzle takes no --variants; leave it out."),
         (["--evaluation-episodes", "0"], "evaluation_episodes is 0; give at least 1."),
         (
             ["--set", "controller.discnt=0.9"],
@@ -73,12 +78,17 @@ def test_wrong_words_get_one_line_and_exit_code_2(
 def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, sentence in (
         (["report", "--out", str(tmp_path)], "There is no bench below"),
-        (["report", str(tmp_path)], "protocol.json is not a bench's protocol"),
+        (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
         (["view", str(tmp_path / "x.rrd")], "No recording"),
         (["film", "--task", "arrow_puzzle", "--out", str(tmp_path / "film.mp4")], "does not end in .gif"),
         (["speed", "--turns", "0"], "turns is 0; give at least 1"),
+        (["speed", "--out", str(tmp_path)], "is a folder; give the JSON file to write."),
         (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
+        (
+            ["encoder", "--task", "arrow_puzzle", "--out", "/dev/null/x"],
+            "Cannot write /dev/null/x: a part of that path",
+        ),
     ):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()

@@ -230,5 +230,25 @@ def test_sampling_changes_no_generator_of_the_imagination_and_follows_its_own() 
     assert actions.tolist() == [0, 1], "the caller's arrays are left alone"
 
 
+def test_all_macro_actions_of_a_future_are_imagined_by_the_same_network() -> None:
+    """One draw of dropout masks, as in every other rollout: followed by hand, the same rewards are met."""
+    model = WorldModelSettings(dynamics_hidden=(32, 32), dropout=0.5)
+    settings = Settings(model=model, imagination=ImaginationSettings(weight_samples=1, temperature=0.0))
+    imagination = Imagination(LATENTS, 2, settings, filtered=False, seeds=SeedTree(1), device=prepare_torch("cpu"))
+    frames, actions = render(np.array([[0]]), "clean", np.random.default_rng(0)), np.array([0])
+    found = sample_futures(
+        imagination, FakeEncoder(), frames, actions, follow=lambda rows: np.zeros(len(rows), dtype=np.int64), samples=1,
+        depth=4, rng=np.random.default_rng(0),
+    )  # type: ignore[arg-type]  # fmt: skip
+    generator = torch.Generator().manual_seed(int(np.random.default_rng(0).integers(2**63)))
+    weights, z, rewards = imagination.draw_weights(generator), FakeEncoder().encode(frames)[0], []
+    for _ in range(4):
+        step = imagination.step(z, torch.tensor([0]), weights, generator)
+        z = step.next_z
+        rewards.append(float(step.reward))
+    assert not found.ended.any(), "an end would make the comparison shorter"
+    assert found.rewards[:, 0, 0].tolist() == rewards
+
+
 def test_after_an_unknown_or_final_macrostate_nobody_acts() -> None:
     assert futures.follow_optimum(RULES, np.array([[0], [2], [4], [5], [77]])).tolist() == [0, 1, -1, -1, -1]

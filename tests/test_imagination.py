@@ -12,7 +12,7 @@ from imagine_bench.agents.memory import RealMemory
 from imagine_bench.agents.mixture import Mixture
 from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -91,6 +91,19 @@ def test_the_filter_discards_the_doubtful_transition_and_the_rest_of_its_rollout
     counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
     assert dataclasses.astuple(counts) == (3, 15, 12)
+
+
+@pytest.mark.parametrize("part", ["log_weights", "means", "log_sigmas"])
+def test_imagination_that_is_not_finite_is_named_and_not_stored(part: str) -> None:
+    class Diverged(CountingModel):
+        def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+            sound = super().predict(z, action, weights)
+            return dataclasses.replace(sound, **{part: torch.full_like(getattr(sound, part), torch.nan)})
+
+    imagination, controller = make(filtered=False, model=Diverged(), temperature=1.0)
+    with pytest.raises(DivergedError, match=r"imagines is no longer finite\. Lower model\.learning_rate\."):
+        imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
+    assert stored_counts(imagination) == []
 
 
 def test_without_the_filter_doubt_is_kept() -> None:

@@ -51,6 +51,14 @@ def test_a_process_that_is_killed_is_a_failure(tmp_path: Path) -> None:
     assert failure.reason == "its process was killed by SIGKILL (out of memory?)"
 
 
+def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) -> None:
+    def closed_screen(progress: Progress) -> None:
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        LocalPool(1).launch([job(tmp_path, "failing", 0)], closed_screen)
+
+
 def test_no_workers_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
         LocalPool(0)

@@ -152,3 +152,12 @@ def test_an_unknown_preset_lists_what_exists() -> None:
 def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
     with pytest.raises((InvalidValueError, UnknownNameError), match=message):
         resolve("quick", {name: value})
+
+
+@pytest.mark.parametrize("network", ["model.dynamics_hidden", "model.reward_hidden"])
+def test_dropout_without_a_hidden_layer_is_refused(network: str) -> None:
+    with pytest.raises(
+        InvalidValueError, match=r"model\.dropout acts on hidden layers: give model\.dynamics_hidden and"
+    ):
+        resolve("thesis", {network: ()})
+    resolve("thesis", {network: (), "model.dropout": 0.0})

@@ -87,14 +87,6 @@ def test_one_run_gives_no_interval() -> None:
     assert math.isnan(statistics.gain([0.3], [0.2], rng()).low)
 
 
-def test_probability_of_improvement_by_hand() -> None:
-    # Pairs: 3>1, 3>2, 3=3, 1=1, 1<2, 1<3 -> (2 + 2 * 0.5) / 6
-    value, low, high = statistics.probability_of_improvement([3.0, 1.0], [1.0, 2.0, 3.0], rng())
-    assert value == pytest.approx(0.5)
-    assert low < 0.5 < high
-    assert statistics.probability_of_improvement([5.0, 6.0], [1.0, 2.0], rng()) == (1.0, 1.0, 1.0)
-
-
 def test_difference_by_hand() -> None:
     assert statistics.difference([3.0, 3.0], [1.0, 1.0, 1.0], rng()) == (2.0, 2.0, 2.0)
     value, low, high = statistics.difference([0.0, 1.0], [0.0, 1.0], rng())
@@ -118,6 +110,18 @@ def test_gain_resamples_both_sides() -> None:
     assert statistics.gain([0.6, 0.6, 0.6], [0.4, 0.4], rng()) == pytest.approx((0.5, 0.5, 0.5))
     # Base means 0.2, 0.3, 0.4 with 1/4, 1/2, 1/4: gains 2, 1, 0.5.
     assert statistics.gain([0.6, 0.6], [0.2, 0.4], rng()) == pytest.approx((1.0, 0.5, 2.0))
+
+
+def test_a_gain_of_which_just_the_share_beyond_its_end_is_boundless_has_no_interval(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def resampled(table: np.ndarray, _: object, resamples: int) -> np.ndarray:
+        draws = np.full((resamples, *table.shape), 0.5)
+        draws[: resamples // 40] = 0.0  # 2.5 %
+        return draws
+
+    monkeypatch.setattr(statistics, "_resample", resampled)
+    assert math.isnan(statistics.gain([0.5, 0.5], [0.5, 0.5], rng()).high)
 
 
 def test_a_gain_without_bound_has_no_interval() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from test_runner import do, same_but_for_time, small
 
 from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError, BusyError
+from imagine_bench.files import write_json
 from imagine_bench.results import OpenLoop
 from imagine_bench.store import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
 
@@ -85,6 +87,36 @@ def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
     assert changed == ["versions"]
     sittings = json.loads((opened(tmp_path).folder / "sittings.json").read_text())
     assert [sitting["changed"] for sitting in sittings] == [{}, {"versions": {"torch": "2"}}]
+
+
+def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for survived in (0, 1):
+        writes = iter(range(10))
+
+        def killed(path: Path, value: object, survived: int = survived, writes: Iterator[int] = writes) -> None:
+            if next(writes) == survived:
+                raise KeyboardInterrupt
+            write_json(path, value)
+
+        folder = opened(tmp_path / str(survived))
+        monkeypatch.setattr("imagine_bench.store.write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.begin_sitting(_ENVIRONMENT)
+        monkeypatch.undo()
+        again = opened(tmp_path / str(survived))
+        assert again.begin_sitting(_ENVIRONMENT) == []
+        assert {path.name for path in again.folder.iterdir()} >= {"environment.json", "sittings.json"}
+
+
+@pytest.mark.parametrize(("name", "content"), [("sittings.json", "null"), ("environment.json", "[]")])
+def test_a_damaged_sitting_is_named(tmp_path: Path, name: str, content: str) -> None:
+    store = opened(tmp_path)
+    store.begin_sitting(_ENVIRONMENT)
+    (store.folder / name).write_text(content)
+    with pytest.raises(ArtefactError, match=rf"{name} is not a bench's .*: it holds a .* left untouched"):
+        store.begin_sitting(_ENVIRONMENT)
 
 
 def test_no_bench_and_no_recording(tmp_path: Path) -> None:

@@ -113,6 +113,15 @@ def test_an_unfinished_bench_shows_its_largest_complete_table(
     assert "This bench is not finished" in write_report(result).read_text()
 
 
+def test_a_bench_that_lacks_recordings_alone_is_not_finished(tmp_path: Path) -> None:
+    result = bench(tmp_path, Inline())
+    assert load_so_far(result.folder).whole is None
+    (result.folder / "table" / "seed_0" / "DONE").unlink()
+    part = load_so_far(result.folder)
+    assert part.protocol == result.protocol == part.whole
+    assert part.missing == ("table seed 0: its recording",)
+
+
 def test_nothing_to_compare_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         bench(tmp_path, Inline(patience=1))

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, ImaginedRollout
+from imagine_bench.capabilities import Answer, ImaginedRollout, planned_actions
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -136,6 +136,7 @@ class ImagineAgent:
         """Keep the dynamics, and of what was rewarded no more than hints; see :meth:`.outcomes.Outcomes.carry_over`."""
         self._learn(len(self.memory))
         self._begin_task()
+        self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
 
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
@@ -180,11 +181,7 @@ class ImagineAgent:
         Raises:
             InvalidValueError: No depth to imagine, or actions that are none.
         """
-        planned = None if actions is None else [int(action) for action in actions[:depth]]
-        if depth < 1 or planned == []:
-            raise InvalidValueError(f"Asked to imagine depth {depth} along actions {actions}; give at least one.")
-        if planned is not None and not all(0 <= action < self.n_actions for action in planned):
-            raise InvalidValueError(f"Actions {planned} must lie in [0, {self.n_actions}).")
+        planned = planned_actions(actions, depth, self.n_actions)
         start = self.encoder.codes(frame)
         steps: list[Imagined] = []
         code = self._modelled(start)
@@ -222,9 +219,10 @@ class ImagineAgent:
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
+        began = self.tasks[-1] if self.tasks else 0
         counters = {
-            "real_transitions": self.memory.real,
-            "teacher/answers": self.memory.told,
+            "real_transitions": self.memory.real(since=began),
+            "teacher/answers": self.memory.told(since=began),
             "model/outcomes": len(self.model.outcomes.kinds),
         }
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}

@@ -54,15 +54,13 @@ class CodeMemory:
         """The transitions from index ``first`` on."""
         return iter(self._rows[first:])
 
-    @property
-    def real(self) -> int:
-        """How many of them happened."""
-        return sum(row.moves for row in self._rows)
+    def real(self, since: int = 0) -> int:
+        """How many of them, from index ``since`` on, happened."""
+        return sum(row.moves for row in self.since(since))
 
-    @property
-    def told(self) -> int:
-        """How many of them are answers."""
-        return sum(row.pays and not row.moves for row in self._rows)
+    def told(self, since: int = 0) -> int:
+        """How many of them, from index ``since`` on, are answers."""
+        return sum(row.pays and not row.moves for row in self.since(since))
 
     @property
     def in_vain(self) -> frozenset[tuple[tuple[int, ...], int]]:

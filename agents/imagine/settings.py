@@ -101,6 +101,7 @@ class ImagineSettings:
 
 _RANGES = {
     "dynamics.parents": COUNT,
+    "dynamics.parent_factor": RATE,
     "dynamics.persistence": INSIDE,
     "dynamics.concentration": POSITIVE,
     "dynamics.slip": INSIDE,

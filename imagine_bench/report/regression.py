@@ -57,11 +57,11 @@ def write_report(result: RegressionResult) -> Path:
 
 
 def summary_table(result: RegressionResult) -> str:
-    """The task's first table, and the short answer, as plain text."""
+    """The task's first table, if there is one, and the short answer, as plain text."""
     own = _own(result)
-    table = own[0].tables[0]
+    table = [line for first in own[0].tables[:1] for line in aligned([list(first.header), *map(list, first.rows)])]
     answers = [answer for section in own for answer in section.answers]
-    return "\n".join([own[0].title, "", *aligned([list(table.header), *map(list, table.rows)]), "", *answers])
+    return "\n".join([own[0].title, "", *table, *([""] if table else []), *answers])
 
 
 def collect(result: RegressionResult) -> list[Section]:

@@ -37,8 +37,8 @@ def sections(result: RegressionResult) -> list[Section]:
                 "Rank correlation: of epistemic uncertainty with the distance from the data, for x from 30 to 40. "
                 "Values are the median over networks, in brackets the smallest and the largest.",
             ),
-            tables=tables,
-            answers=answers,
+            tables=[table for table in tables if table.rows],
+            answers=answers or ["Every claim compares a variant with the variant base; run that too."],
         ),
         Section(
             title="Figure 4.1: what is uncertain, and why",

@@ -11,6 +11,8 @@ from imagine_bench.statistics import Estimate
 
 FEW_SEEDS = 5
 """Below this the bootstrap interval is hardly more than the range of the seeds, and the report says so."""
+_NAMED = 4
+"""Missing runs that are named; the others are counted."""
 
 
 @dataclass(frozen=True)
@@ -160,9 +162,11 @@ def area_text(area: Estimate) -> str:
 def _unfinished(data: ReportData) -> str:
     whole, part = data.result.whole, data.result.protocol
     assert whole is not None
+    missing, more = data.result.missing[:_NAMED], len(data.result.missing) - _NAMED
+    others = f"; and {_count(more, 'more run')}" if more > 0 else ""
     return (
         f"This bench is not finished: shown are {len(part.seeds)} of {_count(len(whole.seeds), 'seed')} up to "
-        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {'; '.join(data.result.missing)}. "
+        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {'; '.join(missing)}{others}. "
         "The same bench command goes on."
     )
 
