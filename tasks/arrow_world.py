@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from . import attitude
 from .macro_env import Reading
 from .motion.executor import MacroResult, at_rest
 from .scenes import constants as c
@@ -155,20 +156,19 @@ class ArrowWorld:
 
 def _direction(pose: list[float]) -> tuple[int, float]:
     """The nearest direction of a cube's arrow, and how far the cube is turned from it, in rad."""
-    w, x, y, z = pose[3:]
-    yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    quarters = round(yaw_rad / _QUARTER_RAD)
-    return -quarters % 4, abs(yaw_rad - quarters * _QUARTER_RAD)
+    turned_rad = attitude.yaw_rad(*pose[3:])
+    quarters = round(turned_rad / _QUARTER_RAD)
+    return -quarters % 4, abs(turned_rad - quarters * _QUARTER_RAD)
 
 
 def _problem(cube: int, pose: list[float], skew_rad: float) -> str | None:
     """What is wrong with how a cube stands, or None."""
     x_m, y_m, _, _, qx, qy, _ = pose
-    tilt_rad = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (qx * qx + qy * qy))))
+    tipped_rad = attitude.tilt_rad(qx, qy)
     slot_x_m, slot_y_m = c.SLOTS_XY_M[cube]
     off_m = math.hypot(x_m - slot_x_m, y_m - slot_y_m)
-    if tilt_rad > MAX_TILT_RAD:
-        return f"cube {cube} is tipped by {math.degrees(tilt_rad):.0f} degrees"
+    if tipped_rad > MAX_TILT_RAD:
+        return f"cube {cube} is tipped by {math.degrees(tipped_rad):.0f} degrees"
     if off_m > MAX_OFF_SLOT_M:
         return f"cube {cube} stands {1e3 * off_m:.0f} mm off its slot"
     if skew_rad > MAX_SKEW_RAD:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from . import attitude
 from .macro_env import Reading
 from .motion.executor import REST_OPENING_M, MacroResult, at_rest
 from .pick_place_rules import HAND_OVER, HANDED_OVER, N_OBJECTS, OPEN_PALM, PICKED, PLACED, WITHDRAWN, held_object
@@ -162,8 +163,8 @@ class PickWorld:
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
-        The human answers as ``intended`` says if the objects are where that says; whatever else happened is not what
-        they asked for, so they withdraw.
+        The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
+        else happened is not what they asked for, so they withdraw.
 
         Raises:
             DivergedError: The simulation blew up.
@@ -177,9 +178,9 @@ class PickWorld:
         self._update()
         self._executor.rest(self.data, held_object(self._objects()[0]))
         self._update()
-        after = self._objects()[0]
+        after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
-            as_asked = after == intended[:N_OBJECTS]
+            as_asked = problem is None and after == intended[:N_OBJECTS]
             self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
             self._update()
         moving = {index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])}
@@ -262,12 +263,10 @@ def _place_of(index: int, pose: list[float], tcp_m: list[float], palm_m: list[fl
 
 
 def _lean(name: str, pose: list[float]) -> str | None:
-    _, x, y, _ = pose[3:]
-    tilt_rad = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
-    return f"the {name} is tipped by {math.degrees(tilt_rad):.0f} degrees" if tilt_rad > MAX_TILT_RAD else None
+    tipped_rad = attitude.tilt_rad(*pose[4:6])
+    return f"the {name} is tipped by {math.degrees(tipped_rad):.0f} degrees" if tipped_rad > MAX_TILT_RAD else None
 
 
 def _skew(name: str, pose: list[float]) -> str | None:
-    w, x, y, z = pose[3:]
-    yaw_rad = abs(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-    return f"the {name} is turned by {math.degrees(yaw_rad):.0f} degrees" if yaw_rad > MAX_SKEW_RAD else None
+    turned_rad = abs(attitude.yaw_rad(*pose[3:]))
+    return f"the {name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None

@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import textwrap
+from collections import Counter
 
 import gymnasium
 import numpy as np
@@ -143,6 +144,27 @@ def test_starts_are_spread_over_the_start_states(task):
     assert min(counts.values()) > 0
     chi_square = sum((count - 12) ** 2 / 12 for count in counts.values())
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
+
+
+def test_the_human_draws_each_wish_as_often_as_the_rules_say():
+    env, counts = make("pick_place", **KINEMATIC), Counter()
+    env.reset(seed=0)
+    for _ in range(300):
+        env.reset(options={"macrostate": (0, 0, 0, 1)})
+        counts[tuple(env.step(1)[4]["macrostate"].tolist())] += 1
+    env.close()
+    assert set(counts) == {(0, 1, 0, wish) for wish in (0, 2, 3)}
+    assert all(abs(count - 100) < 40 for count in counts.values()), "five standard deviations"
+
+
+def test_a_closed_environment_holds_no_opengl_context():
+    env = make(**KINEMATIC, render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    env.render()
+    renderers = env._eye, env._picture
+    assert all(renderer._canvas is not None for renderer in renderers)
+    env.close()
+    assert all(renderer._canvas is None for renderer in renderers)
 
 
 def test_render_gives_the_asked_view_and_nothing_without_a_mode():

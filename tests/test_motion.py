@@ -3,6 +3,7 @@
 import itertools
 import math
 import pickle
+import re
 import tempfile
 
 import mujoco
@@ -236,6 +237,15 @@ def test_only_contact_turns_the_cube(turner):
     angle, fault = turned_deg(turner, compile_arrow_scene(), ghost_tips)
     assert angle == pytest.approx(0, abs=0.1)
     assert fault == "the fingers closed past cube 1"
+
+
+def test_an_arm_that_does_not_come_back_is_a_fault(turner):
+    def pulled_wrist(model):
+        joint = model.joint("right_j6")
+        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 16.0, OBSERVATION_QPOS_RAD[6] + 1.0
+
+    fault = turned_deg(turner, compile_arrow_scene(), pulled_wrist)[1]
+    assert re.fullmatch(r"the arm ended 0\.\d{3} rad off its observation pose", fault)
 
 
 def lifted_m(model):

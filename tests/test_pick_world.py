@@ -91,6 +91,23 @@ def test_every_macrostate_is_read_back_at_every_level(level):
 
 
 @pytest.mark.parametrize(
+    ("index", "yaw_deg", "problem"),
+    [
+        (0, 25, None),
+        (1, 25, "the car is turned by 25 degrees"),
+        (1, -15, None),
+        (2, -25, "the cup is turned by 25 deg"),
+    ],
+)
+def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw_deg, problem):
+    world.place((0, 0, 0, 0), rng())
+    half_rad = math.radians(yaw_deg) / 2
+    world.data.qpos[world._object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
+    found = world.read().problem
+    assert found is None if problem is None else found.startswith(problem)
+
+
+@pytest.mark.parametrize(
     ("index", "moved_m", "tilt_deg", "problem"),
     [
         (0, (0.021, 0, 0), 0, "the ball stands 21 mm off its place"),
@@ -178,6 +195,19 @@ def test_what_is_dropped_is_a_fault_and_ends_the_episode():
     env.close()
     assert info["fault"]
     assert "car" in info["fault_reason"] or "the scene reads" in info["fault_reason"]
+    assert (reward, terminated, info["success"]) == (-5.0, True, False)
+    assert info["macrostate"][3] == WITHDRAWN
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
+    """Wherever it lies then, the human does not take it for what they asked for."""
+    env = gymnasium.make(SPEC.env_id).unwrapped
+    env.reset(seed=0, options={"macrostate": (*(int(each == index) for each in range(3)), (index + 1) % 3)})
+    slippery_tips(env._world.model)
+    _, reward, terminated, _, info = env.step(index)
+    env.close()
+    assert info["fault"]
     assert (reward, terminated, info["success"]) == (-5.0, True, False)
     assert info["macrostate"][3] == WITHDRAWN
 

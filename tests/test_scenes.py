@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -256,6 +258,28 @@ def test_clean_frames_differ_by_cubes_only_and_other_levels_by_more(eye):
     assert changed["clean"][34:].any()
     assert changed["mild"][:34].mean() > 0.5
     assert changed["strong"][:34].mean() > 0.5
+
+
+def test_looks_vary_within_what_their_level_allows_and_cover_it():
+    for level in LEVELS.values():
+        world, generator = ArrowWorld(level), rng()
+        model, camera = world.model, world.model.camera(c.AGENT_CAMERA).id
+        colours, place_m, light = model.mat_rgba.copy(), model.cam_pos[camera].copy(), model.light_diffuse.copy()
+        quat = model.cam_quat[camera].copy()
+        tint, shift_m, turn_rad, brightness = 0.0, 0.0, 0.0, 0.0
+        for _ in range(200):
+            world.vary(generator)
+            tint = max(tint, np.abs(model.mat_rgba / np.where(colours > 0, colours, 1.0) - (colours > 0)).max())
+            shift_m = max(shift_m, np.abs(model.cam_pos[camera] - place_m).max())
+            turn_rad = max(turn_rad, 2.0 * math.acos(min(1.0, abs(model.cam_quat[camera] @ quat))))
+            brightness = max(brightness, np.abs(model.light_diffuse - light).max() / light.max())
+        for found, most in (
+            (tint, level.colour_fraction),
+            (shift_m, level.camera_offset_m),
+            (turn_rad, math.sqrt(3.0) * level.camera_angle_rad),
+            (brightness, level.light_fraction),
+        ):
+            assert 0.75 * most <= found <= most + 1e-6
 
 
 def test_samples_of_looks_do_not_add_up():

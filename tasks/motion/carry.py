@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from .. import attitude
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import THINGS, Thing, standing_m
@@ -155,8 +156,8 @@ class CarryExecutor:
         w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
         return _Pose(
             position_m=data.qpos[start : start + 3].copy(),
-            yaw_rad=math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-            tilt_rad=math.acos(max(-1.0, 1.0 - 2.0 * (x * x + y * y))),
+            yaw_rad=attitude.yaw_rad(w, x, y, z),
+            tilt_rad=attitude.tilt_rad(x, y),
         )
 
     def _solve(self, place_m: Floats, yaw_rad: float, warm_start: _Reach | None) -> _Reach:

@@ -10,6 +10,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError
 
+from .. import attitude
 from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
@@ -133,8 +134,8 @@ class TurnExecutor:
         w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
         return _Stand(
             xy_m=data.qpos[start : start + 2].copy(),
-            yaw_rad=math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-            tilt_rad=math.acos(max(-1.0, 1.0 - 2.0 * (x * x + y * y))),
+            yaw_rad=attitude.yaw_rad(w, x, y, z),
+            tilt_rad=attitude.tilt_rad(x, y),
         )
 
     def _solve(self, place_xy_m: Floats, warm_start: _Grip | None) -> _Grip:
