@@ -59,8 +59,8 @@ test: $(READY)  ## Run the tests, but for those that take minutes each
 test-slow: $(READY)  ## Run the tests that take minutes each
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST) $(ARGS)
 
-lint: $(READY)  ## Check style and format
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+lint: $(READY)  ## Check style, format and types
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
 speed: $(READY)  ## Measure every speed and fidelity figure that is promised
 	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(ARGS)

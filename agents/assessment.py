@@ -42,9 +42,9 @@ class Assessment(nn.Module):
         super().__init__()
         self._transition = require_known("assessment input", settings.assessment_input, INPUTS) == "transition"
         n_in = 2 * latent_size + n_actions if self._transition else latent_size
-        outputs = (settings.reward_hidden, 1), (settings.termination_hidden, 1)
+        outputs = [(settings.reward_hidden, 1), (settings.termination_hidden, 1)]
         if settings.shared_hidden:
-            outputs = ((settings.shared_hidden, 2),)
+            outputs = [(settings.shared_hidden, 2)]
         self.networks = nn.ModuleList(
             MemberMLP(
                 (n_in, *hidden, n_out),
@@ -89,7 +89,7 @@ class Assessment(nn.Module):
         """
         read = self._read(z, action, next_z)
         drawn = [None] * len(self.networks) if masks is None else masks
-        own = [None] * len(self.networks) if parameters is None else by_network(self.networks, parameters)
+        own = [None] * len(self.networks) if parameters is None else by_network(self.networks, parameters)  # type: ignore[arg-type]
         outputs = [network(read, *rest) for network, *rest in zip(self.networks, drawn, own, strict=True)]
         reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [S, N, 2] to [S, N] and [S, N]
         return reward, logit

@@ -113,10 +113,11 @@ def bellman_errors(controllers: Sequence[Controller], batch: Batch, parameters: 
     """
     network, settings = controllers[0].network, controllers[0].settings
     with torch.no_grad():
-        if controllers[0].target is None:
-            q_next = network(batch.next_z, None, parameters)
+        targets = [other.target for other in controllers if other.target is not None]
+        if targets:
+            q_next = torch.stack([target.values(z) for target, z in zip(targets, batch.next_z, strict=True)])
         else:
-            q_next = torch.stack([other.target.values(z) for other, z in zip(controllers, batch.next_z, strict=True)])
+            q_next = network(batch.next_z, None, parameters)
     target = td_target(batch.reward, batch.terminated, q_next, settings.discount)
     q = network(batch.z, None, parameters).gather(2, batch.action.unsqueeze(2)).squeeze(2)  # [S, B]
     return (target - q).square().mean(dim=1).unsqueeze(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
@@ -63,7 +64,7 @@ def measure(rounds: int = 25) -> ModelSpeed:
         {
             "plain": lambda: plain.update(batch),
             "peak": lambda: product(square, square),
-            **{name: lambda model=model: model.update(batch, draws) for name, model in models.items()},
+            **{name: partial(model.update, batch, draws) for name, model in models.items()},
         },
         rounds,
     )

@@ -34,6 +34,7 @@ class PlainWorldModel:
         self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
     ) -> None:
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
+        self._max_norm = math.inf if settings.max_norm is None else settings.max_norm
         outputs = mdn.output_size(settings.components, latent_size)
         self.dynamics = _network(
             (latent_size + n_actions, *settings.dynamics_hidden, outputs), settings.dropout, generator
@@ -66,7 +67,7 @@ class PlainWorldModel:
             for network in self.networks:
                 for layer in network:
                     if isinstance(layer, nn.Linear):
-                        layer.weight.copy_(torch.renorm(layer.weight, p=2, dim=0, maxnorm=self.settings.max_norm))
+                        layer.weight.copy_(torch.renorm(layer.weight, p=2, dim=0, maxnorm=self._max_norm))
 
 
 class _Dropout(nn.Module):

@@ -7,13 +7,14 @@ too, does with the same operands: 98 against 222 GFLOP/s on a core of a Zen 5 at
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 _ONEDNN_FROM = 2**20
 """Multiplications of one product from which oneDNN is ahead of the lower overhead of the other calls."""
-_ONEDNN = getattr(torch.ops.mkldnn, "_linear_pointwise", None) if torch.backends.mkldnn.is_available() else None
+_ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None) if torch.backends.mkldnn.is_available() else None
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:

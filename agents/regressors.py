@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -224,7 +225,7 @@ def _joined(parts: list[Assessment], axis: int | None = None) -> Assessment:
     """Assessments joined along rows, or stacked as networks where no axis is given."""
     join = np.stack if axis is None else np.concatenate
 
-    def field(owner: list[object], name: str) -> Floats:
+    def field(owner: Sequence[object], name: str) -> Floats:
         return join([getattr(part, name) for part in owner], axis=axis or 0)
 
     names = [f.name for f in dataclasses.fields(Assessment) if f.name != "predictive"]

@@ -89,7 +89,7 @@ class WorldModel(nn.Module):
             hidden_dtype=hidden_dtype(settings.precision, generator.device.type),
         )
         self.assessment = Assessment(latent_size, n_actions, settings, generator)
-        self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)  # type: ignore[assignment]
+        self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)
         self.optimiser = FlatAdam(
             self.networks, learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
         )

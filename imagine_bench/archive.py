@@ -9,6 +9,7 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,9 +51,10 @@ def load_archive(folder: Path) -> BenchResult:
 
 def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
     known = (*_COUNTS, *_NUMBERS, *_COMPUTED)
+    numbers: dict[str, Any] = {name: float(row[name]) for name in _NUMBERS}
+    numbers |= {name: int(row[name]) for name in _COUNTS}
     return Checkpoint(
-        **{name: int(row[name]) for name in _COUNTS},
-        **{name: float(row[name]) for name in _NUMBERS},
+        **numbers,
         diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},
     )
 

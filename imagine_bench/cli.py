@@ -340,7 +340,7 @@ Command = (
 def main(words: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
     command = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         prog="imagine-bench",
         description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs.",
         args=words,

@@ -38,7 +38,7 @@ def together(
         (answer,) = function([item])
     if isinstance(answer, Exception):
         raise answer
-    return answer  # type: ignore[no-any-return]
+    return answer
 
 
 def answer_each(function: Callable[..., Answer], items: Sequence[tuple[Any, ...]]) -> list[Answer | Exception]:
@@ -115,7 +115,7 @@ class _Request:
         return self.function, self.kind
 
 
-class _Member(greenlet):
+class _Member(greenlet):  # type: ignore[misc]  # untyped where its stubs are missing
     """A work, and how much CPU time of its process was spent for others while it rested."""
 
     def __init__(self, work: Callable[[], Any]) -> None:

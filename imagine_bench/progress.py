@@ -34,7 +34,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
             form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
             self._total = tqdm(total=self._work, desc=self._description(), bar_format=form, leave=False)
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *error: object) -> None:
         for _, line in self._lines:
             line.close()
         if self._total is not None:

@@ -209,7 +209,7 @@ def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:
     integers = {"count": np.asarray(arrays["count"], dtype=np.int64)}
     unmeasured = np.full(len(integers["count"]), np.nan)  # by the version that made an older run
     names = [field.name for field in dataclasses.fields(OpenLoop) if field.name not in integers]
-    numbers = {name: np.asarray(arrays.get(name, unmeasured), dtype=np.float64) for name in names}
+    numbers: dict[str, Any] = {name: np.asarray(arrays.get(name, unmeasured), dtype=np.float64) for name in names}
     return OpenLoop(**{**numbers, **integers})
 
 
@@ -218,8 +218,7 @@ def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
     rows = csv.DictReader(io.StringIO((folder / _METRICS).read_text()))
     return tuple(
         Checkpoint(
-            **{name: int(row[name]) for name in _INTEGERS},
-            **{name: float(row[name]) for name in _NUMBERS},
+            **_counted(row),
             diagnostics={
                 name.removeprefix(_DIAGNOSTIC): float(value)
                 for name, value in row.items()
@@ -229,6 +228,10 @@ def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
         )
         for row in rows
     )
+
+
+def _counted(row: Mapping[str, str]) -> dict[str, Any]:
+    return {**{name: int(row[name]) for name in _INTEGERS}, **{name: float(row[name]) for name in _NUMBERS}}
 
 
 def _write_rollouts(path: Path, rollouts: Sequence[ComparedRollout]) -> None:

@@ -6,13 +6,14 @@ import functools
 from importlib import resources
 
 import mink
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Motion, Shape3D
 from imagine_bench.regression import Floats
 
-from .rendering import Renderer, View, mujoco
+from .rendering import Renderer, View
 from .scene_reader import body_names, poses_of, shapes_of
 from .scenes.constants import SCENE_GROUP
 

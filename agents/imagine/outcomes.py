@@ -259,9 +259,9 @@ def _blame(strength: Floats, active: NDArray[np.int64], often: Floats, leak: flo
     """How many of the transitions each conjunction is held to have decided. Shape (J,)."""
     caused = 1.0 - (1.0 - leak) * np.exp(np.log1p(-strength)[active].sum(axis=1))
     share = np.minimum(strength[active] / caused[:, None], 1.0) * often[:, None]
-    return np.bincount(active.ravel(), share.ravel(), size)
+    return np.bincount(active.ravel(), share.ravel(), size)  # type: ignore[return-value]  # weights make it float64
 
 
 def _spread(active: NDArray[np.int64], weight: Floats, size: int) -> Floats:
     """Sum of the weights (U,) of the transitions in which each conjunction holds. Shape (J,)."""
-    return np.bincount(active.ravel(), np.repeat(weight, active.shape[1]), size)
+    return np.bincount(active.ravel(), np.repeat(weight, active.shape[1]), size)  # type: ignore[return-value]

@@ -227,8 +227,8 @@ def summary_csv(data: ReportData) -> str:
 
 def futures_csv(data: ReportData) -> str:
     """One row an agent, seed, budget, depth, macrostate and macro-action of the futures that were sampled."""
-    spec, measures = data.spec, ("samples", "total_variation", "floor", "missing", "invented", "reward_error")
-    measures = (*measures, "termination_error", "going_on")
+    spec, errors = data.spec, ("reward_error", "termination_error")
+    measures = ("samples", "total_variation", "floor", "missing", "invented", *errors, "going_on")
     rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
     for agent in data.futures:
         for run in data.result.of(agent):

@@ -49,7 +49,8 @@ def write_report(result: BenchResult) -> Path:
         "encoders": seen_through,
         "encoder_pictures": {each.identity: base64.b64encode(picture).decode() for each, picture in shown},
     }
-    files = {f"{each.name}.png": each.png for each in (*drawn, *strips, *courses)}
+    pictures: list[plots.Plot | Picture] = [*drawn, *strips, *courses]
+    files = {f"{each.name}.png": each.png for each in pictures}
     files |= {each.file: picture for each, picture in shown}
     files["results.csv"] = results_csv(result).encode()
     if data.open_loop:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -254,7 +254,7 @@ def _success_legend(axes: Axes, data: ReportData) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)
 
 
-def _end_labels(axes: Axes, last: dict[str, tuple[float, float]], to_x: float) -> None:
+def _end_labels(axes: Axes, last: Mapping[str, tuple[float, float]], to_x: float) -> None:
     """Name each line in the right margin, spread so that no two names overlap, with a thin leader to its last point."""
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -192,7 +194,7 @@ def _ratio_picture(result: RegressionResult, rng: np.random.Generator) -> Pictur
                 c[0] / printed["random"][v][0] for v, c in printed.get(name, {}).items() if v in protocol.variants
             ]
             if ratios:
-                label = "thesis" if index == 0 else None
+                label = "thesis" if index == 0 else ""
                 axes.hlines(ratios, index - 0.42, index + 0.42, color="#2b2b2f", linewidth=0.9, label=label)
         axes.axhline(1.0, color="#8c8c8c", linewidth=1, linestyle=(0, (4, 3)))
         axes.set_xticks(places, [name.replace("_plus_", " +\n").replace("_", "\n") for name in SCORES])
@@ -212,13 +214,13 @@ def _maps(result: RegressionResult) -> Section:
         for variant in variants:
             name = f"{agent}_{variant}"
             pictures.append(picture(
-                f"figure_4_2_{name}", lambda a=agent, v=variant: figure_4_2(result, a, v),
+                f"figure_4_2_{name}", partial(figure_4_2, result, agent, variant),
                 alt="Places visited while babbling, error of reaching, and stationarity over the workspace.",
                 caption=f"{title}, {variant} samples (first network), after figure 4.2: where the arm's tip was while "
                 "babbling, how far it misses a place that it reaches for, and the stationarity score.",
             ))  # fmt: skip
             pictures.append(picture(
-                f"figure_4_3_{name}", lambda a=agent, v=variant: figure_4_3(result, a, v),
+                f"figure_4_3_{name}", partial(figure_4_3, result, agent, variant),
                 alt="Epistemic, modal and aleatoric uncertainty of each joint over the workspace.",
                 caption=f"{title}, {variant} samples (first network), after figure 4.3: standard deviation of each "
                 "joint by cause, in radians. Outside of the line no place can be reached.",

@@ -9,7 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from imagine_bench.report.plots import STYLE
 
@@ -90,7 +92,7 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - whole)}f}".replace("-", "\u2212")
 
 
-def mean_std(values: Sequence[float]) -> str:
+def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
     """``2.36 (0.45)``: mean and standard deviation, as the thesis prints them."""
     count = len(values)
     mean = sum(values) / count
