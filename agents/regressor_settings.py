@@ -13,7 +13,7 @@ from .family import Deviation
 from .layers import dropout_bits
 from .precision import PRECISIONS
 from .presets import checked
-from .ranges import NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, between, require_ranges
+from .ranges import NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, Range, between, require_ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ _RANGES = {
     "weight_samples": between(2, 10_000, "the spread of one sample is 0"),
     "components": between(1, 1_000),
     "members": between(1, 1_000),
-    "batch_size": between(8, 1e9, "layers are standardised over a batch"),
+    "batch_size": Range(lambda value: value >= 8, "must be at least 8: layers are standardised over a batch"),
 }
 """Ranges of the numbers; every other number is a count of at least 1."""
 

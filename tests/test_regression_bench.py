@@ -192,6 +192,7 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
         (["--task", "toy_regression", "--set", "dropout=0.001"], "Setting dropout is 0.001, which counts as 0"),
         (["--task", "toy_regression", "--set", "epochs=0"], "Setting epochs is 0; it must be at least 1."),
         (["--task", "toy_regression", "--set", "learning_rate=0"], "Setting learning_rate is 0.0; it must lie in (0,"),
+        (["--task", "toy_regression", "--set", "batch_size=1"], "batch_size is 1; it must be at least 8: layers are stand"),
         (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
         (["--task", "toy_regression", "--set", "members=1"], "Setting members is 1 in an ensemble; it must be at"),
         (["--task", "toy_regression", "--set", "precision=half"], "No precision 'half'."),
@@ -214,7 +215,7 @@ def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: 
     assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
 
 
-@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (1, 600)])
+@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (8, 75)])
 def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
     data = Dataset(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
     settings = {"hidden": (4, 4), "components": 2, "batch_size": batch_size}

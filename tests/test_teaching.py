@@ -220,7 +220,7 @@ def test_who_can_carry_over_or_ask_is_known() -> None:
         (["--questions", "2"], "Agent 'dqn' cannot ask a teacher; leave --questions out"),
         (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: what is known of one world is of no"),
         (["--after", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'?"),
-        (["--after-episodes", "50"], "after_episodes is 50 with after (); give at least 1, and the tasks."),
+        (["--after-episodes", "50"], "after_episodes is 50, but no task comes before; give it in after."),
         (["--demonstrations", "-1"], "demonstrations is -1; give at least 0."),
         (["--questions", "-1"], "questions is -1; give at least 0"),
     ],
