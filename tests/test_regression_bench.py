@@ -192,7 +192,7 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
         (["--task", "toy_regression", "--set", "dropout=0.001"], "Setting dropout is 0.001, which counts as 0"),
         (["--task", "toy_regression", "--set", "epochs=0"], "Setting epochs is 0; it must be at least 1."),
         (["--task", "toy_regression", "--set", "learning_rate=0"], "Setting learning_rate is 0.0; it must lie in (0,"),
-        (["--task", "toy_regression", "--set", "batch_size=1"], "batch_size is 1; it must be at least 8: layers are stand"),
+        (["--task", "toy_regression", "--set", "batch_size=1"], "batch_size is 1; it must be at least 8: layers are"),
         (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
         (["--task", "toy_regression", "--set", "members=1"], "Setting members is 1 in an ensemble; it must be at"),
         (["--task", "toy_regression", "--set", "precision=half"], "No precision 'half'."),
