@@ -177,6 +177,14 @@ def test_areas_in_the_page_are_those_in_the_summary_and_in_the_markdown(folder: 
         assert f"{value} [{low}, {high}]" in markdown
 
 
+def test_areas_that_are_alike_are_not_ranked(result: BenchResult) -> None:
+    data = collect(result)
+    one = data.areas["dqn"]
+    assert re.search(r"highest for “.*” \(.*\); next is “", " ".join(words.answers(data)))
+    tied = dataclasses.replace(data, areas={"dqn": one, "imagination": one})
+    assert re.search(r"highest for “DQN” \(.*\) and “imagination” \(.*\) alike\.", " ".join(words.answers(tied)))
+
+
 def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
     by_cell = {
         (data["data-agent"], data["data-episodes"]): text

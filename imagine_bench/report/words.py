@@ -150,7 +150,9 @@ def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
     ranked = sorted(data.areas, key=lambda agent: data.areas[agent][budget].value, reverse=True)[:2]
     first, second = (f"“{agent_words(agent).title}” ({area_text(data.areas[agent][budget])} %)" for agent in ranked)
-    return f"Over all episodes up to {budget:,} the mean success is highest for {first}; next is {second}."
+    tied = data.areas[ranked[0]][budget].value == data.areas[ranked[1]][budget].value
+    who = f"{first} and {second} alike" if tied else f"{first}; next is {second}"
+    return f"Over all episodes up to {budget:,} the mean success is highest for {who}."
 
 
 def area_text(area: Estimate) -> str:
