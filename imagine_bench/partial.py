@@ -34,7 +34,7 @@ def load_so_far(folder: Path) -> BenchResult:
     if part.missing:
         return part
     last = tuple(f"{agent} seed {seed}: its recording" for agent, seed in store.missing())  # tested, but not at its end
-    return dataclasses.replace(part, whole=whole, missing=last)
+    return dataclasses.replace(part, whole=whole if last else None, missing=last)
 
 
 def largest_part(
