@@ -202,8 +202,9 @@ def test_diagnostics_are_means_since_the_last_call(monkeypatch: pytest.MonkeyPat
     assert set(read) == names | {"real_transitions", "imagined_transitions"}
     assert read["real_transitions"] == 8.0
     assert read["imagination/acceptance_rate"] == 1.0
-    assert 1.0 <= read["imagination/mean_depth"] <= 3.0
-    assert read["imagined_transitions"] == pytest.approx(4 * 3 * read["imagination/mean_depth"])
+    steps, rollouts, depth = 4, 3, 3
+    assert rollouts <= read["imagined_transitions"] / steps <= rollouts * depth
+    assert read["imagination/mean_depth"] == pytest.approx(read["imagined_transitions"] / (steps * rollouts))
     assert set(agent.diagnostics()) == {"epsilon", "real_transitions", "imagined_transitions"}
 
 

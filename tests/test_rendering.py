@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
-from ctypes.util import find_library
 
 import mujoco
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 from imagine_bench.tasks import rendering
 from imagine_bench.tasks.arrow_puzzle import SPEC
 from imagine_bench.tasks.arrow_world import ArrowWorld
+from imagine_bench.tasks.graphics import choose_platform
 from imagine_bench.tasks.macro_env import agent_eye, picture_view
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes.appearance import appearance
@@ -212,10 +213,20 @@ def test_a_platform_that_does_not_exist_is_named():
     assert "SetupError: MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa." in done.stderr
 
 
-@pytest.mark.skipif(sys.platform != "linux" or find_library("OSMesa") is not None, reason="OSMesa is installed")
-def test_a_platform_without_its_library_is_named():
-    done = run_script(_FRAME.format(before="", after=""), MUJOCO_GL="osmesa")
-    assert "SetupError: MUJOCO_GL is 'osmesa', but libOSMesa is not installed;" in done.stderr
+@pytest.mark.parametrize("installed", [None, "libOSMesa.so.8"])
+def test_a_platform_without_its_library_is_named(monkeypatch, installed):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("ctypes.util.find_library", {"OSMesa": installed}.get)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("LP_NUM_THREADS", "0")
+    if installed:
+        choose_platform()
+        assert os.environ["MUJOCO_GL"] == "osmesa"
+    else:
+        with pytest.raises(
+            SetupError, match="MUJOCO_GL is 'osmesa', but libOSMesa is not installed; install it or uns"
+        ):
+            choose_platform()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
