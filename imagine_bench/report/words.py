@@ -148,10 +148,15 @@ def few_words(count: int, noun: str = "seeds") -> list[str]:
 
 def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
-    ranked = sorted(data.areas, key=lambda agent: data.areas[agent][budget].value, reverse=True)[:2]
-    first, second = (f"“{agent_words(agent).title}” ({area_text(data.areas[agent][budget])} %)" for agent in ranked)
-    tied = data.areas[ranked[0]][budget].value == data.areas[ranked[1]][budget].value
-    who = f"{first} and {second} alike" if tied else f"{first}; next is {second}"
+    areas = {agent: data.areas[agent][budget] for agent in data.areas}
+    named = {agent: f"“{agent_words(agent).title}” ({area_text(area)} %)" for agent, area in areas.items()}
+    ranked = sorted(areas, key=lambda agent: areas[agent].value, reverse=True)
+    first = [named[agent] for agent in ranked if areas[agent].value == areas[ranked[0]].value]
+    who = (
+        f"{', '.join(first[:-1])} and {first[-1]} alike"
+        if len(first) > 1
+        else f"{first[0]}; next is {named[ranked[1]]}"
+    )
     return f"Over all episodes up to {budget:,} the mean success is highest for {who}."
 
 
