@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench peers plan generalise study view report encoder film doctor test test-slow lint speed clean
+.PHONY: help setup bench peers plan generalise policy study view report encoder film doctor test test-slow lint speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,9 @@ plan: $(READY)  ## Let the best imagining agent of the newest bench plan from on
 
 generalise: $(READY)  ## Ask the newest bench's models for transitions that no training can contain
 	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
+
+policy: $(READY)  ## Follow the policies of the newest bench's learners from every start by the rules
+	@$(BIN)/imagine-bench policy --task $(TASK) $(ARGS)
 
 study: $(READY)  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench study --task $(TASK) --launcher $(LAUNCHER) $(ARGS)

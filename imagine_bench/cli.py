@@ -158,8 +158,8 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generalise:
-    """Ask the trained models for transitions that no training can contain: those out of terminal macrostates."""
+class _OfBench:
+    """Which bench a question is put to."""
 
     folder: Annotated[Path | None, tyro.conf.Positional] = None
     """A bench's folder; by default the newest."""
@@ -172,11 +172,27 @@ class Generalise:
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
+
+@dataclass(frozen=True, kw_only=True)
+class Generalise(_OfBench):
+    """Ask the trained models for transitions that no training can contain: those out of terminal macrostates."""
+
     def __call__(self) -> None:
         """Ask and report."""
         from imagine_bench.quality import generalisation_report  # noqa: PLC0415 - as above
 
         print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy(_OfBench):
+    """Follow the policies of a bench, finished or not, from every start by the rules: what they miss, and how."""
+
+    def __call__(self) -> None:
+        """Ask and follow."""
+        from imagine_bench.quality import policy_report  # noqa: PLC0415 - as above
+
+        print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,6 +343,7 @@ Command = (
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Generalise, tyro.conf.subcommand("generalise")]
+    | Annotated[Policy, tyro.conf.subcommand("policy")]
     | Annotated[StudyCommand, tyro.conf.subcommand("study")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Encoder, tyro.conf.subcommand("encoder")]

@@ -1,4 +1,7 @@
-"""What trained agents can do beyond the bench's test: plans carried out blindly, and transitions nobody ever saw."""
+"""What can be asked of trained agents beyond the bench's test.
+
+Plans carried out blindly, transitions nobody ever saw, and where the policy leads from every start.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,13 @@ from imagine_bench.generalisation import answer, probing, summarise
 from imagine_bench.interfaces import EXECUTIONS
 from imagine_bench.kinds import kind_of
 from imagine_bench.plans import make_plans
+from imagine_bench.policy import choices, follow, situations
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import plan_table, write_plans
+from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.seeding import SeedTree, exam
-from imagine_bench.store import load_bench, newest_bench
-from imagine_bench.trained import Trained, best_run, imagining, load_trained, require_control
+from imagine_bench.store import load_bench, newest_bench, read_protocol
+from imagine_bench.trained import Trained, best_run, imagining, learners, load_trained, require_control
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -114,6 +119,40 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     write_generalisation(where, asked, probe, spec, facts)
     head = f"{spec.title}, {protocol.appearance}, after {protocol.budgets[-1]:,} real episodes"
     return "\n".join([head, "", generalisation_table(asked, probe, spec), "", f"Answers:    {where}"])
+
+
+def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+    """Follow the policy of every learner of a bench by the rules, and leave where it leads in the bench's folder.
+
+    An unfinished bench will do: every run is asked as its last checkpoint left it.
+
+    Args:
+        folder: A bench's folder; None for the newest.
+        root: Folder of all benches.
+        task: Whose newest bench; None for that of any task.
+        encoder: See :func:`imagine_bench.trained.load_trained`.
+
+    Returns:
+        What to print.
+
+    Raises:
+        ImagineBenchError: No bench, or none with a learner that can be taken up again.
+    """
+    bench = folder or newest_bench(root, _control(task))
+    protocol = read_protocol(bench)
+    require_control(protocol.task, bench)
+    spec = registry.task(protocol.task)
+    met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
+    followed = []
+    for run in tqdm(learners(bench), desc="runs", leave=False, disable=not sys.stderr.isatty()):
+        trained = load_trained(run, encoder=encoder)
+        ends = follow(spec, met, choices(trained.agent, met))
+        who = trained.spec
+        followed.append(Followed(agent=who.agent, seed=who.seed, episodes=trained.episodes, ends=ends))
+    where = bench / "policy"
+    write_policy(where, followed, spec, {**_origin(protocol.hash), "appearance": protocol.appearance})
+    head = f"{spec.title}, {protocol.appearance}"
+    return "\n".join([head, "", policy_table(followed, spec), "", f"All starts: {where / 'starts.csv'}"])
 
 
 def _control(task: str | None) -> tuple[str, ...]:

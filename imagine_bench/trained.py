@@ -10,13 +10,14 @@ from typing import Any
 
 from imagine_bench import encoders, registry
 from imagine_bench.capabilities import Imaginer
-from imagine_bench.checkpointing import load_newest
+from imagine_bench.checkpointing import has_checkpoint, load_newest
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.files import read_json, reading
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.protocol import Protocol
 from imagine_bench.results import BenchResult, RunResult
 from imagine_bench.runs import RunSpec
+from imagine_bench.store import BenchStore, read_protocol
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +99,26 @@ def imagining(result: BenchResult) -> tuple[RunResult, ...]:
     if not runs:
         raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
     return runs
+
+
+def learners(bench: Path) -> tuple[Path, ...]:
+    """The run folders of a bench, finished or not, whose agents have learned and can be taken up again.
+
+    Raises:
+        ArtefactError: There are none.
+    """
+    protocol = read_protocol(bench)
+    store = BenchStore(bench, protocol)
+    entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
+    able = [agent for agent, entry in entries.items() if entry.learns and not entry.trains_itself]
+    folders = [store.run_folder(agent, seed) for agent in able for seed in protocol.seeds]
+    found = tuple(folder for folder in folders if has_checkpoint(folder / "checkpoints"))
+    if not found:
+        raise ArtefactError(
+            f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again (a library's "
+            "cannot); give the folder of a bench with one, such as of dqn."
+        )
+    return found
 
 
 def best_run(result: BenchResult) -> RunResult:

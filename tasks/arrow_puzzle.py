@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Promises, TaskSpec
+from imagine_bench.rules import facts
 
 from .arrow_rules import (
     N_CUBES,
@@ -25,7 +26,6 @@ from .arrow_rules import (
     toward_human,
     toward_human_alone,
 )
-from .rules import facts
 
 if TYPE_CHECKING:
     from .macro_env import MacroEnv

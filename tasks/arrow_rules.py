@@ -14,8 +14,7 @@ from itertools import product
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
-
-from .rules import optimal_policy, tabulate
+from imagine_bench.rules import optimal_policy, tabulate
 
 N_CUBES = 3
 N_DIRECTIONS = 4

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Promises, TaskSpec
+from imagine_bench.rules import facts
 
 from .pick_place_rules import N_OBJECTS, PickPlaceRules
-from .rules import facts
 
 if TYPE_CHECKING:
     from .macro_env import MacroEnv

@@ -12,8 +12,7 @@ from functools import cached_property
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
-
-from .rules import optimal_policy, tabulate
+from imagine_bench.rules import optimal_policy, tabulate
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Rules
+from imagine_bench.rules import require_macrostates
 
 from .macro_env import FRAME_PX, World, agent_eye
 from .rendering import Renderer
-from .rules import require_macrostates
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 

@@ -16,10 +16,10 @@ from imagine_bench.tasks.arrow_rules import (
     toward_agent,
     toward_human_alone,
 )
-from imagine_bench.tasks.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
+from imagine_bench.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
 EASY, HARD = ArrowPuzzleRules(), ArrowPuzzleRules(toward_human_alone)
 TOWARD, CLOCKWISE = ArrowPuzzleRules(toward_agent), ArrowPuzzleRules(left_and_clear_clockwise)

@@ -16,9 +16,9 @@ from imagine_bench.tasks.pick_place_rules import (
     PickPlaceRules,
     held_object,
 )
-from imagine_bench.tasks.rules import facts, optimal_values, tabulate
 
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.rules import facts, optimal_values, tabulate
 
 RULES = PickPlaceRules()
 PLAY = [state for state in RULES.states if not RULES.is_terminal(state)]

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from imagine_bench import reference, statistics
+from imagine_bench import reference
 from imagine_bench.files import make_folder, write_bytes, write_json
 from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.report.words import agent_words, few_words, percent
+from imagine_bench.report.words import agent_words, few_words, mean_text, percent
 from imagine_bench.seeding import SeedTree
 
 _ROWS = {
@@ -97,14 +94,7 @@ def _plain(value: float) -> str:
 
 
 def _cell(values: Sequence[float], name: str, words: Callable[[float], str] = percent) -> str:
-    if any(math.isnan(value) for value in values):
-        return "–"
-    mean = words(float(np.mean(values)))
-    if len(values) == 1:
-        return mean
-    rng = SeedTree(0).child("report", "generalisation", name).generator()
-    low, high = statistics.bootstrap_interval(values, rng, statistic="mean")
-    return f"{mean} [{words(low)}, {words(high)}]"
+    return mean_text(values, SeedTree(0).child("report", "generalisation", name).generator(), words)
 
 
 def _csv(asked: Sequence[Asked], probe: Probing) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from imagine_bench import statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.statistics import Estimate
 
@@ -91,6 +94,17 @@ def percent(share: float) -> str:
 def signed_percent(share: float) -> str:
     """Like :func:`percent` with a sign, the minus a true one."""
     return "–" if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+
+
+def mean_text(values: Sequence[float], rng: np.random.Generator, words: Callable[[float], str] = percent) -> str:
+    """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
+    if any(math.isnan(value) for value in values):
+        return "–"
+    mean = words(float(np.mean(values)))
+    if len(values) == 1:
+        return mean
+    low, high = statistics.bootstrap_interval(values, rng, statistic="mean")
+    return f"{mean} [{words(low)}, {words(high)}]"
 
 
 def score_text(score: Score) -> str:

@@ -113,11 +113,13 @@ class PolicyFacts:
 
     Attributes:
         success: Success probability.
+        failure: Probability of an end that is no success; the rest of them is still going on at the horizon.
         returns: Expected undiscounted return.
         length: Expected number of actions.
     """
 
     success: NDArray[np.float64]
+    failure: NDArray[np.float64]
     returns: NDArray[np.float64]
     length: NDArray[np.float64]
 
@@ -134,13 +136,15 @@ def evaluate(tables: RuleTables, policy: NDArray[np.float64], horizon: int) -> P
         raise InvalidValueError(f"Horizon {horizon} is too short; give at least 1 action.")
     alive = np.einsum("as,ast->st", policy, tables.alive)
     reward, success = (policy * tables.reward).sum(axis=0), (policy * tables.success).sum(axis=0)
+    failure = 1.0 - alive.sum(axis=1) - success
     zeros = np.zeros(alive.shape[0])
-    successes, returns, length = zeros, zeros, zeros
+    successes, failures, returns, length = zeros, zeros, zeros, zeros
     for _ in range(horizon):
         successes = success + alive @ successes
+        failures = failure + alive @ failures
         returns = reward + alive @ returns
         length = 1.0 + alive @ length
-    return PolicyFacts(success=successes, returns=returns, length=length)
+    return PolicyFacts(success=successes, failure=failures, returns=returns, length=length)
 
 
 def greedy(policy: NDArray[np.int64], n_actions: int) -> NDArray[np.float64]:

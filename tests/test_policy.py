@@ -1,0 +1,176 @@
+"""Where policies lead by the rules: against oracles, against walks step by step, and from a real bench."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_agents import FakeAgent
+from numpy.typing import NDArray
+from test_waves import Inline, bench
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import Observation, TaskSpec
+from imagine_bench.plans import fewest_actions
+from imagine_bench.policy import Ends, Situations, choices, follow, situations
+from imagine_bench.report.policy import Followed, policy_table, write_policy
+from imagine_bench.trained import learners
+
+HARD = registry.task("arrow_puzzle_hard")
+PICK = registry.task("pick_place")
+State = tuple[int, ...]
+
+
+@pytest.fixture(scope="module")
+def hard() -> Situations:
+    return situations(HARD, appearance="clean")
+
+
+def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Ends:
+    """Where a rule of choice leads; what the frames show does not matter to it."""
+    states = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)])
+    met = Situations(macrostates=states, frames=np.zeros((len(states), 64, 64, 3), dtype=np.uint8))
+    return follow(spec, met, np.array([choose(tuple(state)) for state in states.tolist()]))
+
+
+def means(ends: Ends) -> tuple[float, float, float, float]:
+    return tuple(float(part.mean()) for part in (ends.success, ends.failure, ends.late, ends.never))  # type: ignore[return-value]
+
+
+def legal(state: State) -> list[int]:
+    """Turns that break no rule: one each way round the ring of twelve."""
+    return [action for action in range(6) if HARD.rules.is_legal(HARD.rules.outcomes(state, action)[0].macrostate)]
+
+
+def other_way(state: State) -> int:
+    """The legal turn away from the nearest goal."""
+    (away,) = set(legal(state)) - {HARD.rules.optimal_action(state)}
+    return away
+
+
+def walked(spec: TaskSpec, choose: Callable[[State], int], start: State, patience: int) -> tuple[bool, bool, int]:
+    """Success, end, and length of a walk by deterministic rules."""
+    state = start
+    for length in range(1, patience + 1):
+        (outcome,) = spec.rules.outcomes(state, choose(state))
+        if outcome.terminated:
+            return outcome.success, True, length
+        state = outcome.macrostate
+    return False, False, patience
+
+
+def test_the_optimal_policy_misses_nothing() -> None:
+    ends = ends_of(HARD, HARD.rules.optimal_action)
+    assert means(ends) == (1.0, 0.0, 0.0, 0.0)
+    assert np.array_equal(ends.length, ends.shortest)
+    assert ends.shortest.tolist() == [fewest_actions(HARD.rules, state) for state in HARD.rules.start_states]
+
+
+def test_the_long_way_round_comes_late() -> None:
+    """Twelve macrostates make a ring: who is one turn from the goal and goes the other way comes after eleven."""
+    astray = next(state for state in HARD.rules.start_states if fewest_actions(HARD.rules, state) == 1)
+    policy = {state: HARD.rules.optimal_action(state) for state in HARD.rules.start_states}
+    here, previous = astray, None
+    while not HARD.rules.is_terminal(here):
+        turns = {action: HARD.rules.outcomes(here, action)[0].macrostate for action in legal(here)}
+        policy[here] = other_way(here) if previous is None else next(a for a, to in turns.items() if to != previous)
+        here, previous = turns[policy[here]], here
+    ends = ends_of(HARD, policy.__getitem__)
+    index = HARD.rules.start_states.index(astray)
+    assert (ends.success[index], ends.failure[index], ends.late[index], ends.length[index]) == (0.0, 0.0, 1.0, 10.0)
+    assert walked(HARD, policy.__getitem__, astray, 20) == (True, True, 11)
+    assert ends.success.sum() == len(ends.success) - 1, "ten turns are still in time"
+
+
+def test_who_undoes_what_was_done_never_comes() -> None:
+    ends = ends_of(HARD, lambda state: legal(state)[0])
+    for index, start in enumerate(HARD.rules.start_states):
+        success, _, _ = walked(HARD, lambda state: legal(state)[0], start, 1_000)
+        assert (ends.success[index] + ends.late[index], ends.never[index]) == (float(success), 1.0 - success)
+    assert 0.0 < ends.never.mean() < 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_policy_ends_as_the_walk_does(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    policy = {state: int(rng.integers(6)) for state in HARD.rules.start_states}
+    ends = ends_of(HARD, policy.__getitem__)
+    for index, start in enumerate(HARD.rules.start_states):
+        success, over, length = walked(HARD, policy.__getitem__, start, HARD.horizon)
+        assert (ends.success[index], ends.failure[index]) == (float(success), float(over and not success))
+        assert ends.length[index] == length
+    assert ends.failure.mean() > 0.5, "most turns break a rule"
+
+
+def test_chance_in_the_rules_is_kept() -> None:
+    ends = ends_of(PICK, PICK.rules.optimal_action)
+    assert ends.success.mean() == pytest.approx(PICK.facts().optimum)
+    assert ends.length.mean() == pytest.approx(PICK.facts().mean_plan_length)
+    assert 0.0 < ends.late.max() < 1e-3, "the optimal agent is cut off once in 25,000 episodes"
+    idle = ends_of(PICK, lambda state: 0)
+    total = idle.success + idle.failure + idle.late + idle.never
+    assert total == pytest.approx(np.ones(len(total))) and idle.success.mean() < 0.9
+
+
+def test_every_situation_is_asked_once_and_greedily(hard: Situations) -> None:
+    assert len(hard.macrostates) == 66 == len(HARD.rules.start_states)
+    again = situations(HARD, appearance="clean")
+    assert np.array_equal(again.frames, hard.frames)
+
+    class Watched(FakeAgent):
+        seen: list[NDArray[np.uint8]] = []  # noqa: RUF012 - one agent only
+
+        def act(self, observation: Observation, *, explore: bool) -> int:
+            assert not explore and observation.macrostate is None
+            self.seen.append(observation.frame)
+            return len(self.seen) % 6
+
+    assert choices(Watched(), hard).tolist() == [count % 6 for count in range(1, 67)]
+    assert np.array_equal(np.stack(Watched.seen), hard.frames)
+
+
+def test_table_and_files(tmp_path: Path) -> None:
+    good, bad = ends_of(HARD, HARD.rules.optimal_action), ends_of(HARD, other_way)
+    followed = [
+        Followed(agent="dqn", seed=0, episodes=100, ends=good),
+        Followed(agent="dqn", seed=1, episodes=100, ends=bad),
+        Followed(agent="imagination", seed=0, episodes=50, ends=good),
+    ]
+    table = policy_table(followed, HARD)
+    assert "All 66 starts" in table and "(optimal: 3.27)" in table
+    assert f"| DQN | 100 | 2 | {50 + 50 * bad.success.mean():.1f} [" in table
+    assert "| imagination | 50 | 1 | 100.0 | 0.0 | 0.0 | 0.0 | 3.27 |" in table
+    assert f"Starts that some run does not always solve: {(bad.success < 1).sum()}; the 12 of most runs:" in table
+    assert "Every run solves every start." in policy_table(followed[2:], HARD)
+    write_policy(tmp_path / "out", followed, HARD, {"commit": "abc"})
+    with (tmp_path / "out" / "starts.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * 66
+    assert sum(float(row["success"]) for row in rows[66:132]) == pytest.approx(bad.success.sum())
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["commit"] == "abc" and summary["runs"][1]["success"] == pytest.approx(bad.success.mean())
+
+
+def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, Inline(patience=3))  # both agents of seed 0, and one of seed 1, to the end
+    (folder,) = tmp_path.glob("*/*/")
+    assert [path.relative_to(folder).as_posix() for path in learners(folder)] == [
+        "table/seed_0", "table/seed_1", "imaginer/seed_0",
+    ]  # fmt: skip
+    assert main(["policy", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "| table | 9 | 2 |" in said and "| imaginer | 9 | 1 |" in said and str(folder / "policy") in said
+    assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
+
+
+def test_a_bench_without_learners_says_so(tmp_path: Path) -> None:
+    result = bench(tmp_path, Inline(), agents=("random",), budgets=(2,), seeds=(0,))
+    with pytest.raises(ArtefactError, match="has a checkpoint of an agent that learns"):
+        learners(result.folder)
