@@ -1,7 +1,9 @@
 """What a trained agent would do in every macrostate, and where that leads by the rules: no episode is sampled.
 
 A test says how often an agent succeeds. This says from which starts it does not, and how: an end that is no success, a
-success that comes too late, or neither, however long it goes on.
+success that comes too late, or neither, however long it goes on. An agent sees a macrostate in many frames, and may do
+one thing in some of them and another in others; here every visit of a macrostate shows it in one of ``F`` frames, drawn
+anew. In a real episode the frames of two visits are more alike, so who goes to and fro stays there a little longer.
 """
 
 from __future__ import annotations
@@ -11,25 +13,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Agent, Frame, Observation, TaskSpec
+from imagine_bench.interfaces import Agent, Observation, TaskSpec
 from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
 from imagine_bench.seeding import Purpose, SeedTree
 
+FRAMES = 16
+"""Frames of a macrostate, F."""
 _PATIENCE = 1_000
 """Macro-actions after which a success is taken for one that never comes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Situations:
-    """Every macrostate of a task that no episode ends in, and a frame of it. N of them.
+    """Every macrostate of a task that no episode ends in, N of them, and what it looks like.
 
     Attributes:
         macrostates: Shape (N, M).
-        frames: Kinematic mode. Shape (N, 64, 64, 3).
+        frames: Of each of them, kinematic mode. Shape (N, F, 64, 64, 3).
     """
 
     macrostates: NDArray[np.int64]
-    frames: Frame
+    frames: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,33 +61,39 @@ class Ends:
 
 
 def situations(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> Situations:
-    """All that an agent of a task may meet; the frames are the same for every agent."""
+    """All that an agent of a task may meet, each in :data:`FRAMES` frames, the same for every agent."""
     macrostates = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)], dtype=np.int64)
     rng = SeedTree(0).child(purpose, "policy", spec.id).generator()
-    return Situations(macrostates=macrostates, frames=spec.render_macrostates(macrostates, appearance, rng))
+    frames = spec.render_macrostates(np.repeat(macrostates, FRAMES, axis=0), appearance, rng)
+    return Situations(macrostates=macrostates, frames=frames.reshape(len(macrostates), FRAMES, *frames.shape[1:]))
 
 
-def choices(agent: Agent, met: Situations) -> NDArray[np.int64]:
-    """The greedy macro-action of an agent in each situation; it is not changed. Shape (N,)."""
-    actions = [agent.act(Observation(frame=frame), explore=False) for frame in met.frames]
-    return np.array(actions, dtype=np.int64)
+def choices(agent: Agent, met: Situations, n_actions: int) -> NDArray[np.float64]:
+    """In which share of the frames of each macrostate an agent takes each macro-action, greedily. Shape (A, N).
+
+    The agent is not changed.
+    """
+    counts = np.zeros((n_actions, len(met.macrostates)))
+    for index, frames in enumerate(met.frames):
+        for frame in frames:
+            counts[agent.act(Observation(frame=frame), explore=False), index] += 1.0
+    return np.asarray(counts / counts.sum(axis=0))
 
 
-def follow(spec: TaskSpec, met: Situations, actions: NDArray[np.int64]) -> Ends:
+def follow(spec: TaskSpec, met: Situations, policy: NDArray[np.float64]) -> Ends:
     """Follow a policy from every start, by the rules.
 
     Args:
         spec: The task.
         met: All situations.
-        actions: What is done in each of them. Shape (N,).
+        policy: Probability of each macro-action in each of them. Shape (A, N).
     """
-    rules, tables = spec.rules, tabulate(spec.rules)
-    policy = np.zeros(len(tables.index), dtype=np.int64)  # any action where episodes have ended
-    policy[[tables.index[tuple(state)] for state in met.macrostates.tolist()]] = actions
-    chosen = greedy(policy, rules.n_actions)
-    within = evaluate(tables, chosen, spec.horizon)
-    patient = evaluate(tables, chosen, max(spec.horizon, _PATIENCE))
-    optimal = evaluate(tables, greedy(optimal_policy(tables), rules.n_actions), spec.horizon)
+    tables = tabulate(spec.rules)
+    everywhere = np.full(tables.reward.shape, 1.0 / len(policy))  # anything, where episodes have ended
+    everywhere[:, [tables.index[tuple(state)] for state in met.macrostates.tolist()]] = policy
+    within = evaluate(tables, everywhere, spec.horizon)
+    patient = evaluate(tables, everywhere, max(spec.horizon, _PATIENCE))
+    optimal = evaluate(tables, greedy(optimal_policy(tables), len(policy)), spec.horizon)
     return Ends(
         success=within.success[tables.starts],
         failure=within.failure[tables.starts],

@@ -146,7 +146,7 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
     followed = []
     for run in tqdm(learners(bench), desc="runs", leave=False, disable=not sys.stderr.isatty()):
         trained = load_trained(run, encoder=encoder)
-        ends = follow(spec, met, choices(trained.agent, met))
+        ends = follow(spec, met, choices(trained.agent, met, spec.n_actions))
         who = trained.spec
         followed.append(Followed(agent=who.agent, seed=who.seed, episodes=trained.episodes, ends=ends))
     where = bench / "policy"

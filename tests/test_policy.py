@@ -18,8 +18,9 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, TaskSpec
 from imagine_bench.plans import fewest_actions
-from imagine_bench.policy import Ends, Situations, choices, follow, situations
+from imagine_bench.policy import FRAMES, Ends, Situations, choices, follow, situations
 from imagine_bench.report.policy import Followed, policy_table, write_policy
+from imagine_bench.rules import greedy
 from imagine_bench.trained import learners
 
 HARD = registry.task("arrow_puzzle_hard")
@@ -35,8 +36,9 @@ def hard() -> Situations:
 def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Ends:
     """Where a rule of choice leads; what the frames show does not matter to it."""
     states = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)])
-    met = Situations(macrostates=states, frames=np.zeros((len(states), 64, 64, 3), dtype=np.uint8))
-    return follow(spec, met, np.array([choose(tuple(state)) for state in states.tolist()]))
+    met = Situations(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
+    chosen = np.array([choose(tuple(state)) for state in states.tolist()])
+    return follow(spec, met, greedy(chosen, spec.n_actions))
 
 
 def means(ends: Ends) -> tuple[float, float, float, float]:
@@ -118,8 +120,26 @@ def test_chance_in_the_rules_is_kept() -> None:
     assert total == pytest.approx(np.ones(len(total))) and idle.success.mean() < 0.9
 
 
-def test_every_situation_is_asked_once_and_greedily(hard: Situations) -> None:
+def test_doubt_between_two_ways_is_a_walk_by_chance() -> None:
+    """Half of the frames say one legal turn and half the other: a fair walk on the ring, solved by hand."""
+    half = {state: legal(state) for state in HARD.rules.start_states}
+    states = np.array(list(half))
+    policy = sum(greedy(np.array([half[tuple(s)][way] for s in states.tolist()]), 6) for way in (0, 1)) / 2
+    met = Situations(macrostates=states, frames=np.zeros((len(states), 2, 64, 64, 3), dtype=np.uint8))
+    ends = follow(HARD, met, policy)
+    ring = np.zeros(13)  # the goal is at 0 and at 12, one turn a step
+    ring[[0, 12]] = 1.0
+    for _ in range(HARD.horizon):
+        ring[1:12] = (ring[:11] + ring[2:]) / 2
+    by_distance = {int(far): ring[int(far)] for far in ends.shortest}
+    assert ends.success == pytest.approx(np.array([by_distance[int(far)] for far in ends.shortest]))
+    assert ends.failure == pytest.approx(0.0) and ends.success + ends.late == pytest.approx(np.ones(66), abs=1e-4)
+
+
+def test_every_frame_is_asked_once_and_greedily(hard: Situations) -> None:
     assert len(hard.macrostates) == 66 == len(HARD.rules.start_states)
+    assert hard.frames.shape == (66, FRAMES, 64, 64, 3)
+    assert not np.array_equal(hard.frames[0, 0], hard.frames[0, 1]), "cubes lie a little otherwise each time"
     again = situations(HARD, appearance="clean")
     assert np.array_equal(again.frames, hard.frames)
 
@@ -129,10 +149,11 @@ def test_every_situation_is_asked_once_and_greedily(hard: Situations) -> None:
         def act(self, observation: Observation, *, explore: bool) -> int:
             assert not explore and observation.macrostate is None
             self.seen.append(observation.frame)
-            return len(self.seen) % 6
+            return 5 if len(self.seen) % FRAMES == 1 else 2
 
-    assert choices(Watched(), hard).tolist() == [count % 6 for count in range(1, 67)]
-    assert np.array_equal(np.stack(Watched.seen), hard.frames)
+    policy = choices(Watched(), hard, 6)
+    assert np.array_equal(policy[5], np.full(66, 1 / FRAMES)) and np.array_equal(policy[2], np.full(66, 1 - 1 / FRAMES))
+    assert np.array_equal(np.stack(Watched.seen), hard.frames.reshape(-1, 64, 64, 3))
 
 
 def test_table_and_files(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.files import make_folder, write_bytes, write_json
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.policy import Ends
+from imagine_bench.policy import FRAMES, Ends
 from imagine_bench.report.words import agent_words, few_words, mean_text, percent
 from imagine_bench.seeding import SeedTree
 
@@ -41,8 +41,8 @@ def policy_table(followed: Sequence[Followed], task: TaskSpec) -> str:
     groups = list(dict.fromkeys((one.agent, one.episodes) for one in followed))
     most = max(Counter((one.agent, one.episodes) for one in followed).values())
     lines = [
-        f"All {starts} starts, followed by the rules from one frame a macrostate; mean over seeds [95 % interval over "
-        f"seeds]. {' '.join(few_words(most))}".rstrip(),
+        f"All {starts} starts, followed by the rules; every visit of a macrostate shows one of {FRAMES} frames of it. "
+        f"Mean over seeds [95 % interval over seeds]. {' '.join(few_words(most))}".rstrip(),
         "",
         "| agent | real episodes | seeds | solved, % | ends otherwise, % | solved after the last macro-action, % "
         f"| never, % | macro-actions (optimal: {_optimal(followed):.2f}) |",
