@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +20,9 @@ from imagine_bench.seeding import SeedTree
 
 _SHARES = ("success", "failure", "late", "never")
 _SURE = 0.999
+"""From here on a start counts as always solved: rules may leave something to chance."""
 _LISTED = 12
-"""Starts that the page lists; the others are in the table of all."""
+"""Starts that the page lists; starts.csv has all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,24 +36,23 @@ class Followed:
 
 
 def policy_table(followed: Sequence[Followed], task: TaskSpec) -> str:
-    """Means over the seeds of each agent with 95 % intervals, and the starts that are not solved, as Markdown."""
-    starts = len(task.rules.start_states)
-    groups = list(dict.fromkeys((one.agent, one.episodes) for one in followed))
-    most = max(Counter((one.agent, one.episodes) for one in followed).values())
+    """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
+    groups = _groups(followed)
+    optimal = float(followed[0].ends.shortest.mean())
     lines = [
-        f"All {starts} starts, followed by the rules; every visit of a macrostate shows one of {FRAMES} frames of it. "
-        f"Mean over seeds [95 % interval over seeds]. {' '.join(few_words(most))}".rstrip(),
+        f"All {len(task.rules.start_states)} starts, followed by the rules; every visit of a macrostate shows one of "
+        f"{FRAMES} frames of it. Mean over seeds [95 % interval over seeds]. "
+        f"{' '.join(few_words(max(map(len, groups.values()))))}".rstrip(),
         "",
         "| agent | real episodes | seeds | solved, % | ends otherwise, % | solved after the last macro-action, % "
-        f"| never, % | macro-actions (optimal: {_optimal(followed):.2f}) |",
+        f"| never, % | macro-actions (optimal: {optimal:.2f}) |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for agent, episodes in groups:
-        ends = [one.ends for one in followed if (one.agent, one.episodes) == (agent, episodes)]
+    for (agent, episodes), ends in groups.items():
         cells = [_cell([getattr(one, share) for one in ends], f"{agent} {share}") for share in _SHARES]
         cells.append(_cell([one.length for one in ends], f"{agent} length", "{:.2f}".format))
         lines.append(f"| {agent_words(agent).title} | {episodes:,} | {len(ends)} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *_unsolved(followed, task)])
+    return "\n".join([*lines, "", *_missed(groups, followed[0].ends.shortest, task)])
 
 
 def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, facts: dict[str, Any]) -> None:
@@ -78,27 +77,30 @@ def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, fac
     write_bytes(folder / "policy.md", page.encode())
 
 
-def _optimal(followed: Sequence[Followed]) -> float:
-    return float(followed[0].ends.shortest.mean())
+def _groups(followed: Sequence[Followed]) -> dict[tuple[str, int], list[Ends]]:
+    """The seeds of one agent after as many episodes; those of an unfinished bench may differ in that."""
+    groups: dict[tuple[str, int], list[Ends]] = {}
+    for one in followed:
+        groups.setdefault((one.agent, one.episodes), []).append(one.ends)
+    return groups
 
 
-def _unsolved(followed: Sequence[Followed], task: TaskSpec) -> list[str]:
-    """The starts that most runs do not solve for sure, with what an optimal agent needs there."""
-    failing = np.array([one.ends.success < _SURE for one in followed])  # [runs, starts]
-    order = [index for index in np.argsort(-failing.sum(axis=0), kind="stable") if failing[:, index].any()]
+def _missed(groups: dict[tuple[str, int], list[Ends]], shortest: NDArray[np.float64], task: TaskSpec) -> list[str]:
+    """The starts that are solved least, with what an optimal agent needs there."""
+    solved = np.array([np.mean([one.success for one in ends], axis=0) for ends in groups.values()])  # [groups, starts]
+    order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if solved[:, index].min() < _SURE]
     if not order:
         return ["Every run solves every start."]
+    heads = [f"{agent_words(agent).title}, {episodes:,} episodes, %" for agent, episodes in groups]
     lines = [
-        f"Starts that some run does not always solve: {len(order)}; the {min(len(order), _LISTED)} of most runs:",
+        f"Starts that some run does not always solve: {len(order)} of {len(shortest)}. Solved least:",
         "",
-        "| start | optimal macro-actions | runs that do not always solve it |",
-        "|---|---|---|",
+        f"| start | optimal macro-actions | {' | '.join(heads)} |",
+        f"|---|---|{'---|' * len(heads)}",
     ]
     for index in order[:_LISTED]:
-        runs = Counter(one.agent for one, fails in zip(followed, failing[:, index], strict=True) if fails)
-        who = ", ".join(f"{agent_words(agent).title}: {count}" for agent, count in runs.items())
-        needs = followed[0].ends.shortest[index]
-        lines.append(f"| {_words(task.rules.start_states[index], task)} | {needs:.2f} | {who} |")
+        cells = " | ".join(percent(float(share)) for share in solved[:, index])
+        lines.append(f"| {_words(task.rules.start_states[index], task)} | {shortest[index]:.2f} | {cells} |")
     return lines
 
 
