@@ -24,6 +24,9 @@ _SURE = 0.999
 _LISTED = 12
 """Starts that the page lists; starts.csv has all."""
 
+_Groups = dict[tuple[str, int], list[Ends]]
+"""The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Followed:
@@ -52,7 +55,8 @@ def policy_table(followed: Sequence[Followed], task: TaskSpec) -> str:
         cells = [_cell([getattr(one, share) for one in ends], f"{agent} {share}") for share in _SHARES]
         cells.append(_cell([one.length for one in ends], f"{agent} length", "{:.2f}".format))
         lines.append(f"| {agent_words(agent).title} | {episodes:,} | {len(ends)} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *_missed(groups, followed[0].ends.shortest, task)])
+    shortest = followed[0].ends.shortest
+    return "\n".join([*lines, "", *_by_distance(groups, shortest), "", *_missed(groups, shortest, task)])
 
 
 def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, facts: dict[str, Any]) -> None:
@@ -77,31 +81,49 @@ def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, fac
     write_bytes(folder / "policy.md", page.encode())
 
 
-def _groups(followed: Sequence[Followed]) -> dict[tuple[str, int], list[Ends]]:
-    """The seeds of one agent after as many episodes; those of an unfinished bench may differ in that."""
-    groups: dict[tuple[str, int], list[Ends]] = {}
+def _groups(followed: Sequence[Followed]) -> _Groups:
+    groups: _Groups = {}
     for one in followed:
         groups.setdefault((one.agent, one.episodes), []).append(one.ends)
     return groups
 
 
-def _missed(groups: dict[tuple[str, int], list[Ends]], shortest: NDArray[np.float64], task: TaskSpec) -> list[str]:
+def _by_distance(groups: _Groups, shortest: NDArray[np.float64]) -> list[str]:
+    """What is solved of the starts from which an optimal agent needs equally long."""
+    needs = shortest.round().astype(int)
+    solved = _solved(groups)
+    lines = [f"| optimal macro-actions | starts | {_heads(groups)} |", f"|---|---|{'---|' * len(groups)}"]
+    for need in np.unique(needs):
+        cells = " | ".join(percent(float(share)) for share in solved[:, needs == need].mean(axis=1))
+        lines.append(f"| {need} | {int((needs == need).sum())} | {cells} |")
+    return lines
+
+
+def _missed(groups: _Groups, shortest: NDArray[np.float64], task: TaskSpec) -> list[str]:
     """The starts that are solved least, with what an optimal agent needs there."""
-    solved = np.array([np.mean([one.success for one in ends], axis=0) for ends in groups.values()])  # [groups, starts]
+    solved = _solved(groups)
     order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if solved[:, index].min() < _SURE]
     if not order:
         return ["Every run solves every start."]
-    heads = [f"{agent_words(agent).title}, {episodes:,} episodes, %" for agent, episodes in groups]
     lines = [
         f"Starts that some run does not always solve: {len(order)} of {len(shortest)}. Solved least:",
         "",
-        f"| start | optimal macro-actions | {' | '.join(heads)} |",
-        f"|---|---|{'---|' * len(heads)}",
+        f"| start | optimal macro-actions | {_heads(groups)} |",
+        f"|---|---|{'---|' * len(groups)}",
     ]
     for index in order[:_LISTED]:
         cells = " | ".join(percent(float(share)) for share in solved[:, index])
         lines.append(f"| {_words(task.rules.start_states[index], task)} | {shortest[index]:.2f} | {cells} |")
     return lines
+
+
+def _solved(groups: _Groups) -> NDArray[np.float64]:
+    """Mean over the seeds of each group, of each start. Shape (groups, starts)."""
+    return np.array([np.mean([one.success for one in ends], axis=0) for ends in groups.values()])
+
+
+def _heads(groups: _Groups) -> str:
+    return " | ".join(f"{agent_words(agent).title}, {episodes:,} episodes: solved, %" for agent, episodes in groups)
 
 
 def _words(macrostate: tuple[int, ...], task: TaskSpec) -> str:
