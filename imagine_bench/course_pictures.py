@@ -63,11 +63,8 @@ def _imagined(
 
 def changes(before: NDArray[np.int64], now: NDArray[np.int64], spec: TaskSpec) -> str:
     """What is different, in the task's own words."""
-    parts = [
-        f"{name} {values[int(after)]}"
-        for name, values, was, after in zip(spec.macrostate_names, spec.macrostate_values, before, now, strict=True)
-        if was != after
-    ]
+    named = zip(spec.macrostate_names, spec.value_names(now), before, now, strict=True)
+    parts = [f"{name} {value}" for name, value, was, after in named if was != after]
     return ", ".join(parts) or "nothing changes"
 
 

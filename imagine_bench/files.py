@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -100,6 +102,13 @@ def write_json(path: Path, value: Any) -> None:
         SetupError: It cannot be written.
     """
     write_bytes(path, (json.dumps(value, indent=1) + "\n").encode())
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows, the head first, as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def read_json(path: Path, what: str, holds: type = dict) -> Any:

@@ -7,7 +7,7 @@ actions, ``M`` coordinates of a macrostate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -206,6 +206,10 @@ class TaskSpec:
     def n_actions(self) -> int:
         """Number of macro-actions A."""
         return len(self.action_names)
+
+    def value_names(self, macrostate: Sequence[int] | Macrostate) -> tuple[str, ...]:
+        """The names of a macrostate's values, one a coordinate. Length M."""
+        return tuple(names[int(value)] for names, value in zip(self.macrostate_values, macrostate, strict=True))
 
 
 def bundled_name(encoder: str, appearance: str, kind: str) -> str:

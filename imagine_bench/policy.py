@@ -1,9 +1,11 @@
 """What a trained agent would do in every macrostate, and where that leads by the rules: no episode is sampled.
 
-A test says how often an agent succeeds. This says from which starts it does not, and how: an end that is no success, a
-success that comes too late, or neither, however long it goes on. An agent sees a macrostate in many frames, and may do
-one thing in some of them and another in others; here every visit of a macrostate shows it in one of ``F`` frames, drawn
-anew. In a real episode the frames of two visits are more alike, so who goes to and fro stays there a little longer.
+A test says how often an agent succeeds. This says from which starts it does not, and how: an end that is no success, or
+out of time, and then whether it would have come to a success, to another end, or to none however long.
+
+An agent sees a macrostate in many frames, and may do one thing in some of them and another in others; here every visit
+of a macrostate shows it in one of ``F`` frames, drawn anew. In a real episode the frames of two visits are more alike,
+so who goes to and fro stays there a little longer.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from imagine_bench.seeding import Purpose, SeedTree
 FRAMES = 16
 """Frames of a macrostate, F."""
 _PATIENCE = 1_000
-"""Macro-actions after which a success is taken for one that never comes."""
+"""Macro-actions after which an end is taken for one that never comes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,21 +45,22 @@ class Ends:
     Attributes:
         success: Probability of a success within the horizon.
         failure: Probability of another end within the horizon.
-        late: Probability of a success after the horizon, if episodes went on there.
+        late_success: Probability of a success after the horizon, if episodes went on there.
+        late_failure: Probability of another end after it.
         length: Expected macro-actions within the horizon.
-        shortest: The same of an optimal agent.
     """
 
     success: NDArray[np.float64]
     failure: NDArray[np.float64]
-    late: NDArray[np.float64]
+    late_success: NDArray[np.float64]
+    late_failure: NDArray[np.float64]
     length: NDArray[np.float64]
-    shortest: NDArray[np.float64]
 
     @property
-    def never(self) -> NDArray[np.float64]:
-        """Probability of what remains: out of time at the horizon, and no success after it."""
-        return np.maximum(0.0, 1.0 - self.success - self.failure - self.late)  # but for rounding
+    def endless(self) -> NDArray[np.float64]:
+        """Probability of what remains: no end at all."""
+        ended = self.success + self.failure + self.late_success + self.late_failure
+        return np.maximum(0.0, 1.0 - ended)  # but for rounding
 
 
 def situations(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> Situations:
@@ -80,6 +83,13 @@ def choices(agent: Agent, met: Situations, n_actions: int) -> NDArray[np.float64
     return np.asarray(counts / counts.sum(axis=0))
 
 
+def optimal_length(spec: TaskSpec) -> NDArray[np.float64]:
+    """Expected macro-actions of an optimal agent within the horizon, from each start. Shape (S,)."""
+    tables = tabulate(spec.rules)
+    best = greedy(optimal_policy(tables), spec.n_actions)
+    return evaluate(tables, best, spec.horizon).length[tables.starts]
+
+
 def follow(spec: TaskSpec, met: Situations, policy: NDArray[np.float64]) -> Ends:
     """Follow a policy from every start, by the rules.
 
@@ -93,11 +103,10 @@ def follow(spec: TaskSpec, met: Situations, policy: NDArray[np.float64]) -> Ends
     everywhere[:, [tables.index[tuple(state)] for state in met.macrostates.tolist()]] = policy
     within = evaluate(tables, everywhere, spec.horizon)
     patient = evaluate(tables, everywhere, max(spec.horizon, _PATIENCE))
-    optimal = evaluate(tables, greedy(optimal_policy(tables), len(policy)), spec.horizon)
     return Ends(
         success=within.success[tables.starts],
         failure=within.failure[tables.starts],
-        late=(patient.success - within.success)[tables.starts],
+        late_success=(patient.success - within.success)[tables.starts],
+        late_failure=(patient.failure - within.failure)[tables.starts],
         length=within.length[tables.starts],
-        shortest=optimal.length[tables.starts],
     )

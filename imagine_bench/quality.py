@@ -24,7 +24,7 @@ from imagine_bench.report.plans import plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.seeding import SeedTree, exam
 from imagine_bench.store import load_bench, newest_bench, read_protocol
-from imagine_bench.trained import Trained, best_run, imagining, learners, load_trained, require_control
+from imagine_bench.trained import Trained, best_run, imagining, learners, load_trained, require_control, require_runs
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -104,8 +104,10 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     Raises:
         ImagineBenchError: No bench, or none that imagines.
     """
-    result = load_bench(folder or newest_bench(root, _control(task)))
-    require_control(result.protocol.task, result.folder)
+    bench = folder or newest_bench(root, _control(task))
+    require_control(read_protocol(bench).task, str(bench))
+    require_runs(bench)
+    result = load_bench(bench)
     protocol = result.protocol
     spec = registry.task(protocol.task)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
@@ -140,17 +142,19 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
     """
     bench = folder or newest_bench(root, _control(task))
     protocol = read_protocol(bench)
-    require_control(protocol.task, bench)
-    spec = registry.task(protocol.task)
+    require_control(protocol.task, str(bench))
+    require_runs(bench)
+    spec, runs = registry.task(protocol.task), learners(bench)
     met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
     followed = []
-    for run in tqdm(learners(bench), desc="runs", leave=False, disable=not sys.stderr.isatty()):
+    for run in tqdm(runs, desc="runs", leave=False, disable=not sys.stderr.isatty()):
         trained = load_trained(run, encoder=encoder)
         ends = follow(spec, met, choices(trained.agent, met, spec.n_actions))
         who = trained.spec
         followed.append(Followed(agent=who.agent, seed=who.seed, episodes=trained.episodes, ends=ends))
     where = bench / "policy"
-    write_policy(where, followed, spec, {**_origin(protocol.hash), "appearance": protocol.appearance})
+    facts = {**_origin(protocol.hash), "appearance": protocol.appearance, "frames": "kinematic"}
+    write_policy(where, followed, spec, facts)
     head = f"{spec.title}, {protocol.appearance}"
     return "\n".join([head, "", policy_table(followed, spec), "", f"All starts: {where / 'starts.csv'}"])
 
@@ -160,7 +164,7 @@ def _control(task: str | None) -> tuple[str, ...]:
     if task is None:
         return tuple(registry.TASKS)
     kind_of(task)  # knows every name
-    require_control(task, Path(task))
+    require_control(task, f"Task {task!r}")
     return (task,)
 
 

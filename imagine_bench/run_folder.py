@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import read_json, reading, sha256, write_bytes, write_json
+from imagine_bench.files import csv_text, read_json, reading, sha256, write_bytes, write_json
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 FORMAT = "imagine_bench run 1"
@@ -80,13 +80,13 @@ def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
         SetupError: It cannot be written.
     """
     names = sorted({name for checkpoint in checkpoints for name in checkpoint.diagnostics})
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*_INTEGERS, *_NUMBERS, *(_DIAGNOSTIC + name for name in names)])
-    for row in checkpoints:
-        values = [getattr(row, name) for name in (*_INTEGERS, *_NUMBERS)]
-        table.writerow([*values, *(row.diagnostics.get(name, "") for name in names)])
-    write_bytes(folder / _METRICS, text.getvalue().encode())
+    fields = (*_INTEGERS, *_NUMBERS)
+    rows = [
+        [*(getattr(row, field) for field in fields), *(row.diagnostics.get(name, "") for name in names)]
+        for row in checkpoints
+    ]
+    head = [*fields, *(_DIAGNOSTIC + name for name in names)]
+    write_bytes(folder / _METRICS, csv_text([head, *rows]).encode())
 
 
 def forget(folder: Path) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import encoders, registry
-from imagine_bench.capabilities import Imaginer
-from imagine_bench.checkpointing import has_checkpoint, load_newest
+from imagine_bench.archive import is_archive
+from imagine_bench.capabilities import Imaginer, Rehearser
+from imagine_bench.checkpointing import load_newest
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.files import read_json, reading
 from imagine_bench.interfaces import Agent, TaskSpec
@@ -28,7 +29,7 @@ class Trained:
         agent: The agent itself.
         spec: What its run was.
         task: The task it was trained on.
-        episodes: Real training episodes it has had.
+        episodes: Real training episodes it has had on its task, without those on tasks before.
         folder: Its run's folder.
     """
 
@@ -68,7 +69,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     with reading(path, what):
         task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
         settings = tuple(sorted(_flat(config["settings"]).items()))
-    require_control(task, folder)
+    require_control(task, str(folder))
     with reading(path, what):
         protocol = Protocol.from_dict(config["protocol"])
     spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
@@ -78,14 +79,23 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
     agent.restore(snapshot.agent)
+    if isinstance(agent, Rehearser):  # as before every test; there is nothing left to do in a finished run
+        while agent.rehearse():
+            pass
     return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
 
 
-def require_control(task: str, folder: Path) -> None:
-    """Raise ArtefactError for what is left of a task in which nothing is done, so that nothing can be planned."""
+def require_control(task: str, what: str) -> None:
+    """Raise ArtefactError for a task in which no agent acts."""
     if task not in registry.TASKS:
+        raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
+
+
+def require_runs(bench: Path) -> None:
+    """Raise ArtefactError for results that were kept without the agents."""
+    if is_archive(bench):
         raise ArtefactError(
-            f"{folder} is of a regression task, and no transitions are imagined there; give one of agents."
+            f"{bench} holds kept results and no agents; give a bench's own folder, runs/<task>/<preset>-<hash>."
         )
 
 
@@ -112,13 +122,19 @@ def learners(bench: Path) -> tuple[Path, ...]:
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
     able = [agent for agent, entry in entries.items() if entry.learns and not entry.trains_itself]
     folders = [store.run_folder(agent, seed) for agent in able for seed in protocol.seeds]
-    found = tuple(folder for folder in folders if has_checkpoint(folder / "checkpoints"))
+    found = tuple(folder for folder in folders if _has_learned(folder))
     if not found:
         raise ArtefactError(
             f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again (a library's "
             "cannot); give the folder of a bench with one, such as of dqn."
         )
     return found
+
+
+def _has_learned(run: Path) -> bool:
+    """Whether a run has had an episode on its task; one with tasks before may have a checkpoint without."""
+    snapshot = load_newest(run / "checkpoints")
+    return snapshot is not None and snapshot.episode > 0
 
 
 def best_run(result: BenchResult) -> RunResult:
@@ -135,13 +151,24 @@ def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
     used = protocol.encoder_of(entry.encoder_kind)
     if not entry.needs_encoder or used is None:
         return None
-    path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given or used.partition("@")[0])
+    task, name = registry.task(protocol.task), used.partition("@")[0]
+    if given is not None and _is_other(task, protocol, given, used):
+        given = None
+    if given is None and name not in encoders.bundled():
+        raise ArtefactError(f"The run saw through encoder {used}, which is not bundled; give its file with --encoder.")
+    path = encoders.resolve(task, protocol.appearance, given or name)
     if encoders.identity(path) != used:
         raise ArtefactError(
             f"The run saw through encoder {used}, and {path} is {encoders.identity(path)}; give the right "
             "file with --encoder."
         )
     return path
+
+
+def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool:
+    """Whether an encoder was given for the agents of the bench that see through another kind than this one."""
+    found = encoders.identity(encoders.resolve(task, protocol.appearance, given))
+    return found != used and found in (protocol.encoder, protocol.codes)
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from imagine_bench.errors import ArtefactError, BusyError, SetupError
-from imagine_bench.files import lock, make_folder, read_json, write_bytes, write_json, writing
+from imagine_bench.files import csv_text, lock, make_folder, read_json, write_bytes, write_json, writing
 
 _HOLD = """
 import sys, time
@@ -97,3 +97,7 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(SetupError, match="No such file"):
         write_bytes(tmp_path / "missing" / "a", b"x")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_as_csv() -> None:
+    assert csv_text([["a", "b"], (1, "x, y")]) == 'a,b\n1,"x, y"\n'

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_fakes import TableAgent
 from fake_agents import FakeAgent
 from numpy.typing import NDArray
 from test_waves import Inline, bench
 
-from imagine_bench import registry
+from imagine_bench import encoders, registry
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, TaskSpec
 from imagine_bench.plans import fewest_actions
-from imagine_bench.policy import FRAMES, Ends, Situations, choices, follow, situations
+from imagine_bench.policy import FRAMES, Ends, Situations, choices, follow, optimal_length, situations
+from imagine_bench.protocol import protocol
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.rules import greedy
-from imagine_bench.trained import learners
+from imagine_bench.trained import learners, load_trained
 
 HARD = registry.task("arrow_puzzle_hard")
 PICK = registry.task("pick_place")
@@ -42,7 +46,7 @@ def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Ends:
 
 
 def means(ends: Ends) -> tuple[float, float, float, float]:
-    return tuple(float(part.mean()) for part in (ends.success, ends.failure, ends.late, ends.never))  # type: ignore[return-value]
+    return tuple(float(part.mean()) for part in (ends.success, ends.failure, ends.late_success, ends.endless))  # type: ignore[return-value]
 
 
 def legal(state: State) -> list[int]:
@@ -70,8 +74,8 @@ def walked(spec: TaskSpec, choose: Callable[[State], int], start: State, patienc
 def test_the_optimal_policy_misses_nothing() -> None:
     ends = ends_of(HARD, HARD.rules.optimal_action)
     assert means(ends) == (1.0, 0.0, 0.0, 0.0)
-    assert np.array_equal(ends.length, ends.shortest)
-    assert ends.shortest.tolist() == [fewest_actions(HARD.rules, state) for state in HARD.rules.start_states]
+    assert np.array_equal(ends.length, optimal_length(HARD))
+    assert optimal_length(HARD).tolist() == [fewest_actions(HARD.rules, state) for state in HARD.rules.start_states]
 
 
 def test_the_long_way_round_comes_late() -> None:
@@ -85,7 +89,12 @@ def test_the_long_way_round_comes_late() -> None:
         here, previous = turns[policy[here]], here
     ends = ends_of(HARD, policy.__getitem__)
     index = HARD.rules.start_states.index(astray)
-    assert (ends.success[index], ends.failure[index], ends.late[index], ends.length[index]) == (0.0, 0.0, 1.0, 10.0)
+    assert (ends.success[index], ends.failure[index], ends.late_success[index], ends.length[index]) == (
+        0.0,
+        0.0,
+        1.0,
+        10.0,
+    )
     assert walked(HARD, policy.__getitem__, astray, 20) == (True, True, 11)
     assert ends.success.sum() == len(ends.success) - 1, "ten turns are still in time"
 
@@ -94,8 +103,21 @@ def test_who_undoes_what_was_done_never_comes() -> None:
     ends = ends_of(HARD, lambda state: legal(state)[0])
     for index, start in enumerate(HARD.rules.start_states):
         success, _, _ = walked(HARD, lambda state: legal(state)[0], start, 1_000)
-        assert (ends.success[index] + ends.late[index], ends.never[index]) == (float(success), 1.0 - success)
-    assert 0.0 < ends.never.mean() < 1.0
+        assert (ends.success[index] + ends.late_success[index], ends.endless[index]) == (float(success), 1.0 - success)
+    assert 0.0 < ends.endless.mean() < 1.0
+
+
+def test_what_fails_after_the_horizon_is_told_from_what_never_ends() -> None:
+    """Where one frame in a hundred makes the agent break a rule, going to and fro ends that way, but mostly late."""
+    states = np.array(HARD.rules.start_states)
+    to_and_fro = greedy(np.array([legal(tuple(state))[0] for state in states.tolist()]), 6)
+    illegal = greedy(np.array([min(set(range(6)) - set(legal(tuple(state)))) for state in states.tolist()]), 6)
+    met = Situations(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
+    pure, mixed = follow(HARD, met, to_and_fro), follow(HARD, met, 0.99 * to_and_fro + 0.01 * illegal)
+    stuck = pure.endless == 1.0
+    assert stuck.any() and mixed.endless == pytest.approx(0.0, abs=1e-4)
+    assert mixed.failure[stuck] == pytest.approx(1 - 0.99**HARD.horizon)
+    assert mixed.late_failure[stuck] == pytest.approx(0.99**HARD.horizon, abs=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -114,9 +136,9 @@ def test_chance_in_the_rules_is_kept() -> None:
     ends = ends_of(PICK, PICK.rules.optimal_action)
     assert ends.success.mean() == pytest.approx(PICK.facts().optimum)
     assert ends.length.mean() == pytest.approx(PICK.facts().mean_plan_length)
-    assert 0.0 < ends.late.max() < 1e-3, "the optimal agent is cut off once in 25,000 episodes"
+    assert 0.0 < ends.late_success.max() < 1e-3, "the optimal agent is cut off once in 25,000 episodes"
     idle = ends_of(PICK, lambda state: 0)
-    total = idle.success + idle.failure + idle.late + idle.never
+    total = idle.success + idle.failure + idle.late_success + idle.late_failure + idle.endless
     assert total == pytest.approx(np.ones(len(total))) and idle.success.mean() < 0.9
 
 
@@ -131,9 +153,11 @@ def test_doubt_between_two_ways_is_a_walk_by_chance() -> None:
     ring[[0, 12]] = 1.0
     for _ in range(HARD.horizon):
         ring[1:12] = (ring[:11] + ring[2:]) / 2
-    by_distance = {int(far): ring[int(far)] for far in ends.shortest}
-    assert ends.success == pytest.approx(np.array([by_distance[int(far)] for far in ends.shortest]))
-    assert ends.failure == pytest.approx(0.0) and ends.success + ends.late == pytest.approx(np.ones(66), abs=1e-4)
+    by_distance = {int(far): ring[int(far)] for far in optimal_length(HARD)}
+    assert ends.success == pytest.approx(np.array([by_distance[int(far)] for far in optimal_length(HARD)]))
+    assert ends.failure == pytest.approx(0.0) and ends.success + ends.late_success == pytest.approx(
+        np.ones(66), abs=1e-4
+    )
 
 
 def test_every_frame_is_asked_once_and_greedily(hard: Situations) -> None:
@@ -166,12 +190,15 @@ def test_table_and_files(tmp_path: Path) -> None:
     table = policy_table(followed, HARD)
     assert "All 66 starts" in table and "(optimal: 3.27)" in table
     assert f"| DQN | 100 | 2 | {50 + 50 * bad.success.mean():.1f} [" in table
-    assert "| imagination | 50 | 1 | 100.0 | 0.0 | 0.0 | 0.0 | 3.27 |" in table
+    assert "| imagination | 50 | 1 | 100.0 | 0.0 | 0.0 | 0.0 | 0.0 | 3.27 |" in table
     assert f"Starts that some run does not always solve: {(bad.success < 1).sum()} of 66. Solved least:" in table
-    near = [end for end, need in zip(bad.success, bad.shortest, strict=True) if need == 2]
+    near = [end for end, need in zip(bad.success, optimal_length(HARD), strict=True) if need == 2]
     assert f"| 2 | 12 | {50 + 50 * np.mean(near):.1f} | 100.0 |" in table
     assert table.endswith("| 50.0 | 100.0 |") and table.split("Solved least:")[1].count("| 50.0 | 100.0 |") == 12
     assert "Every run solves every start." in policy_table(followed[2:], HARD)
+    seldom = dataclasses.replace(good, success=np.where(np.arange(66) == 5, 0.998, 1.0))
+    many = [Followed(agent="dqn", seed=seed, episodes=9, ends=seldom if seed == 3 else good) for seed in range(5)]
+    assert "does not always solve: 1 of 66." in policy_table(many, HARD), "the mean of five is 99.96 %"
     write_policy(tmp_path / "out", followed, HARD, {"commit": "abc"})
     with (tmp_path / "out" / "starts.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -192,6 +219,49 @@ def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytes
     said = capsys.readouterr().out
     assert "| table | 9 | 2 |" in said and "| imaginer | 9 | 1 |" in said and str(folder / "policy") in said
     assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
+
+
+@pytest.mark.parametrize(
+    ("folder", "complaint"),
+    [
+        ("docs/results/arrow_puzzle_hard-thesis-dqn", "holds kept results and no agents; give a bench's own folder"),
+        ("docs/results/toy_regression-quick", "is of a regression task, in which no agent acts"),
+        ("docs", "There is no docs/protocol.json"),
+    ],
+)
+@pytest.mark.parametrize("command", ["policy", "generalise"])
+def test_folders_without_agents_are_named(
+    command: str, folder: str, complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(Path(__file__).parent.parent)
+    assert main([command, folder]) == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_who_rehearses_before_tests_does_so_before_questions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
+    left = [True, True, False]
+    monkeypatch.setattr(TableAgent, "rehearse", lambda agent: left.pop(0), raising=False)
+    load_trained(result.runs[0].folder)
+    assert left == []
+
+
+def test_one_encoder_file_is_enough_where_agents_see_through_two_kinds(tmp_path: Path) -> None:
+    own = tmp_path / "own.safetensors"
+    shutil.copy(encoders.resolve(HARD, "clean"), own)
+    codes = encoders.resolve(HARD, "clean", kind="codes")
+    names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
+    wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "imagine"), **names)
+    config = {"protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
+    for agent, complaint in (("dqn", "has no checkpoint"), ("imagine", "has no checkpoint")):
+        (tmp_path / "config.json").write_text(json.dumps({**config, "agent": agent}))
+        with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
+            load_trained(tmp_path, encoder=str(own))
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ArtefactError, match=r"own@\w+, which is not bundled; give its file with --encoder"):
+        load_trained(tmp_path)
+    with pytest.raises(ArtefactError, match=r"own@\w+, and .*arrow_puzzle-mild.* give the right file"):
+        load_trained(tmp_path, encoder="arrow_puzzle-mild")
 
 
 def test_a_bench_without_learners_says_so(tmp_path: Path) -> None:

@@ -213,8 +213,8 @@ class _Story:
 
     def _seen(self, macrostate: NDArray[np.int64]) -> str:
         """The macrostate in words."""
-        pairs = zip(self._spec.macrostate_names, self._spec.macrostate_values, macrostate, strict=True)
-        return "\n".join(f"- {name}: {values[int(value)]}" for name, values, value in pairs)
+        pairs = zip(self._spec.macrostate_names, self._spec.value_names(macrostate), strict=True)
+        return "\n".join(f"- {name}: {value}" for name, value in pairs)
 
     def _outcome(self, action: int, reward: float, info: dict[str, Any]) -> str:
         fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import write_bytes
+from imagine_bench.files import csv_text, write_bytes
 from imagine_bench.regression.protocol import RegressionProtocol
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
@@ -111,11 +111,8 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> None:
 
 def rows_csv(rows: Sequence[Row]) -> str:
     """Rows as CSV."""
-    text = io.StringIO()
-    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    return text.getvalue()
+    names = list(rows[0])
+    return csv_text([names, *([row[name] for name in names] for row in rows)])
 
 
 def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from imagine_bench import reference, registry, statistics
+from imagine_bench.files import csv_text
 from imagine_bench.interfaces import RuleFacts, TaskSpec
 from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
@@ -191,7 +190,7 @@ def results_csv(result: BenchResult) -> str:
                 row = [agent, run.seed, *(getattr(checkpoint, field) for field in fields), low, high]
                 row += [getattr(checkpoint, cost) for cost in costs]
                 rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def open_loop_csv(result: BenchResult) -> str:
@@ -205,7 +204,7 @@ def open_loop_csv(result: BenchResult) -> str:
                 for index in range(0 if loop is None else len(loop.count)):
                     values = [getattr(loop, name)[index] for name in names]
                     rows.append([agent, run.seed, checkpoint.episodes, index + 1, *values])
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def summary_csv(data: ReportData) -> str:
@@ -222,7 +221,7 @@ def summary_csv(data: ReportData) -> str:
             else:
                 row += [""] * 7
             rows.append(row + list(data.areas.get(agent, {}).get(budget, [""] * 3)))
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def futures_csv(data: ReportData) -> str:
@@ -236,17 +235,15 @@ def futures_csv(data: ReportData) -> str:
                 if checkpoint.futures is not None:
                     head = [agent, run.seed, checkpoint.episodes]
                     rows += [[*head, *row] for row in _futures_rows(checkpoint.futures, spec, measures)]
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def _futures_rows(futures: Futures, spec: TaskSpec, measures: tuple[str, ...]) -> Iterator[list[object]]:
     for depth, pair in np.ndindex(*futures.total_variation.shape):
-        state = zip(spec.macrostate_values, futures.macrostates[pair], strict=True)
-        words = [values[int(value)] for values, value in state]
         numbers = [np.broadcast_to(getattr(futures, name), futures.floor.shape)[depth, pair] for name in measures]
         yield [
             depth + 1,
-            *words,
+            *spec.value_names(futures.macrostates[pair]),
             spec.action_names[int(futures.actions[pair])],
             *(f"{number:.6g}" for number in numbers),
         ]
@@ -409,9 +406,3 @@ def _learner_cpu_s(run: RunResult) -> float:
 
 def _rng(result: BenchResult, *names: str | int) -> np.random.Generator:
     return SeedTree(int(result.protocol.hash, 16)).child("report", *names).generator()
-
-
-def _csv(rows: list[list[object]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import reference
-from imagine_bench.files import make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.report.words import agent_words, few_words, mean_text, percent
@@ -98,18 +96,18 @@ def _cell(values: Sequence[float], name: str, words: Callable[[float], str] = pe
 
 
 def _csv(asked: Sequence[Asked], probe: Probing) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([
+    head = [
         "agent", "seed", "macrostate", "action", "terminal", "legal", "consequence",
         "right", "end_right", "reward_error", "epistemic",
-    ])  # fmt: skip
-    for one in asked:
-        for index, state in enumerate(probe.macrostates):
-            table.writerow([
-                one.agent, one.seed, " ".join(map(str, state)), int(probe.actions[index]), int(probe.terminal[index]),
-                int(probe.legal[index]), consequence(probe.possible[index]) or "open",
-                int(one.answers.right[index]), int(one.answers.end_right[index]),
-                f"{one.answers.reward_error[index]:.6g}", f"{one.answers.epistemic[index]:.6g}",
-            ])  # fmt: skip
-    return text.getvalue()
+    ]  # fmt: skip
+    rows = [
+        [
+            one.agent, one.seed, " ".join(map(str, state)), int(probe.actions[index]), int(probe.terminal[index]),
+            int(probe.legal[index]), consequence(probe.possible[index]) or "open",
+            int(one.answers.right[index]), int(one.answers.end_right[index]),
+            f"{one.answers.reward_error[index]:.6g}", f"{one.answers.epistemic[index]:.6g}",
+        ]
+        for one in asked
+        for index, state in enumerate(probe.macrostates)
+    ]  # fmt: skip
+    return csv_text([head, *rows])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.files import make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.pictures import png, rollout_strip
 from imagine_bench.plans import Plan
@@ -139,17 +137,16 @@ def _page(summary: PlanSummary, failures: Sequence[Plan], task: TaskSpec) -> str
 
 
 def _csv(plans: Sequence[Plan]) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(_COLUMNS)
-    for plan in plans:
-        table.writerow([
+    rows = [
+        [
             plan.number, " ".join(map(str, plan.start)), plan.shortest, plan.length, plan.done, int(plan.solved),
             int(plan.optimal), plan.refused, int(plan.as_imagined.sum()), plan.faults,
             f"{float(plan.compared.rollout.epistemic.max()):.6g}",
             " ".join(str(int(action)) for action in plan.compared.rollout.actions),
-        ])  # fmt: skip
-    return text.getvalue()
+        ]
+        for plan in plans
+    ]  # fmt: skip
+    return csv_text([_COLUMNS, *rows])
 
 
 def _varied(plans: Sequence[Plan], count: int) -> list[Plan]:

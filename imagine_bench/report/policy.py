@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.files import make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.policy import FRAMES, Ends
+from imagine_bench.policy import FRAMES, Ends, optimal_length
 from imagine_bench.report.words import agent_words, few_words, mean_text, percent
 from imagine_bench.seeding import SeedTree
 
-_SHARES = ("success", "failure", "late", "never")
+_SHARES = {
+    "success": "solved",
+    "failure": "ends otherwise",
+    "late_success": "out of time, then solved",
+    "late_failure": "out of time, then ends otherwise",
+    "endless": "never ends",
+}
 _SURE = 0.999
 """From here on a start counts as always solved: rules may leave something to chance."""
 _LISTED = 12
@@ -40,23 +44,22 @@ class Followed:
 
 def policy_table(followed: Sequence[Followed], task: TaskSpec) -> str:
     """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
-    groups = _groups(followed)
-    optimal = float(followed[0].ends.shortest.mean())
+    groups, optimal = _groups(followed), optimal_length(task)
+    fewest = min((len(ends) for ends in groups.values() if len(ends) > 1), default=1)
     lines = [
         f"All {len(task.rules.start_states)} starts, followed by the rules; every visit of a macrostate shows one of "
         f"{FRAMES} frames of it. Mean over seeds [95 % interval over seeds]. "
-        f"{' '.join(few_words(max(map(len, groups.values()))))}".rstrip(),
+        f"{' '.join(few_words(fewest))}".rstrip(),
         "",
-        "| agent | real episodes | seeds | solved, % | ends otherwise, % | solved after the last macro-action, % "
-        f"| never, % | macro-actions (optimal: {optimal:.2f}) |",
-        "|---|---|---|---|---|---|---|---|",
+        f"| agent | real episodes | seeds | {' | '.join(f'{words}, %' for words in _SHARES.values())} "
+        f"| macro-actions (optimal: {optimal.mean():.2f}) |",
+        f"|---|---|---|{'---|' * len(_SHARES)}---|",
     ]
     for (agent, episodes), ends in groups.items():
         cells = [_cell([getattr(one, share) for one in ends], f"{agent} {share}") for share in _SHARES]
         cells.append(_cell([one.length for one in ends], f"{agent} length", "{:.2f}".format))
         lines.append(f"| {agent_words(agent).title} | {episodes:,} | {len(ends)} | {' | '.join(cells)} |")
-    shortest = followed[0].ends.shortest
-    return "\n".join([*lines, "", *_by_distance(groups, shortest), "", *_missed(groups, shortest, task)])
+    return "\n".join([*lines, "", *_by_distance(groups, optimal), "", *_missed(groups, optimal, task)])
 
 
 def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, facts: dict[str, Any]) -> None:
@@ -71,13 +74,14 @@ def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, fac
             "agent": one.agent,
             "seed": one.seed,
             "episodes": one.episodes,
-            **{name: float(getattr(one.ends, name).mean()) for name in (*_SHARES, "length", "shortest")},
+            **{name: float(getattr(one.ends, name).mean()) for name in (*_SHARES, "length")},
         }
         for one in followed
     ]
     write_bytes(folder / "starts.csv", _csv(followed, task).encode())
     write_json(folder / "summary.json", {**facts, "runs": runs})
-    page = f"# {task.title}: where the greedy policies lead\n\n{policy_table(followed, task)}\n"
+    origin = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
+    page = f"# {task.title}: where the greedy policies lead\n\n{policy_table(followed, task)}\n\n{origin}.\n"
     write_bytes(folder / "policy.md", page.encode())
 
 
@@ -88,9 +92,9 @@ def _groups(followed: Sequence[Followed]) -> _Groups:
     return groups
 
 
-def _by_distance(groups: _Groups, shortest: NDArray[np.float64]) -> list[str]:
-    """What is solved of the starts from which an optimal agent needs equally long."""
-    needs = shortest.round().astype(int)
+def _by_distance(groups: _Groups, optimal: NDArray[np.float64]) -> list[str]:
+    """What is solved of the starts from which an optimal agent needs equally long, in whole macro-actions."""
+    needs = optimal.round().astype(int)
     solved = _solved(groups)
     lines = [f"| optimal macro-actions | starts | {_heads(groups)} |", f"|---|---|{'---|' * len(groups)}"]
     for need in np.unique(needs):
@@ -99,21 +103,22 @@ def _by_distance(groups: _Groups, shortest: NDArray[np.float64]) -> list[str]:
     return lines
 
 
-def _missed(groups: _Groups, shortest: NDArray[np.float64], task: TaskSpec) -> list[str]:
+def _missed(groups: _Groups, optimal: NDArray[np.float64], task: TaskSpec) -> list[str]:
     """The starts that are solved least, with what an optimal agent needs there."""
     solved = _solved(groups)
-    order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if solved[:, index].min() < _SURE]
+    worst = np.min([one.success for ends in groups.values() for one in ends], axis=0)  # [starts]
+    order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]
     if not order:
         return ["Every run solves every start."]
     lines = [
-        f"Starts that some run does not always solve: {len(order)} of {len(shortest)}. Solved least:",
+        f"Starts that some run does not always solve: {len(order)} of {len(optimal)}. Solved least:",
         "",
         f"| start | optimal macro-actions | {_heads(groups)} |",
         f"|---|---|{'---|' * len(groups)}",
     ]
     for index in order[:_LISTED]:
         cells = " | ".join(percent(float(share)) for share in solved[:, index])
-        lines.append(f"| {_words(task.rules.start_states[index], task)} | {shortest[index]:.2f} | {cells} |")
+        lines.append(f"| {_words(task.rules.start_states[index], task)} | {optimal[index]:.2f} | {cells} |")
     return lines
 
 
@@ -127,8 +132,8 @@ def _heads(groups: _Groups) -> str:
 
 
 def _words(macrostate: tuple[int, ...], task: TaskSpec) -> str:
-    named = zip(task.macrostate_names, task.macrostate_values, macrostate, strict=True)
-    return ", ".join(f"{name} {values[value]}" for name, values, value in named)
+    named = zip(task.macrostate_names, task.value_names(macrostate), strict=True)
+    return ", ".join(f"{name} {value}" for name, value in named)
 
 
 def _cell(parts: Sequence[NDArray[np.float64]], name: str, words: Callable[[float], str] = percent) -> str:
@@ -137,12 +142,11 @@ def _cell(parts: Sequence[NDArray[np.float64]], name: str, words: Callable[[floa
 
 
 def _csv(followed: Sequence[Followed], task: TaskSpec) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["agent", "seed", "episodes", *task.macrostate_names, *_SHARES, "length", "shortest"])
+    optimal = optimal_length(task)
+    rows = [["agent", "seed", "episodes", *task.macrostate_names, *_SHARES, "length", "optimal_length"]]
     for one in followed:
         for index, state in enumerate(task.rules.start_states):
-            named = [values[value] for values, value in zip(task.macrostate_values, state, strict=True)]
-            numbers = [getattr(one.ends, name)[index] for name in (*_SHARES, "length", "shortest")]
-            table.writerow([one.agent, one.seed, one.episodes, *named, *(f"{number:.6g}" for number in numbers)])
-    return text.getvalue()
+            numbers = [*(getattr(one.ends, name)[index] for name in (*_SHARES, "length")), optimal[index]]
+            shares = [f"{number:.6g}" for number in numbers]
+            rows.append([one.agent, str(one.seed), str(one.episodes), *task.value_names(state), *shares])
+    return csv_text(rows)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.calibration import LEVELS
-from imagine_bench.files import make_folder, write_bytes
+from imagine_bench.files import csv_text, make_folder, write_bytes
 from imagine_bench.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult, rows_csv
@@ -46,7 +44,8 @@ def write_report(result: RegressionResult) -> Path:
         "recordings": [str(run.recording.relative_to(result.folder)) for run in result.runs if run.recording],
     }
     files = {f"{drawn.name}.png": drawn.png for section in sections for drawn in section.pictures}
-    files |= {f"{table.name}.csv": table_csv(table).encode() for section in sections for table in section.tables}
+    tables = [table for section in sections for table in section.tables]
+    files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]).encode() for table in tables}
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
     files["results.csv"] = rows_csv(rows).encode()
     files["report.md"] = _render("regression.md.j2", context).encode()
@@ -67,15 +66,6 @@ def summary_table(result: RegressionResult) -> str:
 def collect(result: RegressionResult) -> list[Section]:
     """Every section: the task's own, then what all regression tasks have."""
     return [*_own(result), _calibration(result), _costs(result)]
-
-
-def table_csv(table: Table) -> str:
-    """A table as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.header)
-    writer.writerows(table.rows)
-    return text.getvalue()
 
 
 def _own(result: RegressionResult) -> list[Section]:

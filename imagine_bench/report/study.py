@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections import Counter
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench import statistics
-from imagine_bench.files import make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.report.plots import STYLE
 from imagine_bench.report.words import estimate_text, few_words, percent
 from imagine_bench.study import Line, Study
@@ -75,7 +74,7 @@ def _seeds(study: Study, lines: Sequence[Line]) -> str:
             for budget, success in zip(study.budgets, row, strict=True):
                 variant, protocol = line.variant, line.folder.name.rpartition("-")[2]
                 rows.append([variant.factor, variant.name, variant.agent, protocol, seed, budget, f"{success:.6g}"])
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def _summary(study: Study, lines: Sequence[Line]) -> str:
@@ -90,7 +89,7 @@ def _summary(study: Study, lines: Sequence[Line]) -> str:
                 variant.factor, variant.name, variant.agent, budget, f"{iqm:.6g}", variant.against or "", *estimate,
                 f"{line.train_cpu_s:.1f}",
             ])  # fmt: skip
-    return _csv(rows)
+    return csv_text(rows)
 
 
 def _plot(study: Study, lines: Sequence[Line]) -> bytes:
@@ -124,9 +123,3 @@ def _label(line: Line, usual: str | None) -> str:
     if variant.against == usual:
         return f"{variant.factor}: {variant.name}"
     return f"{variant.name} – {variant.against}"
-
-
-def _csv(rows: list[list[Any]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
