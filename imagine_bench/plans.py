@@ -26,7 +26,7 @@ from imagine_bench.trained import Trained
 
 State = tuple[int, ...]
 OnStep = Callable[[int], None]
-"""Told after each macro-action how many of the plan are done; 0 when the plan stands and nothing was done yet."""
+"""Told after each macro-action how many of the plan are done."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext
 from imagine_bench.regression.results import RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report import robot_ik, toy_regression
+from imagine_bench.report.page import flat
+from imagine_bench.report.sections import number
 from imagine_bench.runs import Progress, RunSpec
 from imagine_bench.seeding import SeedTree
 from imagine_bench.trained import load_trained
@@ -293,3 +296,22 @@ def test_claims_and_ratios_by_hand() -> None:
     estimate = robot_ik.ratio_to_random(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.random.default_rng(0))
     assert estimate == pytest.approx((0.5, 0.5, 0.5))  # every network halves its own random error
     assert set(SCORES) >= {"epistemic", "aleatoric", "modal", "stationarity", "surprise", "drawn_component"}
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (9.999, 3, "10.0"), (1234.5, 3, "1234"), (0.0042, 3, "0.004"), (0.004, 2, "4.0e\u221203"), (0.0, 3, "0.000"),
+        (-3.14159, 3, "\u22123.14"), (123456.0, 3, "1.23e+05"), (math.nan, 3, "–"),
+    ],
+)  # fmt: skip
+def test_numbers_show_what_there_is(value: float, digits: int, text: str) -> None:
+    assert number(value, digits) == text
+
+
+def test_lists_of_sittings_are_rows_not_python() -> None:
+    facts = {"seeds": [0, 1], "sittings": [{"wall_s": 1.0, "changed": {}}, {"wall_s": 2.0, "changed": {"commit": "a"}}]}
+    assert flat("", facts) == [
+        ("seeds", "0; 1"), ("sittings.1.wall_s", "1.0"),
+        ("sittings.2.wall_s", "2.0"), ("sittings.2.changed.commit", "a"),
+    ]  # fmt: skip

@@ -71,8 +71,8 @@ class _PlanStory:
 
     def tell(self, number: int) -> None:
         """One plan: the scene stands, the plan appears, the arm does it, and it is seen what came of it."""
-        recording, begins_s, self._number = self._recording, self._clock_s, number + 1
-        recording.set_time("plan", sequence=self._number)
+        self._number = number
+        self._recording.set_time("plan", sequence=number)
         moments: list[tuple[float, int]] = []
 
         def on_plan(*_: object) -> None:
@@ -92,7 +92,7 @@ class _PlanStory:
         for done, (clock_s, env_step) in enumerate(moments):
             self._set_clocks(clock_s, env_step)
             self._show(plan, done)
-        self._clock_s = max(self._clock_s, begins_s) + _LOOK_S
+        self._clock_s += _LOOK_S
         self._env_step += 1
 
     def _set_clocks(self, clock_s: float, env_step: int) -> None:
@@ -123,9 +123,9 @@ class _PlanStory:
 
     def _words(self, plan: Plan, done: int) -> str:
         names = self._trained.task.action_names
-        lines = [f"### Plan {plan.number + 1} of {self._count}, imagined from one frame", ""]
+        lines = [f"### Plan {plan.number} (of {self._count}, from 0), imagined from one frame", ""]
         for step, action in enumerate(plan.compared.rollout.actions, start=1):
-            mark = "done" if step <= done else ("**now**" if step == done + 1 and not plan.refused else "")
+            mark = "done" if step <= done else ("**now**" if step == done + 1 and done < plan.done else "")
             lines.append(f"{step}. {names[int(action)]} {mark}")
         last = done == plan.done
         if plan.refused:

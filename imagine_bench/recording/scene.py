@@ -24,7 +24,7 @@ _KINEMATIC_STEP_S = 1.0
 
 
 def extent_m(shape: Shape3D) -> float:
-    """How far a shape reaches from its middle, in metres, along its longest axis."""
+    """Roughly how far a shape reaches from its origin along its longest axis, in metres."""
     if shape.vertices is not None:
         return float(np.abs(shape.vertices).max())
     return float(shape.size.max())

@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from imagine_bench.course_pictures import courses_sheet
@@ -17,6 +16,7 @@ from imagine_bench.report import plots, words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.sections import Picture
+from imagine_bench.report.template import render
 from imagine_bench.report.words import agent_words, percent, score_text
 from imagine_bench.results import BenchResult, ComparedRollout
 
@@ -58,8 +58,8 @@ def write_report(result: BenchResult) -> Path:
     files["summary.csv"] = summary_csv(data).encode()
     if data.futures:
         files["futures.csv"] = futures_csv(data).encode()
-    files["report.md"] = _render("report.md.j2", context).encode()
-    files["index.html"] = _render("report.html.j2", context).encode()
+    files["report.md"] = render("report.md.j2", context, **_NAMES).encode()
+    files["index.html"] = render("report.html.j2", context, **_NAMES).encode()
     for name, content in files.items():
         write_bytes(folder / name, content)
     return folder / "index.html"
@@ -166,6 +166,8 @@ def flat(prefix: str, value: Any) -> list[tuple[str, str]]:
     """Nested values as rows of dotted name and text."""
     if hasattr(value, "items"):
         return [row for key, inner in value.items() for row in flat(f"{prefix}.{key}" if prefix else str(key), inner)]
+    if isinstance(value, list | tuple) and any(hasattr(item, "items") for item in value):
+        return [row for count, item in enumerate(value, 1) for row in flat(f"{prefix}.{count}", item)]
     if isinstance(value, list | tuple):
         return [(prefix, "; ".join(str(item) for item in value))]
     return [(prefix, str(value))]
@@ -216,23 +218,16 @@ def _relative(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
-def _render(template: str, context: dict[str, Any]) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("imagine_bench.report"),
-        autoescape=template.endswith(".html.j2"),
-        trim_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.globals.update(
-        percent=percent,
-        signed=words.signed_percent,
-        estimate=words.estimate_text,
-        score_text=score_text,
-        thesis_text=_thesis_text,
-        seconds=_seconds,
-        lasting=words.lasting,
-        area_text=words.area_text,
-        words=agent_words,
-        color=plots.color,
-    )
-    return environment.get_template(template).render(context)
+_NAMES = {
+    "percent": percent,
+    "signed": words.signed_percent,
+    "estimate": words.estimate_text,
+    "score_text": score_text,
+    "thesis_text": _thesis_text,
+    "seconds": _seconds,
+    "lasting": words.lasting,
+    "area_text": words.area_text,
+    "words": agent_words,
+    "color": plots.color,
+}
+"""What the templates call."""

@@ -97,7 +97,7 @@ def plan_table(summary: PlanSummary, task: TaskSpec) -> str:
 def write_plans(
     folder: Path, plans: Sequence[Plan], task: TaskSpec, facts: dict[str, Any], *, strips: int
 ) -> PlanSummary:
-    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and a strip of every plan that failed.
+    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and strips of the first plans that failed.
 
     Args:
         folder: Where to; it is made.

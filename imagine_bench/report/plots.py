@@ -80,7 +80,7 @@ class Plot:
 
 
 def all_plots(data: ReportData) -> list[Plot]:
-    """Success against real episodes, and where agents imagined, acceptance and open-loop error by depth."""
+    """Success against real episodes; gain where the thesis has one; acceptance, open-loop error and futures if any."""
     plots = [_render("success", success_figure, data, "Success of each agent against real training episodes.")]
     if set(data.thesis_gains) & set(data.comparisons):
         plots.append(_render("gain", gain_figure, data, "Gain over DQN against real training episodes."))

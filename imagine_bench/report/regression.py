@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -17,6 +15,7 @@ from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult, rows_csv
 from imagine_bench.report.page import aligned, facts, flat
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
+from imagine_bench.report.template import render
 
 _SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
@@ -48,8 +47,8 @@ def write_report(result: RegressionResult) -> Path:
     files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]).encode() for table in tables}
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
     files["results.csv"] = rows_csv(rows).encode()
-    files["report.md"] = _render("regression.md.j2", context).encode()
-    files["index.html"] = _render("regression.html.j2", context).encode()
+    files["report.md"] = render("regression.md.j2", context).encode()
+    files["index.html"] = render("regression.html.j2", context).encode()
     for name, content in files.items():
         write_bytes(folder / name, content)
     return folder / "index.html"
@@ -170,13 +169,3 @@ def _costs(result: RegressionResult) -> Section:
         ),
         tables=(table,),
     )
-
-
-def _render(template: str, context: dict[str, Any]) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("imagine_bench.report"),
-        autoescape=template.endswith(".html.j2"),
-        trim_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    return environment.get_template(template).render(context)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,6 +18,10 @@ from imagine_bench.report.words import few_words
 from imagine_bench.seeding import SeedTree
 
 Values = NDArray[np.float64]
+Pair = tuple[str, str]
+"""A regressor and its dataset."""
+Ratios = dict[str, statistics.Estimate]
+"""Error as a ratio to a random choice, by criterion."""
 _JOINTS = ("q1", "q2", "q3")
 _KINDS = ("epistemic", "modal", "aleatoric")
 
@@ -73,20 +78,17 @@ def _decisions(result: RegressionResult) -> Section:
     protocol, columns = result.protocol, (*SCORES, "min", "max", "random", "mink")
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
     rng = SeedTree(int(protocol.hash, 16)).child("report").generator()
-    errors, ratios, answers = [], [], []
-    for agent in protocol.agents:
-        title = registry.regressor_entry(agent).title
-        for variant in protocol.variants:
-            found = totals(result, agent, variant)
-            errors.append([f"{title}, {variant}", *(mean_std(found[name].tolist()) for name in columns)])
-            against = {name: ratio_to_random(found[name], found["random"], rng) for name in SCORES}
-            ratios.append([f"{title}, {variant}", *(_interval(against[name]) for name in SCORES)])
-            least, best = min((estimate.value, name) for name, estimate in against.items())
-            answers.append(
-                f"{title}, {variant} samples: choosing the least epistemic uncertainty leaves "
-                f"{against['epistemic'].value:.2f} of the error of a random choice"
-                f"{_printed_ratio(printed, variant)}; best is {best.replace('_', ' ')} with {least:.2f}."
-            )
+    found = {pair: totals(result, *pair) for pair in _pairs(result)}
+    against = {pair: _against_chance(errors, rng) for pair, errors in found.items()}
+    errors, ratios = _rows(found, against, columns)
+    answers = []
+    for (agent, variant), estimates in against.items():
+        least, best = min((estimate.value, name) for name, estimate in estimates.items())
+        answers.append(
+            f"{_label(agent, variant)} samples: choosing the least epistemic uncertainty leaves "
+            f"{estimates['epistemic'].value:.2f} of the error of a random choice"
+            f"{_printed_ratio(printed, variant)}; best is {best.replace('_', ' ')} with {least:.2f}."
+        )
     for variant in protocol.variants:
         if variant in printed["random"]:
             cells = {name: rows[variant] for name, rows in printed.items() if variant in rows}
@@ -106,7 +108,7 @@ def _decisions(result: RegressionResult) -> Section:
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
             "is measured. Here no place outside of the workspace is asked for; the maps below show the distance there.",
         ),
-        pictures=(_ratio_picture(result, rng),),
+        pictures=(_ratio_picture(result, against),),
         tables=(
             Table(name="table_4_1", header=["cumulated error (m)", *names], rows=errors),
             Table(
@@ -122,21 +124,18 @@ def _beyond(result: RegressionResult) -> Section:
     """The same choices among points of the whole disc of the stretched arm."""
     protocol, columns = result.protocol, (*SCORES, "min", "max", "random")
     rng = SeedTree(int(protocol.hash, 16)).child("report_disc").generator()
-    errors, ratios, answers = [], [], []
-    for agent in protocol.agents:
-        title = registry.regressor_entry(agent).title
-        for variant in protocol.variants:
-            found = by_criterion(result, agent, variant, "disc", "error")
-            outside = by_criterion(result, agent, variant, "disc", "outside_m")
-            errors.append([f"{title}, {variant}", *(mean_std(found[name].tolist()) for name in columns)])
-            against = {name: ratio_to_random(found[name], found["random"], rng) for name in SCORES}
-            ratios.append([f"{title}, {variant}", *(_interval(against[name]) for name in SCORES)])
-            answers.append(
-                f"{title}, {variant} samples, any place on the disc of the stretched arm: choosing the least epistemic "
-                f"uncertainty leaves {against['epistemic'].value:.2f} of the error of a random choice, and asks for "
-                f"{outside['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
-                f"{outside['random'].mean():.2f} m)."
-            )
+    found = {pair: by_criterion(result, *pair, "disc", "error") for pair in _pairs(result)}
+    against = {pair: _against_chance(errors, rng) for pair, errors in found.items()}
+    errors, ratios = _rows(found, against, columns)
+    answers = []
+    for (agent, variant), estimates in against.items():
+        outside = by_criterion(result, agent, variant, "disc", "outside_m")
+        answers.append(
+            f"{_label(agent, variant)} samples, any place on the disc of the stretched arm: choosing the least "
+            f"epistemic uncertainty leaves {estimates['epistemic'].value:.2f} of the error of a random choice, and "
+            f"asks for {outside['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
+            f"{outside['random'].mean():.2f} m)."
+        )
     names = [name.replace("_", " ") for name in columns]
     return Section(
         title="The same among places that may be out of reach",
@@ -156,6 +155,27 @@ def _beyond(result: RegressionResult) -> Section:
     )  # fmt: skip
 
 
+def _pairs(result: RegressionResult) -> list[Pair]:
+    return [(agent, variant) for agent in result.protocol.agents for variant in result.protocol.variants]
+
+
+def _label(agent: str, variant: str) -> str:
+    return f"{registry.regressor_entry(agent).title}, {variant}"
+
+
+def _against_chance(errors: Mapping[str, Values], rng: np.random.Generator) -> Ratios:
+    return {name: ratio_to_random(errors[name], errors["random"], rng) for name in SCORES}
+
+
+def _rows(
+    found: Mapping[Pair, Mapping[str, Values]], against: Mapping[Pair, Ratios], columns: Sequence[str]
+) -> tuple[list[list[str]], list[list[str]]]:
+    """Rows of errors by criterion, and of their ratios to a random choice, one a regressor and dataset."""
+    errors = [[_label(*pair), *(mean_std(by[name].tolist()) for name in columns)] for pair, by in found.items()]
+    ratios = [[_label(*pair), *(_interval(by[name]) for name in SCORES)] for pair, by in against.items()]
+    return errors, ratios
+
+
 def _printed(cells: dict[str, list[float]], criterion: str) -> str:
     return f"{cells[criterion][0]:.2f} ({cells[criterion][1]:.2f})" if criterion in cells else ""
 
@@ -171,7 +191,7 @@ def _interval(estimate: statistics.Estimate) -> str:
     return value if np.isnan(estimate.low) else f"{value} [{estimate.low:.2f}, {estimate.high:.2f}]"
 
 
-def _ratio_picture(result: RegressionResult, rng: np.random.Generator) -> Picture:
+def _ratio_picture(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Picture:
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
 
     def draw() -> Figure:
@@ -179,16 +199,16 @@ def _ratio_picture(result: RegressionResult, rng: np.random.Generator) -> Pictur
         figure = Figure(figsize=(9.2, 3.6), layout="constrained")
         axes = figure.add_subplot()
         places, shades = np.arange(len(SCORES), dtype=float), ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
-        series = [(agent, variant) for agent in protocol.agents for variant in protocol.variants]
-        for index, (agent, variant) in enumerate(series):
-            found = totals(result, agent, variant)
-            values = np.array([ratio_to_random(found[name], found["random"], rng) for name in SCORES])
-            off = places + 0.8 * ((index + 0.5) / len(series) - 0.5)
+        for index, ((agent, variant), estimates) in enumerate(against.items()):
+            values = np.array([estimates[name] for name in SCORES])
+            off = places + 0.8 * ((index + 0.5) / len(against) - 0.5)
             marker = "osDv^"[protocol.agents.index(agent) % 5]
             shade = shades[protocol.variants.index(variant) % 5]
             bars = np.nan_to_num(np.abs(values[:, 1:].T - values[:, 0]))
-            label = f"{registry.regressor_entry(agent).title}, {variant}"
-            axes.errorbar(off, values[:, 0], yerr=bars, fmt=marker, markersize=5, color=shade, capsize=2, label=label)
+            axes.errorbar(
+                off, values[:, 0], yerr=bars, fmt=marker, markersize=5, color=shade, capsize=2,
+                label=_label(agent, variant),
+            )  # fmt: skip
         for index, name in enumerate(SCORES):
             ratios = [
                 c[0] / printed["random"][v][0] for v, c in printed.get(name, {}).items() if v in protocol.variants

@@ -83,12 +83,16 @@ def picture(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, dp
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits; not a number as an en dash."""
+    """A number with so many significant digits from 1 on, and so many decimals below; not a number as an en dash.
+
+    In powers of ten from 100,000 on, and where those decimals would show nothing.
+    """
     if math.isnan(value):
         return "–"
-    if value and (abs(value) >= 10**5 or abs(value) < 10**-3):
+    if value and (abs(value) >= 10**5 or abs(value) < 10.0**-digits):
         return f"{value:.{digits - 1}e}".replace("-", "\u2212")
-    whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
+    rounded = float(f"{abs(value):.{digits - 1}e}")  # 9.999 is printed as 10.0
+    whole = len(str(int(rounded))) if rounded >= 1 else 0
     return f"{value:.{max(0, digits - whole)}f}".replace("-", "\u2212")
 
 
