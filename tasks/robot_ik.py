@@ -141,8 +141,9 @@ def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[
     """The decisions of table 4.1 and the maps of figures 4.2 and 4.3.
 
     Returns:
-        ``decision/...``: ``points`` (E, DECISIONS, CANDIDATES, 2), ``error``, ``joints`` and one entry a score of the
-        same leading shape, ``mink_error`` of the first candidate of each choice (E, DECISIONS).
+        ``decision/...``: ``points`` and where the tip came to rest instead, ``reached`` (E, DECISIONS, CANDIDATES, 2),
+        ``error``, ``joints`` and one entry a score of the same leading shape, ``mink_error`` of the first candidate of
+        each choice (E, DECISIONS).
         ``disc/...``: ``error``, scores and ``outside_m`` of the same choices among points of the whole disc of the
         stretched arm, some of them out of reach.
         ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, and the three
@@ -162,8 +163,10 @@ def _decide(points_m: Floats, assess: Assess, purpose: str) -> dict[str, NDArray
     """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
     shape = (len(points_m), DECISIONS, CANDIDATES)
     said = assess(points_m, purpose)
-    wrong = np.stack([missed(*pair) for pair in zip(points_m, said.prediction, strict=True)])
+    reached = np.stack([arm().execute(joints_rad) for joints_rad in said.prediction])  # [E, DECISIONS CANDIDATES, 2]
+    wrong = np.linalg.norm(reached - points_m, axis=-1)
     result = {"points": points_m.reshape(*shape, 2), "error": wrong.reshape(shape)}
+    result |= {"reached": reached.reshape(*shape, 2)}
     result |= {"joints": said.prediction.reshape(*shape, 3), "outside_m": distance_to_workspace(result["points"])}
     return result | {name: score(said).reshape(shape) for name, score in SCORES.items()}
 

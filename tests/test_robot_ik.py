@@ -7,6 +7,8 @@ import pytest
 from imagine_bench.tasks import robot_ik as ik
 
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.regression import Assessment
+from imagine_bench.seeding import SeedTree
 
 
 def joints(count: int, seed: int = 0) -> np.ndarray:
@@ -108,3 +110,22 @@ def test_pictures_show_the_arm_and_the_target() -> None:
     assert (small != moved).any(axis=-1).sum() > 30 and 2 <= (small != elsewhere).any(axis=-1).sum() < 40
     assert arm.picture(np.zeros(3), large=320).shape == (240, 320, 3)
     arm.close()
+
+
+def test_decisions_are_carried_out_by_the_arm() -> None:
+    """Of networks that say what they like: the arm rests where equation 4.29 puts the joints, and misses by that."""
+
+    def assess(points: np.ndarray, purpose: str) -> Assessment:
+        shape, rng = points.shape[:2], np.random.default_rng(len(purpose))
+        said = {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
+        scores = {name: rng.random(shape) for name in ("stationarity", "drawn", "surprise")}
+        told = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
+        return Assessment(prediction=told, **said, **scores, predictive=None)  # type: ignore[arg-type]
+
+    found = ik.evaluate("1000", assess, (SeedTree(0), SeedTree(1)))
+    for part in ("decision", "disc"):
+        reached, points = found[f"{part}/reached"], found[f"{part}/points"]
+        assert reached.shape == points.shape == (2, ik.DECISIONS, ik.CANDIDATES, 2)
+        np.testing.assert_allclose(reached, ik.forward(found[f"{part}/joints"]), atol=2e-4)
+        np.testing.assert_array_equal(found[f"{part}/error"], np.linalg.norm(reached - points, axis=-1))
+    assert not np.array_equal(found["decision/points"][0], found["decision/points"][1]), "networks are asked elsewhere"

@@ -59,7 +59,7 @@ def record(
             clock_s += _LOOK_S + float(motion.time_s[-1])
             log_motion(recording, motion, end_s=clock_s, sequences={"choice": choice}, only_moved=False)
             _at(recording, clock_s, choice)
-            _show_error(recording, motion.poses_in_world[-1], motion.body_names, points[chosen])
+            _show_error(recording, data["decision/reached"][0, choice, chosen], points[chosen])
             error_m = float(data["decision/error"][0, choice, chosen])
             recording.log("/choice/error", rr.Scalars(error_m), strict=True)
             _say(recording, name, variant, data, choice, chosen, arrived=True)
@@ -112,19 +112,10 @@ def _show_candidates(
     recording.log("/choice/miss", rr.Clear(recursive=False), strict=True)
 
 
-def _show_error(
-    recording: rr.RecordingStream, poses: NDArray[np.float64], bodies: tuple[str, ...], target_m: NDArray[np.float64]
-) -> None:
+def _show_error(recording: rr.RecordingStream, tip_m: NDArray[np.float64], target_m: NDArray[np.float64]) -> None:
     """A line from where the tip came to rest to where it should be."""
-    last = poses[bodies.index("link_3")]
-    w, z = last[3], last[6]
-    heading = np.array([1 - 2 * z * z, 2 * w * z])  # a turn about the vertical
-    tip_m = last[:2] + _LAST_LINK_M * heading
     line = _lifted(np.stack([tip_m, target_m]))
     recording.log("/choice/miss", rr.LineStrips3D([line], colors=_ERROR, radii=0.009), strict=True)
-
-
-_LAST_LINK_M = 0.2
 
 
 def _say(
