@@ -45,8 +45,13 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, se
     if imagines:
         pages = [_imagined_now(), *([_courses()] if several else []), *pages, _by_depth()]
     bottom = rrb.Tabs(*pages, active_tab=0)
+    return playing(rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]))
+
+
+def playing(layout: rrb.Container) -> rrb.Blueprint:
+    """A layout with nothing around it but the time, which runs over and over."""
     return rrb.Blueprint(
-        rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]),
+        layout,
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"),

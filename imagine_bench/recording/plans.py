@@ -19,7 +19,7 @@ from imagine_bench.files import make_folder
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.pictures import png, rgb, rollout_strip
 from imagine_bench.plans import Plan, carry_out, make_env
-from imagine_bench.recording.blueprint import scene_view
+from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ, recording_file
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.results import ComparedRollout
@@ -155,9 +155,4 @@ def _layout(scene: Any, trained: Trained) -> rrb.Blueprint:
         name=f"{trained.task.title}: the plan, real above and imagined below",
         background=[255, 255, 255],
     )
-    return rrb.Blueprint(
-        rrb.Vertical(top, strip, row_shares=[1.45, 1.0]),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"),
-    )
+    return playing(rrb.Vertical(top, strip, row_shares=[1.45, 1.0]))
