@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -365,9 +366,12 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     try:
         command()
+        sys.stdout.flush()
     except ImagineBenchError as error:
         print(f"imagine-bench: {error}", file=sys.stderr)
         return error.exit_code
+    except BrokenPipeError:  # who read along has seen enough, as `| head` does; nothing more can be said to them
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         resumes = isinstance(command, Bench | StudyCommand)
         then = "goes on from the last checkpoints" if resumes else "begins anew"

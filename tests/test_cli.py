@@ -163,3 +163,12 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for name in ("arrow_puzzle_hard", "imagination_uncertainty", "thesis", "kinematic", "strong", "arrow_puzzle-mild"):
         assert name in out
+
+
+def test_who_stops_reading_gets_no_traceback() -> None:
+    command = [sys.executable, "-m", "imagine_bench", "list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
