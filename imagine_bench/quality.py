@@ -104,10 +104,7 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     Raises:
         ImagineBenchError: No bench, or none that imagines.
     """
-    bench = folder or newest_bench(root, _control(task))
-    require_control(read_protocol(bench).task, str(bench))
-    require_runs(bench)
-    result = load_bench(bench)
+    result = load_bench(_bench_of_agents(folder, root, task))
     protocol = result.protocol
     spec = registry.task(protocol.task)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
@@ -140,10 +137,8 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
     Raises:
         ImagineBenchError: No bench, or none with a learner that can be taken up again.
     """
-    bench = folder or newest_bench(root, _control(task))
+    bench = _bench_of_agents(folder, root, task)
     protocol = read_protocol(bench)
-    require_control(protocol.task, str(bench))
-    require_runs(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
     met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
     followed = []
@@ -157,6 +152,14 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
     write_policy(where, followed, spec, facts)
     head = f"{spec.title}, {protocol.appearance}"
     return "\n".join([head, "", policy_table(followed, spec), "", f"All starts: {where / 'starts.csv'}"])
+
+
+def _bench_of_agents(folder: Path | None, root: Path, task: str | None) -> Path:
+    """The bench that a question is put to: one whose agents can act, and are there."""
+    bench = folder or newest_bench(root, _control(task))
+    require_control(read_protocol(bench).task, str(bench))
+    require_runs(bench)
+    return bench
 
 
 def _control(task: str | None) -> tuple[str, ...]:
