@@ -17,8 +17,10 @@ from imagine_bench import registry
 from imagine_bench.errors import SetupError
 
 PACKAGES = (
-    "dm-control", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
+    "daqp", "dm-control", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
 )  # fmt: skip
+OPTIONAL_PACKAGES = ("sb3-contrib", "stable-baselines3")
+"""Of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -40,7 +42,9 @@ def describe_environment() -> dict[str, Any]:
 
 def command() -> str:
     """The command line of this process, with the program's bare name, as a shell takes it."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    name = Path(sys.argv[0]).name
+    program = ["python", "-m", "imagine_bench"] if name == "__main__.py" else [name]
+    return shlex.join([*program, *sys.argv[1:]])
 
 
 def commit() -> str | None:
@@ -56,7 +60,9 @@ def commit() -> str | None:
 def versions() -> dict[str, str]:
     """Versions of Python, this package and the packages that decide its numbers, read without importing them."""
     found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
-    return {**found, **{package: installed(package) for package in PACKAGES}}
+    needed = {package: installed(package) for package in PACKAGES}
+    optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
+    return {**found, **needed, **{package: version for package, version in optional.items() if version != "missing"}}
 
 
 def installed(package: str) -> str:

@@ -166,11 +166,12 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
         Raises:
             InvalidValueError: No such action, or no episode was begun.
-            DivergedError: The simulation blew up.
+            DivergedError: The simulation blew up; the episode is over.
         """
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
         chosen = self._checked(action)
+        self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         intended = self._intended(start, chosen)
         if self._execution == "physics":
@@ -183,6 +184,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._world.vary(self.np_random)
         reading = self._world.read()
         self._macrostate = reading.macrostate
+        self._begun = True
         fault = fault or reading.problem
         outcome = intended
         if reading.macrostate != intended.macrostate:
@@ -197,7 +199,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return None if self.render_mode is None else self._picture.frame(self._world.data)
 
     def close(self) -> None:
-        """Free the OpenGL contexts; may be called again."""
+        """Free the OpenGL contexts; may be called again. Only the thread that drew can: in another they stay."""
         for renderer in (self._eye, self._picture, self._human):
             if renderer is not None:
                 renderer.close()
@@ -271,7 +273,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         try:
             start = tuple(int(value) for value in given)
             known = start in self._known and all(a == b for a, b in zip(start, given, strict=True))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             known = False
         if not known:
             raise InvalidValueError(f"No macrostate {given!r}; give {self._allowed()}, such as {self._starts[0]}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from importlib import resources
 
 import mink
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Motion, Shape3D
 from imagine_bench.regression import Floats
 
@@ -47,7 +49,12 @@ class PlanarArm:
 
         Returns:
             Positions of the tip in the plane, in metres. Shape (N, 2).
+
+        Raises:
+            InvalidValueError: A joint is NaN or infinite, which MuJoCo would take for 0.
         """
+        if not np.isfinite(joints_rad).all():
+            raise InvalidValueError("Joints that are NaN or infinite cannot be carried out; give finite radians.")
         data, reached = self._data, np.empty((len(joints_rad), 2))
         for row, target in enumerate(joints_rad):
             mujoco.mj_resetData(self.model, data)
@@ -86,13 +93,17 @@ class PlanarArm:
         ])  # fmt: skip
 
     def movement(self, joints_rad: Floats, hz: float) -> Motion:
-        """How every body moves while the servos go from zero to one configuration (3,), sampled ``hz`` a second."""
-        data, every = self._data, max(1, round(1.0 / (hz * self.model.opt.timestep)))
+        """How every body moves while the servos go from zero to one configuration (3,), sampled ``hz`` a second.
+
+        Samples are whole timesteps apart, at most ``hz`` a second but for the last: it is where the arm has come to
+        rest.
+        """
+        data, every = self._data, max(1, math.ceil(1.0 / (hz * self.model.opt.timestep) - 1e-9))
         mujoco.mj_resetData(self.model, data)
         data.ctrl[:] = joints_rad
         positions, times = [data.qpos.copy()], [0.0]
-        for _ in range(self._steps // every):
-            mujoco.mj_step(self.model, data, every)
+        for step in range(0, self._steps, every):
+            mujoco.mj_step(self.model, data, min(every, self._steps - step))
             positions.append(data.qpos.copy())
             times.append(float(data.time))
         poses = poses_of(self.model, np.array(positions), data.mocap_pos, data.mocap_quat)

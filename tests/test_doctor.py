@@ -28,6 +28,13 @@ def test_the_broken_pair_is_named() -> None:
     assert "MuJoCo 4.0 breaks dm-control 1.0.50" in complaint and "make setup" in complaint
 
 
+def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/x/imagine_bench/__main__.py", "bench", "--task", "a b"])
+    assert environment.command() == "python -m imagine_bench bench --task 'a b'"
+    monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "list"])
+    assert environment.command() == "imagine-bench list"
+
+
 @pytest.mark.parametrize("package", ["mink", "jinja2", "matplotlib"])
 def test_a_missing_package_is_named(package: str) -> None:
     (complaint,) = doctor.unmet_requirements(with_version(**{package: "missing"}))
@@ -56,4 +63,5 @@ def test_the_environment_is_json_and_complete() -> None:
     assert set(facts) == {"command", "commit", "versions", "machine", "gl_renderer", "threads_a_run"}
     assert "missing" not in facts["versions"].values()
     assert facts["machine"]["cores"] >= 1 and facts["machine"]["cpu"]
+    assert {"daqp", "stable-baselines3"} <= set(facts["versions"]), "a solver of mink's, and a peer of the tests' extra"
     assert facts["gl_renderer"] and not facts["gl_renderer"].startswith("none")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+import tempfile
 import textwrap
 from collections import Counter
 
@@ -17,7 +18,7 @@ from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, SceneReader
 
 TASKS = tuple(registry.TASKS)
@@ -105,7 +106,9 @@ def test_an_episode_keeps_the_contract(env):
 @pytest.mark.parametrize("task", TASKS)
 def test_the_horizon_truncates_and_does_not_terminate(task):
     """Ends by rule are ignored, so that the walk is long enough: the two never depend on each other."""
-    env, horizon, rules = make(task, **KINEMATIC), registry.TASKS[task].horizon, registry.task(task).rules
+    entry, spec = registry.TASKS[task], registry.task(task)
+    assert (spec.horizon, spec.env_id) == (entry.horizon, entry.env_id)
+    env, horizon, rules = make(task, **KINEMATIC), entry.horizon, spec.rules
     _, info = env.reset(seed=0)
     for step in range(horizon):
         *_, terminated, truncated, info = env.step(step % rules.n_actions)
@@ -262,7 +265,8 @@ def kinematic():
 
 
 @pytest.mark.parametrize(
-    "given", [(0, 1, 2), (0, 1, 2, 3), (0, 1, 4, 0), (0.5, 1, 2, 0), "0120", 7, None, (-1, 1, 2, 0)]
+    "given",
+    [(0, 1, 2), (0, 1, 2, 3), (0, 1, 4, 0), (-1, 1, 2, 0), (0.5, 1, 2, 0), (float("inf"), 1, 2, 0), "0120", 7, None],
 )
 def test_a_wrong_macrostate_is_refused(kinematic, given):
     with pytest.raises(InvalidValueError, match=r"No macrostate .*; give 4 integers from 0 to at most \(3, 3, 3, 2\)"):
@@ -291,6 +295,21 @@ def test_a_step_before_the_first_reset_is_refused():
     env = make(**KINEMATIC).unwrapped
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         env.step(0)
+    env.close()
+
+
+def test_an_episode_whose_simulation_blew_up_is_over(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+    env = make().unwrapped
+    env.reset(seed=0)
+    env._world.data.joint("cube_2_joint").qpos[0] = 1e11
+    with pytest.raises(DivergedError):
+        env.step(0)
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.step(0)
+    env.reset(seed=0)
+    assert env.step(0)[4]["fault"] is False
     env.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from imagine_bench.tasks import robot_ik as ik
+from imagine_bench.tasks.planar_arm import MOVE_S
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.regression import Assessment
@@ -33,6 +34,22 @@ def test_joints_stop_at_their_limits() -> None:
     reached = ik.arm().execute(beyond)[0]
     np.testing.assert_allclose(reached, ik.forward(np.array([ik.HIGH_RAD[0], 0.0, 0.0])), atol=1e-3)
     assert np.linalg.norm(reached - ik.forward(beyond)[0]) > 0.5  # without limits it would be elsewhere
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_joints_that_are_no_numbers_are_not_carried_out(value: float) -> None:
+    with pytest.raises(InvalidValueError, match="NaN or infinite cannot be carried out"):
+        ik.arm().execute(np.array([[0.0, 0.0, 0.0], [0.1, value, 0.0]]))
+
+
+@pytest.mark.parametrize("hz", [20.0, 30.0, 60.0, 1e6])
+def test_a_movement_is_sampled_to_its_end(hz: float) -> None:
+    q = joints(1, seed=4)[0]
+    motion = ik.arm().movement(q, hz)
+    assert motion.time_s[0] == 0.0 and motion.time_s[-1] == pytest.approx(MOVE_S)
+    assert np.diff(motion.time_s)[:-1].min() >= 1 / hz - 1e-9
+    still = ik.arm().movement(q, 1e6).poses_in_world[-1]
+    np.testing.assert_allclose(motion.poses_in_world[-1], still, atol=1e-12)
 
 
 def test_distance_to_the_workspace_against_brute_force() -> None:

@@ -3,12 +3,13 @@
 import itertools
 import subprocess
 import sys
+import typing
 
 import numpy as np
 import pytest
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.seeding import SeedTree, episode_seed
+from imagine_bench.seeding import Purpose, SeedTree, episode_seed
 
 
 def test_children_do_not_depend_on_order_and_differ_from_one_another():
@@ -33,7 +34,7 @@ def test_seeds_are_equal_in_another_process():
 
 
 def test_episode_seeds_never_meet():
-    purposes = ("training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning")
+    purposes = typing.get_args(Purpose)
     edges = (0, 1, 2**24 - 1), (0, 1, 9_999, 2**32 - 1)
     seeds = [episode_seed(p, s, e) for p, s, e in itertools.product(purposes, *edges)]
     assert len(set(seeds)) == len(purposes) * 12
