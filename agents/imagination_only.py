@@ -91,8 +91,10 @@ class ImaginationOnly(ImaginingLearner):
         return True
 
     def diagnostics(self) -> dict[str, float]:
-        """As every learner; ``time/rehearsal_s`` is spread over the real steps since the last call."""
-        return {**super().diagnostics(), "rehearsed_steps": float(self.rehearsal.steps)}
+        """As every learner, of its rehearsals; ``time/rehearsal_s`` is a real step since the last call."""
+        base = super().diagnostics()
+        base.pop("time/imagination_s", None)  # rehearsals are all that it imagines
+        return {**base, "imagined_transitions": float(self.rehearsal.steps)}
 
     def state(self) -> AgentState:
         """A snapshot, rehearsal and starts included."""

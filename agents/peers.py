@@ -50,12 +50,12 @@ class LibraryAgent:
         from .peer_training import learn  # noqa: PLC0415 - needs the library
 
         keywords = dataclasses.asdict(self.settings.sb3)
-        steps = episodes * horizon
-        explores = min(1.0, keywords.pop("exploration_steps") / steps)
+        explores = keywords.pop("exploration_steps")
+        steps = max(episodes * horizon, explores)  # on_episode ends training; exploration depends on the step alone
         self._model = self._algorithm(
             "CnnPolicy" if self._encoder is None else "MlpPolicy",
             env if self._encoder is None else LatentObservation(env, self._encoder),
-            exploration_fraction=explores,
+            exploration_fraction=explores / steps,
             seed=self._seed,
             device=self._device,
             **keywords,

@@ -20,7 +20,7 @@ from .chapter_5 import CHAPTER_5
 from .family import Family
 from .layers import dropout_bits
 from .precision import PRECISIONS, settle
-from .ranges import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
+from .ranges import COUNT, FINITE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
 from .settings import START_STATES, Settings
 from .uncertainty import REDUCTIONS
 
@@ -45,7 +45,7 @@ _RANGES = {
     "controller.gradient_clip": POSITIVE,
     "controller.epsilon_min": PROBABILITY,
     "controller.epsilon_max": PROBABILITY,
-    "controller.epsilon_decay": NOT_NEGATIVE,
+    "controller.epsilon_decay": FINITE,
     "imagination.start_episode": NOT_NEGATIVE,
     "imagination.end_episode": NOT_NEGATIVE,
     "imagination.updates_per_step": NOT_NEGATIVE,
@@ -119,7 +119,17 @@ def _require_ranges(settings: Settings) -> None:
     for name, (kind, known) in _WORDS.items():
         require_known(kind, flat[name], known)
     require_ranges(flat, _RANGES)
-    model = settings.model
+    model, controller, imagination = settings.model, settings.controller, settings.imagination
+    if controller.epsilon_min > controller.epsilon_max:
+        raise InvalidValueError(
+            f"controller.epsilon_min {controller.epsilon_min} is above controller.epsilon_max "
+            f"{controller.epsilon_max}: exploration would rise. Set it to that or less."
+        )
+    if imagination.end_episode is not None and imagination.end_episode <= imagination.start_episode:
+        raise InvalidValueError(
+            f"imagination.end_episode {imagination.end_episode} is not above imagination.start_episode "
+            f"{imagination.start_episode}: nothing would be imagined. Set it above that, or to null for no end."
+        )
     if dropout_bits(model.dropout) and not (model.dynamics_hidden and (model.shared_hidden or model.reward_hidden)):
         raise InvalidValueError(
             "model.dropout acts on hidden layers: give model.dynamics_hidden and model.reward_hidden at least one each "

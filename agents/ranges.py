@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,7 @@ SHARE = Range(lambda value: 0.0 <= value < 1.0, "must lie in [0, 1)")
 RATE = Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
 POSITIVE = Range(lambda value: value > 0.0, "must be above 0")
 NOT_NEGATIVE = Range(lambda value: value >= 0.0, "must be at least 0")
+FINITE = Range(lambda value: 0.0 <= value < math.inf, "must be at least 0 and finite")
 COUNT = Range(lambda value: value >= 1, "must be at least 1")
 
 

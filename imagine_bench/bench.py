@@ -157,12 +157,12 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
 def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
     """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
     failures: list[Failure] = []
-    for until in store.protocol.waves:
-        failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
-        pairs = [pair for pair in store.missing(until) if pair not in failed]
-        jobs = [_job(store, paths, *pair, until) for pair in pairs]
-        if jobs:
-            with ProgressBars([job.spec for job in jobs]) as show:
+    with ProgressBars([_job(store, paths, *pair, None).spec for pair in store.missing()]) as show:
+        for until in store.protocol.waves:
+            failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
+            pairs = [pair for pair in store.missing(until) if pair not in failed]
+            jobs = [_job(store, paths, *pair, until) for pair in pairs]
+            if jobs:
                 failures += launcher.launch(jobs, _noting_time(store, show))
     return failures
 

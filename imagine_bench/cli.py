@@ -22,6 +22,7 @@ from imagine_bench.files import require_writable
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
+from imagine_bench.protocol import digest
 from imagine_bench.store import newest_bench, newest_recording, read_protocol
 
 INTERRUPTED = 130
@@ -30,6 +31,9 @@ _RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
 _TOGETHER = "imagine_bench.together:load_together"
 _ARCHIVED = "imagine_bench.archive:load_archive"
 _ABREAST = "(default: equal shares for local workers; with ray 1)"
+_ADDING_UP = ("--set", "--beside", "--variants")
+_LISTS = (*_ADDING_UP, "--agents", "--seeds", "--budgets", "--after")
+"""Options that take several values; of those that do not add up, the last one counts, as with any option."""
 _PRESETS_OWN = "(default: the preset's)"
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
@@ -221,9 +225,9 @@ class StudyCommand:
 
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
         where = launcher(self.launcher, self.workers)
-        lines = run_study(study, self.task, root=self.out, launcher=where)
-        part = f"-{'-'.join(self.variants)}".replace(" ", "_").replace(",", "") if self.variants else ""
+        part = f"-{digest(sorted(self.variants))}" if self.variants else ""
         folder = self.out / self.task / f"study-{study.name}{part}"
+        lines = run_study(study, self.task, root=self.out, launcher=where)
         write_study(folder, study, lines)
         print(study_table(study, lines))
         print(f"\nStudy:      {folder / 'study.md'}")
@@ -357,14 +361,17 @@ Command = (
 
 def main(words: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
-    command = tyro.cli(
-        Command,
-        prog="imagine-bench",
-        description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs.",
-        args=words,
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
+    given = sys.argv[1:] if words is None else list(words)
+    command: Any = None
     try:
+        _require_clear(given)
+        command = tyro.cli(
+            Command,
+            prog="imagine-bench",
+            description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs.",
+            args=given,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
         command()
         sys.stdout.flush()
     except ImagineBenchError as error:
@@ -378,6 +385,20 @@ def main(words: Sequence[str] | None = None) -> int:
         print(f"imagine-bench: interrupted; the same command {then}.", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _require_clear(words: Sequence[str]) -> None:
+    """Refuse what would be taken for something else in silence: a list without values, one of two lists.
+
+    Raises:
+        InvalidValueError: An option that takes a list has no value, or such an option that adds up comes twice.
+    """
+    for name in _LISTS:
+        places = [place for place, word in enumerate(words) if word == name]
+        if any(words[place + 1 : place + 2] == [] or words[place + 1].startswith("--") for place in places):
+            raise InvalidValueError(f"{name} has no value; give at least one behind it, or leave it out.")
+        if len(places) > 1 and name in _ADDING_UP:
+            raise InvalidValueError(f"{name} comes {len(places)} times; give all its values behind one.")
 
 
 def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
@@ -408,8 +429,8 @@ def _show(folder: Path, result: Any = None) -> None:
     """Write a bench's report, or that of another result of its kind, and print its table and where everything lies."""
     kind = kind_of(read_protocol(folder).task)
     result = result or registry.load(_ARCHIVED if is_archive(folder) else kind.load_so_far)(folder)
+    print(registry.load(kind.summary_table)(result))  # first, as it needs no place to write
     page = registry.load(kind.write_report)(result)
-    print(registry.load(kind.summary_table)(result))
     print(f"\nReport:     {page}")
     recordings = [run.recording for run in result.runs if run.recording is not None]
     if recordings:

@@ -11,8 +11,8 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -145,6 +145,19 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise ArtefactError(f"{path} is not {what}: {reason}. It was left untouched.") from error
 
 
+def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Where two JSON values differ first, by sorted name: the dotted name and both values; None where they are equal.
+
+    What one has and the other lacks is None in the other.
+    """
+    if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
+        return None if then == now else (name, then, now)
+    found = (
+        first_difference(then.get(key), now.get(key), f"{name}.{key}" if name else key) for key in sorted({*then, *now})
+    )
+    return next((difference for difference in found if difference is not None), None)
+
+
 def sha256(path: Path) -> str:
     """Hex digest of a file.
 
@@ -175,8 +188,9 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         _acquire(handle, path, busy, time.monotonic() + patience_s)
-        os.ftruncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        with suppress(OSError):  # a courtesy for whoever finds it held, which a full disk cannot take
+            os.ftruncate(handle, 0)
+            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
         os.close(handle)

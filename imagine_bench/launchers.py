@@ -154,6 +154,8 @@ class LocalPool:
                 failures += [failure for child in ended for failure in child.failures()]
                 running = [child for child in running if child not in ended]
         finally:
+            for child in running:  # all at once, so that a second interrupt meanwhile finds none at work
+                child.process.terminate()
             for child in running:
                 child.stop()
         return tuple(failures)
@@ -167,7 +169,7 @@ class _Child:
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._receiver, sender = context.Pipe(duplex=False)
         name = f"{jobs[0].spec.agent}/{jobs[0].folder.name}"
-        self.process: BaseProcess = context.Process(target=_work, args=(jobs, sender), name=name)
+        self.process: BaseProcess = context.Process(target=_work, args=(jobs, sender), name=name, daemon=True)
         with _environment(ONE_THREAD), _interrupts_ignored():
             self.process.start()
         sender.close()

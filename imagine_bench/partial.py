@@ -113,12 +113,14 @@ def _unfinished(folder: Path) -> RunResult:
     config = read_json(folder / "config.json", "a run's configuration")
     with reading(folder / "checkpoints", "a run's checkpoint"):
         counters = Counters.of(snapshot)
+    with reading(folder / "config.json", "a run's configuration"):
+        agent, seed, settings = config["agent"], config["seed"], config["settings"]
     training = counters.training()
     return RunResult(
-        agent=config["agent"],
-        seed=config["seed"],
+        agent=agent,
+        seed=seed,
         checkpoints=tuple(counters.rows),
-        settings=config["settings"],
+        settings=settings,
         training_success=training["success"],
         training_length=training["length"],
         imagined=(),

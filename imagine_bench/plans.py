@@ -181,6 +181,12 @@ def fewest_actions(rules: Rules, start: State) -> int:
     raise InvalidValueError(f"The rules allow no success from {start}.")
 
 
+def require_threshold(max_epistemic: float | None) -> None:
+    """Raise InvalidValueError for an epistemic uncertainty that nothing could stay below, NaN included."""
+    if max_epistemic is not None and not max_epistemic >= 0.0:
+        raise InvalidValueError(f"Plans of more epistemic uncertainty than {max_epistemic}: give at least 0.")
+
+
 def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     """Why a plan must not be carried out, or an empty string."""
     doubt = rollout.epistemic

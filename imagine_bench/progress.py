@@ -19,12 +19,12 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
     """Shows :class:`~imagine_bench.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
 
     Args:
-        specs: The runs to come.
+        specs: The runs to come, to their ends even where they rest on the way.
     """
 
     def __init__(self, specs: Sequence[RunSpec]) -> None:
-        self._work = sum(spec.work for spec in specs)
-        self._runs, self._finished = len(specs), 0
+        self._works = {(spec.agent, spec.seed): spec.work for spec in specs}
+        self._work, self._finished = sum(self._works.values()), set[tuple[str, int]]()
         self._done: dict[tuple[str, int], int] = {}
         self._before = 0
         self._began_s = self._shown_s = time.monotonic()
@@ -42,19 +42,21 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
-        run, finished = (progress.agent, progress.seed), progress.phase == "done"
+        run, rests = (progress.agent, progress.seed), progress.phase == "done"
+        work = self._works[run]
         if run not in self._done:  # what an earlier sitting did took no time now and promises nothing
             self._before += progress.done
         self._done[run] = progress.done
-        self._finished += finished
+        if rests and progress.done >= work:
+            self._finished.add(run)
         if self._total is not None:
-            self._show_on_bars(self._total, run, "" if finished else _sentence(progress))
-        elif finished or time.monotonic() - self._shown_s > _LINE_EVERY_S:
+            self._show_on_bars(self._total, run, "" if rests else _sentence(progress, work))
+        elif rests or time.monotonic() - self._shown_s > _LINE_EVERY_S:
             self._shown_s = time.monotonic()
-            print(f"{self._description()},{self._times()}; {_sentence(progress)}", file=sys.stderr, flush=True)
+            print(f"{self._description()},{self._times()}; {_sentence(progress, work)}", file=sys.stderr, flush=True)
 
     def _description(self) -> str:
-        return f"{self._finished} of {self._runs} runs done"
+        return f"{len(self._finished)} of {len(self._works)} runs done"
 
     def _times(self) -> str:
         """Time gone and, once there is something to judge by, time left."""
@@ -82,11 +84,13 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         return len(owners)
 
 
-def _sentence(progress: Progress) -> str:
+def _sentence(progress: Progress, work: int) -> str:
+    """What a run is doing, and how far it is of all its ``work``; what is done as far as a budget waits for others."""
     if progress.detail is not None:
-        return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / progress.work:.0f} %"
+        return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / work:.0f} %"
+    phase = "waiting" if progress.phase == "done" and progress.done < work else progress.phase
     success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
     return (
-        f"{progress.agent} seed {progress.seed}: {progress.phase}, training episode {progress.episode}, "
-        f"{100 * progress.done / progress.work:.0f} % of its episodes{success}"
+        f"{progress.agent} seed {progress.seed}: {phase}, training episode {progress.episode}, "
+        f"{100 * progress.done / work:.0f} % of its episodes{success}"
     )

@@ -17,7 +17,7 @@ from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.generalisation import answer, probing, summarise
 from imagine_bench.interfaces import EXECUTIONS
 from imagine_bench.kinds import kind_of
-from imagine_bench.plans import make_plans
+from imagine_bench.plans import make_plans, require_threshold
 from imagine_bench.policy import choices, follow, situations
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import plan_table, write_plans
@@ -62,6 +62,7 @@ def plan_report(
     require_known("execution", execution, EXECUTIONS)
     if recorded < 0 or count < 1:
         raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
+    require_threshold(max_epistemic)
     if run is None:
         run = best_run(load_bench(newest_bench(root, _control(task)))).folder
     trained = load_trained(run, encoder=encoder)

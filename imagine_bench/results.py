@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
+from imagine_bench.files import first_difference
 from imagine_bench.protocol import Protocol
 
 
@@ -172,6 +173,24 @@ class RunResult:
     courses: tuple[ComparedRollout, ...] = ()
 
 
+def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
+    """Refuse runs of one agent, by folder, with different settings; kept results, which have none, are passed over.
+
+    Raises:
+        ArtefactError: Two runs differ; the message says where and in what.
+    """
+    known = [(folder, settings) for folder, settings in runs if settings]
+    for folder, settings in known[1:]:
+        difference = first_difference(known[0][1], settings)
+        if difference is not None:
+            name, value, other = difference
+            raise ArtefactError(
+                f"{known[0][0]} ran with {name} {value!r} and {folder} with {other!r}, as another kind of machine may "
+                f"choose. Runs that are compared need one value: give it with --set {name}=..., or use one kind of "
+                "machine."
+            )
+
+
 @dataclass(frozen=True, kw_only=True)
 class BenchResult:
     """All runs of a protocol. Every agent and seed is there, or this cannot be built.
@@ -186,7 +205,7 @@ class BenchResult:
         missing: What a part lacks, one sentence a run.
 
     Raises:
-        ArtefactError: A run of the protocol is missing, doubled or has other budgets.
+        ArtefactError: A run of the protocol is missing, doubled or has other budgets, or other settings than another.
     """
 
     protocol: Protocol
@@ -210,6 +229,8 @@ class BenchResult:
             budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
             if budgets != self.protocol.budgets:
                 raise ArtefactError(f"{run.folder} has budgets {budgets}, the protocol says {self.protocol.budgets}.")
+        for agent in self.protocol.agents:
+            require_one_setting([(run.folder, run.settings) for run in self.of(agent)])
 
     @property
     def protocol_hash(self) -> str:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import csv_text, read_json, reading, sha256, write_bytes, write_json
+from imagine_bench.files import csv_text, first_difference, read_json, reading, sha256, write_bytes, write_json
 from imagine_bench.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 FORMAT = "imagine_bench run 1"
@@ -64,12 +64,14 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
         write_json(path, now)
         return
     then = read_json(path, "a run's configuration")
-    if then == now:
+    difference = first_difference(then, now)
+    if difference is None:
         return
-    name = next(name for name in sorted({*then, *now}) if then.get(name) != now.get(name))
+    name, was, would_be = difference
     raise ArtefactError(
-        f"{folder} was begun with another {name} than this version would use; it was left untouched. Finish it with "
-        "the version that began it, or choose another folder with --out."
+        f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was left "
+        "untouched. Finish it with the version and on the kind of machine that began it, or choose another folder with "
+        "--out."
     )
 
 

@@ -18,8 +18,8 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.environment import describe_environment
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.environment import describe_environment, gl_renderer
+from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.fidelity import measure_fidelity
 from imagine_bench.files import require_writable, write_json
 from imagine_bench.interfaces import Promises, SceneReader, TaskSpec
@@ -87,13 +87,14 @@ def speed_report(out: Path, turns: int = TURNS, show: Callable[[str], None] = pr
 
     Raises:
         InvalidValueError: Too few macro-actions to time, or a folder to write to.
-        SetupError: The file cannot be written.
+        SetupError: The file cannot be written, or there is no GL.
     """
     if turns < 2 * _BLOCK:
         raise InvalidValueError(f"turns is {turns}; give at least {2 * _BLOCK} macro-actions: two blocks are timed.")
     if out.is_dir():
         raise InvalidValueError(f"{out} is a folder; give the JSON file to write.")
     require_writable(out.parent)
+    gl_renderer()  # fails here, in one sentence, rather than in a child
     show("| what | required | measured | |\n|---|---|---|---|")
     figures = []
     for figure in measure(turns):
@@ -116,7 +117,9 @@ def _best_cpu_s(repeat: Callable[[], object], blocks: int) -> float:
 
 def _child(code: str) -> dict[str, float]:
     """Run ``code`` in a fresh interpreter; it prints one JSON object."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise SetupError(f"A fresh interpreter could not be measured: {done.stderr.strip().splitlines()[-1]}")
     answer: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return answer
 

@@ -7,7 +7,7 @@ overwritten by another protocol, for its hash is in the name.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,7 @@ from imagine_bench.kinds import kind_of
 from imagine_bench.registry import load
 
 _PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sittings.json"
-_IDENTITY = ("commit", "versions", "gl_renderer")
+_IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
 
 
@@ -83,12 +83,13 @@ class BenchStore:
         if begun:
             first, self._sittings = read_json(path, "a bench's environment"), _read_sittings(self.folder)
         self._began_s = time.monotonic()
-        changed = [name for name in _IDENTITY if first.get(name) != environment.get(name)]
+        then, now = _facts(first), _facts(environment)
+        changed = [name for name in _IDENTITY if then.get(name) != now.get(name)]
         self._sittings.append({
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "wall_s": 0.0,
             "command": environment["command"],
-            "changed": {name: environment.get(name) for name in changed},
+            "changed": {name: now.get(name) for name in changed},
         })  # fmt: skip
         self.note_time()
         if not begun:
@@ -162,9 +163,16 @@ def newest_recording(root: Path) -> Path:
     return found[-1]
 
 
+def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """An environment with its machine's processor among the facts."""
+    return {**environment, "cpu": environment.get("machine", {}).get("cpu")}
+
+
 def _read_sittings(folder: Path) -> list[dict[str, Any]]:
-    sittings: list[dict[str, Any]] = read_json(folder / _SITTINGS, "a bench's sittings", holds=list)
-    return sittings
+    path, what = folder / _SITTINGS, "a bench's sittings"
+    sittings: list[dict[str, Any]] = read_json(path, what, holds=list)
+    with reading(path, what):
+        return [{**sitting, "wall_s": float(sitting["wall_s"])} for sitting in sittings]
 
 
 def _run_folder(folder: Path, agent: str, seed: int) -> Path:

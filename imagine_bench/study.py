@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from imagine_bench import statistics
 from imagine_bench.bench import Encoders, bench, plan
 from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import Launcher
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, tunes
 
@@ -137,6 +138,9 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     Raises:
         ImagineBenchError: As for :func:`imagine_bench.bench.bench`; what was finished is kept.
     """
+    if task not in KINDS["control"].tasks:
+        kind_of(task)  # knows every name
+        raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run
     results = {
         variant.name: bench(protocol, encoder, root=root, launcher=launcher) for variant, protocol, encoder in planned

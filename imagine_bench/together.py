@@ -46,11 +46,12 @@ def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
         environment=_environment(results),
         folder=root / protocol.task / f"together-{protocol.hash}",
         wall_s=sum(result.wall_s for result in results),
+        missing=tuple(sentence for result in results for sentence in result.missing),
     )
 
 
 def _joined(protocols: Sequence[Protocol], folders: Sequence[Path]) -> Protocol:
-    first, same = protocols[0], len({protocol.agents for protocol in protocols}) == 1
+    first, same = protocols[0], len({frozenset(protocol.agents) for protocol in protocols}) == 1
     agents = first.agents if same else _all([protocol.agents for protocol in protocols], "an agent")
     digests = [protocol.settings_digest for protocol in protocols]  # empty, so unknown, in the oldest ones
     seeds = [protocol.seeds for protocol in protocols]
@@ -101,9 +102,7 @@ def _common(values: Sequence[tuple[int, ...]], name: str) -> tuple[int, ...]:
 
 def _environment(results: Sequence[BenchResult]) -> dict[str, Any]:
     benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
-    unfinished = [sentence for result in results for sentence in result.missing]
     return {
         "command": "; ".join(str(result.environment.get("command", "")) for result in results),
-        **({"unfinished": unfinished} if unfinished else {}),
         **benches,
     }

@@ -224,6 +224,15 @@ def test_questions_lead_where_the_dynamics_do() -> None:
 # --- the thesis' agents ------------------------------------------------------------------------------------------
 
 
+def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
+    learner = imagination_agents.make_uncertainty(context(monkeypatch, moving))
+    live_on_latents(learner, range(4), np.random.default_rng(0))
+    assert learner.imagination.threshold < 99.0
+    learner.carry_over()
+    assert learner.imagination.threshold == 99.0
+
+
 @pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, imagination_only.make])
 def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
     learner, resumed = make(context(monkeypatch)), make(context(monkeypatch))

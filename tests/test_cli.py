@@ -11,7 +11,7 @@ import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
 
 from imagine_bench.cli import main, parse_settings
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.launchers import LocalPool
 from imagine_bench.store import newest_bench
 
@@ -60,6 +60,9 @@ def bench_words(out: Path, *more: str) -> list[str]:
             "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: ",
         ),
         (["--set", "controller.discount"], "--set 'controller.discount' is not of the form name=value"),
+        (["--set", "a=1", "--set", "b=2"], "--set comes 2 times; give all its values behind one."),
+        (["--seeds", "--workers", "1"], "--seeds has no value; give at least one behind it, or leave it out."),
+        (["--workers", "1", "--agents"], "--agents has no value; give at least one behind it, or leave it out."),
         (["--workers", "0"], "0 workers cannot run anything; give at least 1."),
     ],
 )
@@ -78,6 +81,14 @@ def test_wrong_words_get_one_line_and_exit_code_2(
 def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, sentence in (
         (["report", "--out", str(tmp_path)], "There is no bench below"),
+        (["report", "a", "--beside", "b", "--beside", "c"], "--beside comes 2 times; give all its values behind one."),
+        (["plan", str(tmp_path), "--max-epistemic", "nan"], "more epistemic uncertainty than nan: give at least 0."),
+        (["plan", str(tmp_path), "--max-epistemic=-1"], "more epistemic uncertainty than -1.0: give at least 0."),
+        (
+            ["study", "--task", "toy_regression"],
+            "toy_regression is learned from data; a study compares agents that act",
+        ),
+        (["study", "--task", "toy"], "No task 'toy'."),
         (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
         (["view", str(tmp_path / "x.rrd")], "No recording"),
@@ -93,6 +104,15 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("imagine-bench: ") and sentence in line
+
+
+def test_speed_without_gl_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def none() -> str:
+        raise SetupError("No OpenGL for headless rendering: install libegl1.")
+
+    monkeypatch.setattr("imagine_bench.speed.gl_renderer", none)
+    assert main(["speed"]) == 2
+    assert capsys.readouterr() == ("", "imagine-bench: No OpenGL for headless rendering: install libegl1.\n")
 
 
 def test_the_program_itself_exits_without_a_traceback() -> None:

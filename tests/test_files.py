@@ -12,7 +12,16 @@ from pathlib import Path
 import pytest
 
 from imagine_bench.errors import ArtefactError, BusyError, SetupError
-from imagine_bench.files import csv_text, lock, make_folder, read_json, write_bytes, write_json, writing
+from imagine_bench.files import (
+    csv_text,
+    first_difference,
+    lock,
+    make_folder,
+    read_json,
+    write_bytes,
+    write_json,
+    writing,
+)
 
 _HOLD = """
 import sys, time
@@ -91,6 +100,28 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
         child.wait()
     with lock(path, "The folder"):
         assert str(os.getpid()) in path.read_text()
+
+
+def test_a_lock_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handle: int, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("imagine_bench.files.os.write", full)
+    with lock(tmp_path / ".lock", "The folder"), pytest.raises(BusyError), lock(tmp_path / ".lock", "The folder"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "found"),
+    [
+        ({"a": 1, "b": {"c": [1, 2]}}, {"a": 1, "b": {"c": [1, 2]}}, None),
+        ({"a": 1, "b": {"c": 2, "d": 3}}, {"a": 1, "b": {"c": 2, "d": 4}}, ("b.d", 3, 4)),
+        ({"b": 1}, {"a": 2, "b": 1}, ("a", None, 2)),
+        ({"b": {"c": 1}}, {"b": 5}, ("b", {"c": 1}, 5)),
+    ],
+)
+def test_the_first_difference_is_named(then: object, now: object, found: object) -> None:
+    assert first_difference(then, now) == found
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:

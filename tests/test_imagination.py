@@ -26,7 +26,7 @@ class CountingModel:
     The first latent dimension tells the rollouts apart by the action taken first.
     """
 
-    members = 1
+    members, latent_size = 1, 2
 
     def __init__(self, *, doubt_at: int = -1, end_at: int = -1, spurious_at: int = -1, torn_at: int = -1) -> None:
         self.doubt_at, self.end_at, self.spurious_at, self.torn_at = doubt_at, end_at, spurious_at, torn_at
@@ -179,6 +179,26 @@ def test_exploration_inside_rollouts_is_at_least_that_of_the_settings() -> None:
     exploring.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.0)
     share = (exploring.memory.arrays()["action"] != greedy.memory.arrays()["action"][0]).mean()
     assert 0.1 < share < 0.4  # half of the random half
+    following, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1, exploration=0.0)
+    following.rollouts(controller, torch.zeros(2), NOTHING_REAL, 1.0)
+    share = (following.memory.arrays()["action"] != greedy.memory.arrays()["action"][0]).mean()
+    assert 0.3 < share < 0.7  # half: the robot's own exploration is larger
+
+
+def test_the_components_of_different_networks_are_not_averaged() -> None:
+    class Swapped(CountingModel):
+        """Two networks that say the same, z - 1 or z + 1, with their components in another order."""
+
+        members = 2
+
+        def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+            order = torch.tensor([[-1.0, 1.0], [1.0, -1.0]]).repeat_interleave(T, dim=0)  # [2 T, K]
+            means = z[None, :, None, :] + order[:, None, :, None]  # [2 T, N, K, Z]
+            return Mixture(torch.full(means.shape[:3], -0.7), means, torch.full_like(means, -9.0))
+
+    imagination, controller = make(filtered=False, model=Swapped(), depth=1, breadth=50)
+    imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
+    assert set(imagination.memory.arrays()["next_z"].ravel().tolist()) <= {-1.0, 1.0}
 
 
 def remembering(count: int) -> RealMemory:

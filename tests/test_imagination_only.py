@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fake_latents import CODES, context, frame, live, transition
 from imagine_bench.agents import dqn, imagination_agents, imagination_only
+from imagine_bench.agents.controller import Controller, epsilon
+from imagine_bench.agents.imagination import Imagination
 from imagine_bench.agents.imagination_only import ImaginationOnly
+from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.rehearsal import Rehearsal
+from imagine_bench.agents.settings import ControllerSettings, Settings
+from test_imagination import CountingModel, remembering
+from test_imagination import make as counting
 
 from imagine_bench.capabilities import Rehearser
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
+from imagine_bench.seeding import SeedTree
 
 GOAL = 10
 STATES = 6
@@ -141,6 +152,57 @@ def test_the_filter_ends_an_imagined_episode_and_stores_nothing_that_it_discards
     assert rehearse(strict) == 6
     assert len(strict.state().arrays["rehearsal/memory/z"]) == 0
     assert strict.diagnostics()["imagination/acceptance_rate"] == 0.0
+
+
+def rehearsal(model: CountingModel, *, filtered: bool = False, **changes: Any) -> tuple[Rehearsal, Callable[[], None]]:
+    """A rehearsal on a world model that counts, and what lets it imagine one episode from latents of 0."""
+    imagination, _ = counting(filtered=filtered, model=model, **changes)
+    controller = ControllerSettings(hidden=(8,), batch_size=4, epsilon_decay=0.1)
+    settings = Settings(imagination=imagination.settings, controller=controller)
+    practice = Rehearsal(imagination, 2, settings, SeedTree(0), torch.device("cpu"))
+    starts: Any = SimpleNamespace(sample=lambda count, generator: torch.zeros(count, 2))
+    return practice, lambda: practice.episode(starts, remembering(4), Meters())
+
+
+def test_a_rehearsed_episode_ends_where_the_model_says_so_and_every_step_counts() -> None:
+    practice, one_episode = rehearsal(CountingModel(end_at=2), depth=10)
+    for episode in range(1, 6):
+        one_episode()
+        assert practice.steps == practice.values()["imagined"] == 2 * episode
+    assert practice.arrays()["memory/terminated"].tolist() == [0.0, 1.0] * 5
+    practice, one_episode = rehearsal(CountingModel(), depth=7)
+    one_episode()
+    assert practice.steps == 7, "without an end its depth is"
+
+
+def test_rehearsals_explore_ever_less_down_to_the_exploration_of_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    practice, one_episode = rehearsal(CountingModel(), depth=30, exploration=0.2)
+    chances: list[float] = []
+
+    def act(controller: Controller, z: torch.Tensor, chance: float, generator: torch.Generator) -> torch.Tensor:
+        chances.append(chance)
+        return Imagination.act(controller, z, chance, generator)
+
+    monkeypatch.setattr(practice._imagination, "act", act)
+    one_episode()
+    settings = practice._settings.controller
+    assert chances == [max(epsilon(step, settings), 0.2) for step in range(30)]
+    assert chances[0] == 0.8 and chances[-1] == 0.2
+
+
+def test_a_moving_threshold_moves_for_rehearsals_too() -> None:
+    practice, one_episode = rehearsal(CountingModel(), filtered=True, depth=1, threshold=99.0, threshold_quantile=1.0)
+    one_episode()
+    assert practice._imagination.threshold == 0.0  # this model has no doubt
+
+
+def test_rehearsals_are_what_it_says_it_imagined(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch)
+    live(agent, range(4), np.random.default_rng(0))
+    rehearse(agent)
+    read = agent.diagnostics()
+    assert read["imagined_transitions"] == len(agent.state().arrays["rehearsal/memory/z"]) > 8
+    assert read["time/rehearsal_s"] > 0.0 and "time/imagination_s" not in read
 
 
 def test_a_filter_without_dropout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,10 @@ import pytest
 import torch
 from fake_latents import ACTIONS, CODES, context, frame, live, transition
 from imagine_bench.agents import dqn, imagination_agents, imagination_only
+from imagine_bench.agents.controller import Controller
+from imagine_bench.agents.imagination import Counts
 from imagine_bench.agents.learner import Learner
+from imagine_bench.agents.memory import RealMemory
 
 from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
@@ -102,6 +105,35 @@ def test_algorithm_1_in_its_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls.clear()
     agent.observe(transition(0, 1, 0.0, 1), episode=2)
     assert calls == [*waking, "imagine", *["imagined 8"] * 4]
+
+
+def test_rollouts_begin_where_the_robot_acted_and_explore_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = imagination_agents.make(context(monkeypatch))
+    given: list[tuple[list[float], float]] = []
+    rollouts = agent.imagination.rollouts
+
+    def noted(controller: Controller, z: torch.Tensor, real: RealMemory, chance: float) -> Counts:
+        given.append((z.tolist(), chance))
+        return rollouts(controller, z, real, chance)
+
+    monkeypatch.setattr(agent.imagination, "rollouts", noted)
+    chances = []
+    for state in (3, 0, 5):
+        chances.append(agent.epsilon)
+        agent.observe(transition(state, 1, 0.0, 1), episode=2)
+    assert given == [(CODES[state].tolist(), chance) for state, chance in zip((3, 0, 5), chances, strict=True)]
+    assert chances[0] > chances[-1] > 0.0
+
+
+def test_batches_of_the_model_are_spread_and_balanced_and_those_of_the_controller_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wanted = {"spread": 4.0, "balance": 0.5}
+    agent = imagination_agents.make(context(monkeypatch, {f"model.{name}": value for name, value in wanted.items()}))
+    sample, how = agent.real.sample, list[dict[str, float]]()
+    monkeypatch.setattr(agent.real, "sample", lambda *args, **names: (how.append(names), sample(*args, **names))[1])
+    agent.observe(transition(0, 1, 0.0, 1), episode=0)
+    assert how == [wanted, *[{}] * agent.settings.controller.updates_per_step]
 
 
 def test_after_imagination_its_updates_are_made_on_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:

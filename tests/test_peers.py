@@ -49,6 +49,14 @@ def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: P
     assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
 
 
+def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
+    """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
+    short = do(tmp_path / "short", budgets=(6,), overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
+    longer = do(tmp_path / "longer", overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
+    first, same = short.checkpoints[0], longer.checkpoints[0]
+    assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
+
+
 def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     temporary = tmp_path / "temporary"
     temporary.mkdir()

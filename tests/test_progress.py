@@ -13,6 +13,8 @@ from test_runner import small
 from imagine_bench.progress import ProgressBars
 from imagine_bench.runs import Phase, Progress
 
+WORK = 9 + 2 * 5
+"""Of a learner: training episodes, and tests at two budgets."""
 AGENTS, SEEDS = ("table", "random"), (0, 1, 2)
 
 
@@ -30,7 +32,8 @@ def specs() -> list[FakeRunSpec]:
 
 
 def far(agent: str, seed: int, phase: Phase = "training") -> Progress:
-    return Progress(agent=agent, seed=seed, phase=phase, done=5, work=10, episode=5)
+    done = WORK if phase == "done" else 5
+    return Progress(agent=agent, seed=seed, phase=phase, done=done, work=WORK, episode=5)
 
 
 def rows(terminal: Terminal) -> dict[int, str]:
@@ -56,6 +59,17 @@ def test_every_run_that_goes_on_has_a_row_until_another_takes_it_over(monkeypatc
     assert [at_last[row].split(":")[0] for row in (2, 4)] == ["random seed 0", "random seed 1"]
     assert len(at_last) == 4
     assert not any(rows(terminal).values()), "nothing stays behind"
+
+
+def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBars(specs()) as show:
+        show(Progress(agent="table", seed=0, phase="done", done=9, work=9, episode=4))
+        show(far("table", 0, "done"))
+        show(far("table", 0, "done"))
+    waiting, done, again = capsys.readouterr().err.splitlines()
+    assert waiting.startswith("0 of 6 runs done") and "table seed 0: waiting, training episode 4, 47 % of" in waiting
+    assert done.startswith("1 of 6 runs done") and "table seed 0: done" in done
+    assert again.startswith("1 of 6 runs done")
 
 
 def test_without_a_terminal_the_end_of_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -179,7 +179,7 @@ def test_a_finished_run_is_read_and_not_repeated(tmp_path: Path) -> None:
 def test_other_settings_do_not_go_on_in_a_run_that_was_begun(tmp_path: Path) -> None:
     do(tmp_path / "run")
     (tmp_path / "run" / "DONE").unlink()
-    with pytest.raises(ArtefactError, match="was begun with another protocol than this version would use"):
+    with pytest.raises(ArtefactError, match=r"was begun with protocol\.budgets \[4, 9\], and .* use \[4, 10\]"):
         do(tmp_path / "run", budgets=(4, 10))
 
 

@@ -87,6 +87,8 @@ def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
     assert changed == ["versions"]
     sittings = json.loads((opened(tmp_path).folder / "sittings.json").read_text())
     assert [sitting["changed"] for sitting in sittings] == [{}, {"versions": {"torch": "2"}}]
+    elsewhere = {**_ENVIRONMENT, "machine": {"cpu": "another", "cores": 2}}
+    assert opened(tmp_path).begin_sitting(elsewhere) == ["cpu"]
 
 
 def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
@@ -108,6 +110,15 @@ def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
         again = opened(tmp_path / str(survived))
         assert again.begin_sitting(_ENVIRONMENT) == []
         assert {path.name for path in again.folder.iterdir()} >= {"environment.json", "sittings.json"}
+
+
+@pytest.mark.parametrize("content", ["[{}]", "[1]", '[{"wall_s": null}]'])
+def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
+    store = opened(tmp_path)
+    store.begin_sitting(_ENVIRONMENT)
+    (store.folder / "sittings.json").write_text(content)
+    with pytest.raises(ArtefactError, match=r"sittings\.json"):
+        store.begin_sitting(_ENVIRONMENT)
 
 
 @pytest.mark.parametrize(("name", "content"), [("sittings.json", "null"), ("environment.json", "[]")])

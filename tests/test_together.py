@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from imagine_bench.bench import bench
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.launchers import launcher
-from imagine_bench.report import write_report
+from imagine_bench.report import summary_table, write_report
 from imagine_bench.results import BenchResult
 from imagine_bench.store import load_bench
 from imagine_bench.together import load_together
@@ -80,6 +81,34 @@ def test_seeds_of_two_benches_are_those_of_one(tmp_path: Path) -> None:
     assert joined.protocol == whole.protocol
     for agent in ("oracle", "random"):
         assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
+
+
+def test_the_order_of_agents_is_nothing(tmp_path: Path) -> None:
+    here, there = do(tmp_path, "oracle", "random", seeds=(0,)), do(tmp_path, "random", "oracle", seeds=(1,))
+    joined = load_together([here, there], tmp_path)
+    assert (joined.protocol.agents, joined.protocol.seeds) == (("oracle", "random"), (0, 1))
+
+
+def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
+    here, there = do(tmp_path, "oracle", seeds=(0, 1)), do(tmp_path, "oracle", seeds=(2,))
+    shutil.rmtree(here / "oracle" / "seed_1")
+    joined = load_together([here, there], tmp_path)
+    assert joined.protocol.seeds == (0, 2)
+    assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
+    assert "One of these benches is not finished: shown are 2 seeds up to 9 real" in summary_table(joined)
+    assert "Missing are oracle seed 1" in write_report(joined).read_text()
+
+
+def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -> None:
+    """As ``model.precision`` is chosen by processor: protocols, with their digests, are one."""
+    result: BenchResult = load_bench(do(tmp_path, "oracle", seeds=(0, 1)))
+    runs = [
+        dataclasses.replace(run, settings={"model": {"members": 1, "precision": precision}})
+        for run, precision in zip(result.runs, ("bfloat16", "float32"), strict=True)
+    ]
+    with pytest.raises(ArtefactError, match=r"ran with model\.precision 'bfloat16' and .*seed_1 with 'float32'"):
+        dataclasses.replace(result, runs=tuple(runs))
+    assert dataclasses.replace(result, runs=(runs[0], dataclasses.replace(runs[1], settings={}))), "kept ones have none"
 
 
 @pytest.mark.parametrize("digest", ["another", ""])

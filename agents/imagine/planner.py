@@ -105,18 +105,22 @@ class Planner:
         """
         if self._only not in (None, code):
             self.forget()
-        if code not in self._index and not self._imagine_from(code):
-            self.forget()
-            self._only = None if self._imagine_from(code) else code
+        if code not in self._index:
+            alone = not self._index
+            whole = self._imagine_from(code)
+            if not whole and not alone:
+                self.forget()
+                whole = self._imagine_from(code)
+            self._only = None if whole else code
         return self._index[code]
 
     def _imagine_from(self, code: tuple[int, ...]) -> bool:
         """Imagine the futures of a new code and of all that follow; whether they are within bounds."""
         front, self._values = [code], {}
-        while front and self.imagined < self._settings.states:
-            self._reserve(front)
-            front = self._expand(front)
         self._reserve(front)
+        while front and len(self._index) <= self._settings.states:
+            front = self._expand(front)
+            self._reserve(front)
         return not front
 
     def _reserve(self, codes: list[tuple[int, ...]]) -> None:

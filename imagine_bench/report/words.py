@@ -134,7 +134,7 @@ def question(data: ReportData) -> str:
 def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
     budget = data.budgets[-1]
-    sentences = [] if data.result.whole is None else [_unfinished(data)]
+    sentences = [_unfinished(data)] if data.result.missing else []
     if BASE_AGENT in data.scores:
         sentences.append(
             f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
@@ -182,14 +182,15 @@ def area_text(area: Estimate) -> str:
 
 def _unfinished(data: ReportData) -> str:
     whole, part = data.result.whole, data.result.protocol
-    assert whole is not None
     missing, more = data.result.missing[:_NAMED], len(data.result.missing) - _NAMED
     others = f"; and {_count(more, 'more run')}" if more > 0 else ""
-    return (
-        f"This bench is not finished: shown are {len(part.seeds)} of {_count(len(whole.seeds), 'seed')} up to "
-        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {'; '.join(missing)}{others}. "
-        "The same bench command goes on."
-    )
+    if whole is None:  # several benches as one
+        shown = f"One of these benches is not finished: shown are {_count(len(part.seeds), 'seed')} up to "
+        shown += f"{part.budgets[-1]:,} real episodes."
+    else:
+        shown = f"This bench is not finished: shown are {len(part.seeds)} of {_count(len(whole.seeds), 'seed')} up to "
+        shown += f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes."
+    return f"{shown} Missing are {'; '.join(missing)}{others}. The same bench command goes on."
 
 
 def _verdict(data: ReportData, agent: str) -> str:
