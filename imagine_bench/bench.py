@@ -151,6 +151,9 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
             failures = _in_waves(store, paths, launcher)
             store.note_time()
             _raise_if_any(failures, missing)
+        else:
+            print(f"All runs lie in {store.folder} already; nothing was run.")
+            _warn(store.changed(describe_environment()), store.folder)
     return load_bench(store.folder)
 
 

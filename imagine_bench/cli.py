@@ -124,7 +124,7 @@ class Plan:
     """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves pictures, a recording."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """A run's folder; by default the best imagining run of the newest bench of the task."""
+    """The folder of a run, or of a bench, whose best imagining run is taken; by default the task's newest bench."""
     task: str | None = None
     """Task whose newest bench is taken; by default of any task."""
     count: int = 100

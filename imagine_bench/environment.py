@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shlex
@@ -22,6 +23,8 @@ PACKAGES = (
 OPTIONAL_PACKAGES = ("sb3-contrib", "stable-baselines3")
 """Of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
+_CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
+"""What decides results, in a checkout."""
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -48,13 +51,25 @@ def command() -> str:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with ``+changes`` if tracked files differ from it; None outside a checkout."""
+    """The checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
     top = Path(imagine_bench.__file__).parent.parent
     if not (top / ".git").exists() or shutil.which("git") is None:
         return None
     head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")
-    changed = _output("git", "-C", str(top), "status", "--porcelain", "--untracked-files=no")
-    return f"{head}+changes" if head and changed else head
+    changes = _changes(top)
+    return f"{head}+changes.{changes}" if head and changes else head
+
+
+def _changes(top: Path) -> str:
+    """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do."""
+    differing = _output("git", "-C", str(top), "diff", "--name-only", "HEAD", "--", *_CODE) or ""
+    new = _output("git", "-C", str(top), "ls-files", "--others", "--exclude-standard", "--", *_CODE) or ""
+    digest, names = hashlib.sha256(), sorted({*differing.splitlines(), *new.splitlines()})
+    for name in names:
+        digest.update(name.encode())
+        if (top / name).is_file():
+            digest.update((top / name).read_bytes())
+    return digest.hexdigest()[:8] if names else ""
 
 
 def versions() -> dict[str, str]:

@@ -64,7 +64,11 @@ def plan_report(
         raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
     require_threshold(max_epistemic)
     if run is None:
-        run = best_run(load_bench(newest_bench(root, _control(task)))).folder
+        run = newest_bench(root, _control(task))
+    if (run / "protocol.json").exists():  # a bench's folder
+        require_control(read_protocol(run).task, str(run))
+        require_runs(run)
+        run = best_run(load_bench(run)).folder
     trained = load_trained(run, encoder=encoder)
     plans = list(
         tqdm(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from imagine_bench.errors import UnknownNameError
+from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
 
@@ -41,6 +41,8 @@ class AgentEntry:
         settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
         trains_itself: Whether it is a :class:`.capabilities.SelfTrainer`, whose run cannot rest before its end.
+        title: For headings, legends and tables; by default the registered name.
+        description: One sentence for a reader of the report.
     """
 
     make: str
@@ -50,6 +52,8 @@ class AgentEntry:
     settings: str = "imagine_bench.agents.presets"
     privileged: bool = False
     trains_itself: bool = False
+    title: str = ""
+    description: str = "A registered agent."
 
 
 TASKS: dict[str, TaskEntry] = {
@@ -220,8 +224,26 @@ def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str)
 
 
 def task(name: str) -> TaskSpec:
-    """The TaskSpec of a registered task."""
-    spec: TaskSpec = load(task_entry(name).spec)
+    """The TaskSpec of a registered task.
+
+    Raises:
+        UnknownNameError: No such task; the message lists all of them.
+        InvalidValueError: It contradicts its registry line, or its names its rules.
+    """
+    entry = task_entry(name)
+    spec: TaskSpec = load(entry.spec)
+    for field, ours, theirs in (
+        ("id", name, spec.id),
+        ("env_id", entry.env_id, spec.env_id),
+        ("horizon", entry.horizon, spec.horizon),
+        ("n_actions", spec.rules.n_actions, spec.n_actions),
+        ("number of macrostate_values", len(spec.rules.states[0]), len(spec.macrostate_values)),
+    ):
+        if ours != theirs:
+            raise InvalidValueError(
+                f"{entry.spec} says {field} {theirs!r} where the registry line or the rules of {name} say {ours!r}; "
+                "make them one."
+            )
     return spec
 
 

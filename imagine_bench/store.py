@@ -78,13 +78,12 @@ class BenchStore:
         Returns:
             Names of facts that decide the bits and are not as in the first sitting.
         """
-        path, first = self.folder / _ENVIRONMENT, environment
+        path = self.folder / _ENVIRONMENT
         begun = path.exists()
         if begun:
-            first, self._sittings = read_json(path, "a bench's environment"), _read_sittings(self.folder)
+            self._sittings = _read_sittings(self.folder)
         self._began_s = time.monotonic()
-        then, now = _facts(first), _facts(environment)
-        changed = [name for name in _IDENTITY if then.get(name) != now.get(name)]
+        changed, now = self.changed(environment), _facts(environment)
         self._sittings.append({
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "wall_s": 0.0,
@@ -95,6 +94,13 @@ class BenchStore:
         if not begun:
             write_json(path, environment)  # last, so that a bench with an environment has sittings too
         return changed
+
+    def changed(self, environment: dict[str, Any]) -> list[str]:
+        """Names of facts that decide the bits and are not as in the first sitting; none before there was one."""
+        path = self.folder / _ENVIRONMENT
+        first = read_json(path, "a bench's environment") if path.exists() else environment
+        then, now = _facts(first), _facts(environment)
+        return [name for name in _IDENTITY if then.get(name) != now.get(name)]
 
     def note_time(self) -> None:
         """Note how long this sitting has lasted, so that a kill loses little of the count."""

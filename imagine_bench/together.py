@@ -85,9 +85,10 @@ def _one(values: Sequence[str | None], complaint: str) -> str | None:
 
 def _all(values: Sequence[tuple[Any, ...]], name: str) -> tuple[Any, ...]:
     found = tuple(value for each in values for value in each)
-    if len(set(found)) < len(found):
+    twice = sorted({value for value in found if found.count(value) > 1})
+    if twice:
         raise InvalidValueError(
-            f"The benches have {name} in common ({', '.join(map(str, found))}). Give benches of different agents, or "
+            f"The benches have {name} in common ({', '.join(map(str, twice))}). Give benches of different agents, or "
             "of different seeds of the same agents."
         )
     return found

@@ -123,7 +123,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
     ) -> None:
         self.render_mode = None if render_mode is None else _known_render_mode(render_mode)
         self._execution = require_known("execution", execution, EXECUTIONS)
-        self._id, self._rules = spec.id, spec.rules
+        self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
         self._world = make_world(appearance_level(appearance))

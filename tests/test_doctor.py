@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -26,6 +28,38 @@ def test_the_broken_pair_is_named() -> None:
     (complaint,) = doctor.unmet_requirements(with_version(mujoco="4.0.0"))
     assert complaint.startswith("mujoco 4.0.0 is installed, but")
     assert "MuJoCo 4.0 breaks dm-control 1.0.50" in complaint and "make setup" in complaint
+
+
+def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each edit, and a new file that nobody added, has a name of its own; what is no code has none."""
+
+    def git(*words: str) -> None:
+        identity = ("-c", "user.name=x", "-c", "user.email=x@example.org")
+        subprocess.run(["git", "-C", str(tmp_path), *identity, *words], check=True, capture_output=True)
+
+    def write(name: str, text: str) -> None:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    monkeypatch.setattr("imagine_bench.environment.imagine_bench.__file__", str(tmp_path / "imagine_bench/__init__.py"))
+    git("init", "-q")
+    write("agents/a.py", "1")
+    git("add", ".")
+    git("commit", "-qm", "x")
+    head = environment.commit()
+    assert head is not None and "+" not in head
+    write("README.md", "words")
+    write("runs/x.py", "results")
+    assert environment.commit() == head
+    seen = {head}
+    for name, text in (("agents/a.py", "2"), ("agents/a.py", "3"), ("agents/new.py", "1"), ("agents/new.py", "2")):
+        write(name, text)
+        now = environment.commit()
+        assert now is not None and now.startswith(f"{head}+changes.") and now not in seen
+        seen.add(now)
+    (tmp_path / "agents/new.py").unlink()
+    write("agents/a.py", "1")
+    assert environment.commit() == head
 
 
 def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> None:

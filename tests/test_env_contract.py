@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import subprocess
 import sys
@@ -115,6 +116,16 @@ def test_the_horizon_truncates_and_does_not_terminate(task):
         assert truncated == (step == horizon - 1)
         assert terminated == rules.is_terminal(tuple(info["macrostate"].tolist()))
     env.close()
+
+
+@pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_values"])
+def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, monkeypatch):
+    spec = registry.task("arrow_puzzle")
+    wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
+    monkeypatch.setattr("imagine_bench.tasks.arrow_puzzle.SPEC", dataclasses.replace(spec, **{field: wrong}))
+    what = {"action_names": "n_actions 5", "macrostate_values": "macrostate_values 3"}.get(field, f"{field} {wrong!r}")
+    with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
+        registry.task("arrow_puzzle")
 
 
 @pytest.mark.parametrize("task", TASKS)

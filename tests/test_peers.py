@@ -119,6 +119,17 @@ def test_latents_are_those_of_our_own_agents() -> None:
     wrapped.close()
 
 
+def test_latents_of_another_task_or_of_no_name_are_refused() -> None:
+    from imagine_bench.agents.latent_observation import LatentObservation
+
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    with pytest.raises(InvalidValueError, match=r"pick_place reads frames as 'small_rgb', this .* 'gray_strips'"):
+        LatentObservation(env, "pick_place-clean")
+    with pytest.raises(UnknownNameError, match=r"No encoder 'arrow_puzle-clean'\. Did you mean 'arrow_puzzle-clean'"):
+        LatentObservation(env, "arrow_puzle-clean")
+    env.close()
+
+
 def test_it_is_never_taken_up_again_half_way() -> None:
     agent = registry.make_agent("sb3_dqn", spec("sb3_dqn").context())
     with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):

@@ -18,6 +18,7 @@ from fake_results import bench_result, compared_rollout
 from imagine_bench import pictures, reference, registry
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.protocol import Protocol
+from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, words, write_report
 from imagine_bench.report.data import collect
 from imagine_bench.report.encoder import encoder_views
@@ -202,6 +203,15 @@ def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
     assert "thesis +47.4" in text
     summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv")}
     assert float(summary["dqn", "2000"]["thesis_mean"]) == pytest.approx(0.4218)
+
+
+def test_an_agent_without_words_of_its_own_has_those_of_its_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert words.agent_words("dqn").title == "DQN"
+    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make"))
+    assert words.agent_words("my_agent") == words.AgentWords("my agent", "A registered agent.")
+    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make", title="Mine", description="Learns."))
+    assert words.agent_words("my_agent") == words.AgentWords("Mine", "Learns.")
+    assert words.agent_words("of_another_time").title == "of another time"
 
 
 def test_markdown_agrees_with_the_tables(result: BenchResult, folder: Path) -> None:

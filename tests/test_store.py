@@ -12,8 +12,10 @@ import pytest
 from test_runner import do, same_but_for_time, small
 
 from imagine_bench import run_folder
+from imagine_bench.bench import bench
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.files import write_json
+from imagine_bench.launchers import launcher
 from imagine_bench.results import OpenLoop
 from imagine_bench.store import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
 
@@ -46,6 +48,18 @@ def test_a_missing_run_is_an_error_that_says_how_to_go_on(tmp_path: Path) -> Non
     do(store.run_folder("table", 0), seeds=(0, 2))
     with pytest.raises(ArtefactError, match=r"missing: \[\('table', 2\)\]\. Run the same bench command again"):
         load_bench(store.folder)
+
+
+def test_a_bench_that_is_whole_says_that_nothing_was_run_and_with_what(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = small(agents=("random",))
+    for _ in range(2):
+        folder = bench(wanted, {}, root=tmp_path, launcher=launcher("local", 1)).folder
+    assert capsys.readouterr().out == f"All runs lie in {folder} already; nothing was run.\n"
+    monkeypatch.setattr("imagine_bench.environment.commit", lambda: "another")
+    bench(wanted, {}, root=tmp_path, launcher=launcher("local", 1))
+    assert f"Note: {folder} was begun with another commit." in capsys.readouterr().out
 
 
 def test_other_settings_live_elsewhere(tmp_path: Path) -> None:

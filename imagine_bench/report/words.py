@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench import statistics
+from imagine_bench import registry, statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.statistics import Estimate
 
@@ -74,8 +74,12 @@ _AGENTS = {
 
 
 def agent_words(agent: str) -> AgentWords:
-    """Title and description of an agent; one that is not known here goes by its registered name."""
-    return _AGENTS.get(agent, AgentWords(agent.replace("_", " "), "A registered agent."))
+    """Title and description of an agent; one that is not known here has those of its registry line."""
+    if agent in _AGENTS:
+        return _AGENTS[agent]
+    entry = registry.AGENTS.get(agent)
+    spoken = agent.replace("_", " ")
+    return AgentWords(spoken, "") if entry is None else AgentWords(entry.title or spoken, entry.description)
 
 
 def lasting(budgets: Sequence[int | None]) -> str:
