@@ -35,6 +35,8 @@ _ADDING_UP = ("--set", "--beside", "--variants")
 _LISTS = (*_ADDING_UP, "--agents", "--seeds", "--budgets", "--after")
 """Options that take several values; of those that do not add up, the last one counts, as with any option."""
 _PRESETS_OWN = "(default: the preset's)"
+_NONE = tyro.conf.arg(help_behavior_hint="(default: none)")
+_NEWEST = tyro.conf.arg(metavar="[PATH]", help_behavior_hint="(default: the newest)")
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
 
@@ -66,7 +68,7 @@ class Bench:
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
     ] = None
     """Another encoder: a bundled name or a .safetensors file."""
-    after: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: none)")] = ()
+    after: Annotated[tuple[str, ...], _NONE] = ()
     """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
     after_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
     """Real training episodes on each of them."""
@@ -74,7 +76,7 @@ class Bench:
     """First training episodes that the oracle plays and learners watch; budgets count them."""
     questions: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Most questions to a teacher in a training episode."""
-    set: tuple[str, ...] = ()
+    set: Annotated[tuple[str, ...], _NONE] = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
     """Processes at a time."""
@@ -105,9 +107,9 @@ class Bench:
 class Report:
     """Write a bench's report again, from its files, and show its table; of an unfinished bench, what there is."""
 
-    folder: Annotated[Path | None, tyro.conf.Positional] = None
-    """The bench's folder; by default the newest."""
-    beside: tuple[Path, ...] = ()
+    folder: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
+    """The bench's folder."""
+    beside: Annotated[tuple[Path, ...], _NONE] = ()
     """Folders of other benches, or of results that were kept, whose agents are shown beside it, or where those are
     the same, whose seeds; all else in their protocols must be the same."""
     out: Path = Path("runs")
@@ -123,10 +125,10 @@ class Report:
 class Plan:
     """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves pictures, a recording."""
 
-    run: Annotated[Path | None, tyro.conf.Positional] = None
-    """The folder of a run, or of a bench, whose best imagining run is taken; by default the task's newest bench."""
-    task: str | None = None
-    """Task whose newest bench is taken; by default of any task."""
+    run: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
+    """The folder of a run, or of a bench, whose best imagining run is taken."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")] = None
+    """Task whose newest bench is taken."""
     count: int = 100
     """Plans."""
     recorded: int = 5
@@ -166,10 +168,10 @@ class Plan:
 class _OfBench:
     """Which bench a question is put to."""
 
-    folder: Annotated[Path | None, tyro.conf.Positional] = None
-    """A bench's folder; by default the newest."""
-    task: str | None = None
-    """Task whose newest bench is taken; by default of any task."""
+    folder: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
+    """A bench's folder."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")] = None
+    """Task whose newest bench is taken."""
     encoder: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the runs', if bundled)")
     ] = None
@@ -208,8 +210,8 @@ class StudyCommand:
     """Task to study on; 'imagine-bench list' names them."""
     name: str = "factors"
     """Which study; 'imagine-bench list' names them."""
-    variants: tuple[str, ...] = ()
-    """Only these variants and what they are compared with; by default all."""
+    variants: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
+    """Only these variants and what they are compared with."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
     """Processes at a time."""
     launcher: str = "local"
@@ -237,8 +239,8 @@ class StudyCommand:
 class View:
     """Open a recording in the Rerun viewer."""
 
-    file: Annotated[Path | None, tyro.conf.Positional] = None
-    """The .rrd file; by default the newest recording."""
+    file: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
+    """The .rrd file."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
