@@ -293,7 +293,7 @@ class List:
 
     def __call__(self) -> None:
         """List."""
-        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - scipy loads slowly
+        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - no other command but study needs them
 
         for title, names in {
             **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},

@@ -9,17 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench import statistics
 from imagine_bench.bench import Encoders, bench, plan
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import Launcher
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, tunes
+
+if TYPE_CHECKING:
+    from imagine_bench.statistics import Estimate
 
 BASE = "base"
 """Name of the factor of what the other variants are compared with."""
@@ -121,7 +123,7 @@ class Line:
     variant: Variant
     success: NDArray[np.float64]
     train_cpu_s: float
-    difference: tuple[statistics.Estimate, ...] | None
+    difference: tuple[Estimate, ...] | None
     folder: Path
     environment: Mapping[str, Any]
 
@@ -175,12 +177,12 @@ def _plan(study: Study, task: str, variant: Variant) -> tuple[Any, Encoders]:
     )
 
 
-def _differences(
-    study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]
-) -> tuple[statistics.Estimate, ...]:
+def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
+    from imagine_bench.statistics import difference  # noqa: PLC0415 - scipy loads slowly, and lists name studies
+
     ours, theirs = success[variant.name], success[str(variant.against)]
     return tuple(
-        statistics.difference(
+        difference(
             ours[:, index],
             theirs[:, index],
             SeedTree(0).child("study", study.name, variant.name, budget).generator(),
