@@ -91,7 +91,7 @@ class ImaginationOnly(ImaginingLearner):
         return True
 
     def diagnostics(self) -> dict[str, float]:
-        """As every learner, of its rehearsals; ``time/rehearsal_s`` is a real step since the last call."""
+        """As every learner, where what is imagined is rehearsed; ``time/rehearsal_s`` too is spread over real steps."""
         base = super().diagnostics()
         base.pop("time/imagination_s", None)  # rehearsals are all that it imagines
         return {**base, "imagined_transitions": float(self.rehearsal.steps)}

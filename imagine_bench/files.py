@@ -148,14 +148,18 @@ def reading(path: Path, what: str) -> Iterator[None]:
 def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | None:
     """Where two JSON values differ first, by sorted name: the dotted name and both values; None where they are equal.
 
-    What one has and the other lacks is None in the other.
+    What one has and the other lacks is given as None in the other.
     """
     if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
         return None if then == now else (name, then, now)
-    found = (
-        first_difference(then.get(key), now.get(key), f"{name}.{key}" if name else key) for key in sorted({*then, *now})
-    )
-    return next((difference for difference in found if difference is not None), None)
+    for key in sorted({*then, *now}):
+        dotted = f"{name}.{key}" if name else key
+        if (key in then) != (key in now):
+            return dotted, then.get(key), now.get(key)
+        difference = first_difference(then[key], now[key], dotted)
+        if difference is not None:
+            return difference
+    return None
 
 
 def sha256(path: Path) -> str:

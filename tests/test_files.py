@@ -118,6 +118,7 @@ def test_a_lock_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ({"a": 1, "b": {"c": 2, "d": 3}}, {"a": 1, "b": {"c": 2, "d": 4}}, ("b.d", 3, 4)),
         ({"b": 1}, {"a": 2, "b": 1}, ("a", None, 2)),
         ({"b": {"c": 1}}, {"b": 5}, ("b", {"c": 1}, 5)),
+        ({"b": 1}, {"a": None, "b": 1}, ("a", None, None)),
     ],
 )
 def test_the_first_difference_is_named(then: object, now: object, found: object) -> None:
