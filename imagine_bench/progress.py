@@ -1,15 +1,18 @@
-"""A bench on the screen: one bar for everything with the time left, and a line for each run that is going on."""
+"""Work on the screen: of a bench one bar for everything with the time left, and a line for each run that goes on."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from typing import TypeVar
 
 from tqdm import tqdm
 
 from imagine_bench.runs import Progress, RunSpec
+
+Item = TypeVar("Item")
 
 _LINE_EVERY_S = 15.0
 """Between two lines where nobody watches a terminal."""
@@ -82,6 +85,24 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
                 return owners.index(wanted)
         self._lines.append((run, tqdm(bar_format="{desc}", position=len(owners) + 1, leave=False)))
         return len(owners)
+
+
+def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
+    """The items, and how many are done: on a terminal a bar, elsewhere a line now and then.
+
+    Args:
+        items: One is done when the next is asked for.
+        what: What they are called.
+        total: How many there will be.
+    """
+    with tqdm(total=total, desc=what, leave=False, disable=not sys.stderr.isatty()) as bar:
+        shown_s = time.monotonic()
+        for done, item in enumerate(items, start=1):
+            yield item
+            bar.update()
+            if bar.disable and time.monotonic() - shown_s > _LINE_EVERY_S:
+                shown_s = time.monotonic()
+                print(f"{done} of {total} {what}", file=sys.stderr, flush=True)
 
 
 def _sentence(progress: Progress, work: int) -> str:

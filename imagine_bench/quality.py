@@ -5,11 +5,8 @@ Plans carried out blindly, transitions nobody ever saw, and where the policy lea
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from imagine_bench import registry
 from imagine_bench.environment import describe_environment
@@ -19,6 +16,7 @@ from imagine_bench.interfaces import EXECUTIONS
 from imagine_bench.kinds import kind_of
 from imagine_bench.plans import make_plans, require_threshold
 from imagine_bench.policy import choices, follow, situations
+from imagine_bench.progress import counted
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
@@ -71,12 +69,8 @@ def plan_report(
         run = best_run(load_bench(run)).folder
     trained = load_trained(run, encoder=encoder)
     plans = list(
-        tqdm(
-            make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic),
-            total=count,
-            desc="plans",
-            leave=False,
-            disable=not sys.stderr.isatty(),
+        counted(
+            make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic), "plans", total=count
         )
     )
     folder = run / "plans" / f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
@@ -114,7 +108,8 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
     spec = registry.task(protocol.task)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
     asked = []
-    for run in tqdm(imagining(result), desc="runs", leave=False, disable=not sys.stderr.isatty()):
+    runs = imagining(result)
+    for run in counted(runs, "runs", total=len(runs)):
         trained = load_trained(run.folder, encoder=encoder)
         answers = answer(trained.imaginer, probe, SeedTree(run.seed).child("generalisation"))
         asked.append(Asked(agent=run.agent, seed=run.seed, answers=answers, summary=summarise(probe, answers)))
@@ -147,7 +142,7 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
     spec, runs = registry.task(protocol.task), learners(bench)
     met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
     followed = []
-    for run in tqdm(runs, desc="runs", leave=False, disable=not sys.stderr.isatty()):
+    for run in counted(runs, "runs", total=len(runs)):
         trained = load_trained(run, encoder=encoder)
         ends = follow(spec, met, choices(trained.agent, met, spec.n_actions))
         who = trained.spec

@@ -10,7 +10,7 @@ import pytest
 from bench_fakes import FakeRunSpec
 from test_runner import small
 
-from imagine_bench.progress import ProgressBars
+from imagine_bench.progress import ProgressBars, counted
 from imagine_bench.runs import Phase, Progress
 
 WORK = 9 + 2 * 5
@@ -70,6 +70,20 @@ def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.Capt
     assert waiting.startswith("0 of 6 runs done") and "table seed 0: waiting, training episode 4, 47 % of" in waiting
     assert done.startswith("1 of 6 runs done") and "table seed 0: done" in done
     assert again.startswith("1 of 6 runs done")
+
+
+def test_items_are_counted_when_they_are_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = iter(range(0, 1000, 10))
+    monkeypatch.setattr("imagine_bench.progress.time.monotonic", lambda: float(next(now_s)))
+    assert list(counted(iter("abcd"), "plans", total=4)) == list("abcd")
+    assert capsys.readouterr().err.splitlines() == ["2 of 4 plans", "4 of 4 plans"]
+    terminal = Terminal()
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    assert list(counted("abcd", "plans", total=4)) == list("abcd")
+    assert "plans" in terminal.getvalue() and "of 4 plans" not in terminal.getvalue()
 
 
 def test_without_a_terminal_the_end_of_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
