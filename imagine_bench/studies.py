@@ -26,9 +26,13 @@ def _pair(factor: str, value: str, settings: Mapping[str, Any], appearance: str 
     )  # fmt: skip
 
 
-_FACTORS = (
+_BASE = (
     Variant(name=_DQN, factor=BASE, agent=_DQN),
     Variant(name=_FILTERED, factor=BASE, agent=_FILTERED, against=_DQN),
+)
+
+_FACTORS = (
+    *_BASE,
     Variant(
         name="dqn, as many updates", factor="updates", agent=_DQN, against=_DQN,
         settings={"controller.updates_per_step": 5},
@@ -63,6 +67,23 @@ _FACTORS = (
     *_pair("appearance", "strong", {}, "strong"),
 )  # fmt: skip
 
+_DEVIATIONS = (
+    *_BASE,
+    _variant("networks", "dynamics 3 x 256", {"model.dynamics_hidden": (256, 256, 256)}),
+    _variant("networks", "five components", {"model.components": 5}),
+    _variant("networks", "reward 3 x 512", {"model.reward_hidden": (512, 512, 512)}),
+    _variant("networks", "ends 2 x 256", {"model.termination_hidden": (256, 256)}),
+    _variant("likelihood", "z' instead of z' - z", {"model.predict_change": False}),
+    _variant("likelihood", "sigma from 0.01", {"model.sigma_floor": 0.01}),
+    _variant("model's updates", "rate 0.001", {"model.learning_rate": 1e-3}),
+    _variant("model's updates", "sixteen a step", {"model.updates_per_step": 16}),
+    _variant("model's updates", "batches of 512", {"model.batch_size": 512}),
+    _variant("model's updates", "gradients not clipped", {"model.gradient_clip": None}),
+    _variant("model's updates", "bfloat16", {"model.precision": "bfloat16"}),
+    _variant("rollouts", "breadth 3", {"imagination.breadth": 3}),
+    _variant("rollouts", "greedy", {"imagination.exploration": 0.0}),
+)
+
 STUDIES: dict[str, Study] = {
     "factors": Study(
         name="factors",
@@ -73,6 +94,16 @@ STUDIES: dict[str, Study] = {
         appearance="mild",
         execution="kinematic",
         variants=_FACTORS,
+    ),
+    "deviations": Study(
+        name="deviations",
+        question="What is a value of the thesis worth in place of that of quick?",
+        budgets=(250, 500),
+        seeds=(1000, 1001, 1002),
+        evaluation_episodes=300,
+        appearance="mild",
+        execution="kinematic",
+        variants=_DEVIATIONS,
     ),
     "smoke": Study(
         name="smoke",

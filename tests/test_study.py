@@ -11,6 +11,8 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers its agents
 import numpy as np
 import pytest
+from imagine_bench.agents.chapter_5 import CHAPTER_5
+from imagine_bench.agents.presets import flatten
 
 from imagine_bench import runner
 from imagine_bench.cli import main
@@ -145,6 +147,22 @@ def test_the_table_says_what_helps() -> None:
         ),
     ]  # fmt: skip
     assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in study_table(STUDY, lines)
+
+
+UNSTUDIED = {
+    "imagination.weight_samples": "nothing is sampled where nothing is dropped",
+    "imagination.end_episode": "after the last budget of a study",
+}
+
+
+def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
+    varied = {name for study in STUDIES.values() for variant in study.variants for name in variant.settings}
+    deviations = set(CHAPTER_5.presets["quick"])
+    assert deviations - varied == UNSTUDIED.keys()
+    for variant in STUDIES["deviations"].variants:
+        for name, value in variant.settings.items():
+            if name != "model.precision":  # the thesis' is that of the machine
+                assert value == flatten(CHAPTER_5.thesis)[name] != CHAPTER_5.presets["quick"][name].value
 
 
 def test_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
