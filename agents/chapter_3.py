@@ -29,17 +29,15 @@ _THESIS = Settings(
 
 _QUICK: dict[str, Deviation] = {
     "model.members": Deviation(3, "the filter compares networks; chapter 3 has no dropout to draw them from"),
-    "model.updates_per_step": Deviation(1, "CPU time: one update of 256 rows costs a third of four of 64"),
+    "model.updates_per_step": Deviation(1, "CPU time: one update of 256 rows for four of 64"),
     "model.batch_size": Deviation(256, "as many rows a real step as the thesis' four updates; see updates_per_step"),
-    "model.sigma_floor": Deviation(0.05, "below the encoder's own spread (0.11 to 0.17) nothing is left to learn"),
+    "model.sigma_floor": Deviation(0.05, "below the encoder's own spread nothing is left to learn"),
     "controller.learning_rate": Deviation(1e-3, "imagined practice is short: a fresh controller learns on 3,000 steps"),
     "controller.target_rate": Deviation(0.02, "without a target network the values of a long chat with a human swing"),
     "controller.epsilon_decay": Deviation(
         0.001, "0.03 ends exploration after 100 steps, and the model never sees most of the 36 wrong macro-actions"
     ),
-    "imagination.threshold": Deviation(
-        0.1, "latents of unit variance, distinct pictures at least 1 apart: a tenth is doubt"
-    ),
+    "imagination.threshold": Deviation(0.1, "latents have unit variance: a tenth of it is doubt"),
 }
 
 _SMOKE: dict[str, Deviation] = {

@@ -45,13 +45,13 @@ PRESETS: dict[str, dict[str, Deviation]] = {
     "smoke": {
         "epochs": Deviation(20, "shows that every part works, within a minute"),
         "batch_size": _BATCH,
-        "learning_rate": Deviation(3e-3, "a tenth of the epochs want larger steps"),
+        "learning_rate": Deviation(3e-3, "so few epochs want larger steps"),
         "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
     },
     "quick": {
         "epochs": Deviation(600, "CPU time"),
         "batch_size": _BATCH,
-        "learning_rate": Deviation(3e-3, "a fifth of the epochs want larger steps"),
+        "learning_rate": Deviation(3e-3, "fewer epochs want larger steps"),
         "final_rate": _FALLING,
         "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
     },
