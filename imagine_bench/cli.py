@@ -89,16 +89,18 @@ class Bench:
     out: Path = Path("runs")
     """Folder of all benches."""
 
-    def __call__(self) -> None:
-        """Plan, run, report."""
+    def planned(self) -> tuple[Any, Any]:
+        """The protocol of what it would run, and the encoders, checked."""
         names = (
             "agents", "seeds", "budgets", "evaluation_episodes", "execution", "appearance", "variants", "networks",
             "encoder", "after", "after_episodes", "demonstrations", "questions",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) not in ((), None)}
-        wanted, encoder = plan(
-            self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options
-        )
+        return plan(self.task, self.preset, device=self.device, overrides=parse_settings(self.set), **options)
+
+    def __call__(self) -> None:
+        """Plan, run, report."""
+        wanted, encoder = self.planned()
         where = launcher(self.launcher, self.workers, self.abreast)
         _show(bench(wanted, encoder, root=self.out, launcher=where).folder)
 
