@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.kinds import KINDS
 from imagine_bench.partial import largest_part
 from imagine_bench.results import BenchResult, Checkpoint, RunResult
 from imagine_bench.store import read_protocol
@@ -33,9 +34,15 @@ def load_archive(folder: Path) -> BenchResult:
     """Read such a folder.
 
     Raises:
-        ArtefactError: It is damaged, or not of agents; the message names the file.
+        ArtefactError: It is damaged; the message names the file.
+        InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
+    if whole.task not in KINDS["control"].tasks:
+        raise InvalidValueError(
+            f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents that "
+            "act have a report. The command in its environment.json makes the bench anew, with one."
+        )
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     try:
         for row in csv.DictReader(io.StringIO(path.read_text())):

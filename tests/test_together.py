@@ -156,6 +156,12 @@ def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Pat
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
 
 
+def test_kept_results_of_a_regression_bench_are_said_to_have_no_report(capsys: pytest.CaptureFixture[str]) -> None:
+    kept = Path(__file__).parents[1] / "docs/results/toy_regression-quick"
+    assert main(["report", str(kept)]) == 2
+    assert "keeps a bench of toy_regression, whose tables are its .csv files" in capsys.readouterr().err
+
+
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
     (second / "results.csv").write_text("agent,seed,episodes\nrandom,0,many\n")
