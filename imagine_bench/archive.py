@@ -40,8 +40,8 @@ def load_archive(folder: Path) -> BenchResult:
     path, whole = folder / _RESULTS, read_protocol(folder)
     if whole.task not in KINDS["control"].tasks:
         raise InvalidValueError(
-            f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents that "
-            "act have a report. The command in its environment.json makes the bench anew, with one."
+            f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
+            "that act have a report. The command in its environment.json makes the bench anew, with one."
         )
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     try:
