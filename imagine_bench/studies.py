@@ -84,41 +84,37 @@ _DEVIATIONS = (
     _variant("rollouts", "greedy", {"imagination.exploration": 0.0}),
 )
 
-STUDIES: dict[str, Study] = {
-    "factors": Study(
-        name="factors",
-        question="When does imagination help? One factor at a time",
-        budgets=(250, 500),
-        seeds=(1000, 1001, 1002),
-        evaluation_episodes=300,
-        appearance="mild",
-        execution="kinematic",
-        variants=_FACTORS,
-    ),
-    "deviations": Study(
-        name="deviations",
-        question="What is a value of the thesis worth in place of that of quick?",
-        budgets=(250, 500),
-        seeds=(1000, 1001, 1002),
-        evaluation_episodes=300,
-        appearance="mild",
-        execution="kinematic",
-        variants=_DEVIATIONS,
-    ),
-    "smoke": Study(
-        name="smoke",
-        question="Does every part of a study work?",
-        budgets=(5,),
-        seeds=(1000, 1001),
-        evaluation_episodes=5,
-        appearance="clean",
-        execution="kinematic",
-        variants=(
-            Variant(name="dqn", factor=BASE, agent=_DQN),
-            Variant(
-                name="dqn, more updates", factor="updates", agent=_DQN, against="dqn",
-                settings={"controller.updates_per_step": 2},
-            ),
+
+def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
+    """At low budgets, where agents differ most."""
+    return Study(
+        name=name, question=question, budgets=(250, 500), seeds=(1000, 1001, 1002), evaluation_episodes=300,
+        appearance="mild", execution="kinematic", variants=variants,
+    )  # fmt: skip
+
+
+_SMOKE = Study(
+    name="smoke",
+    question="Does every part of a study work?",
+    budgets=(5,),
+    seeds=(1000, 1001),
+    evaluation_episodes=5,
+    appearance="clean",
+    execution="kinematic",
+    variants=(
+        Variant(name="dqn", factor=BASE, agent=_DQN),
+        Variant(
+            name="dqn, more updates", factor="updates", agent=_DQN, against="dqn",
+            settings={"controller.updates_per_step": 2},
         ),
     ),
-}  # fmt: skip
+)  # fmt: skip
+
+STUDIES: dict[str, Study] = {
+    study.name: study
+    for study in (
+        _study("factors", "When does imagination help? One factor at a time", _FACTORS),
+        _study("deviations", "What is a value of the thesis worth in place of that of quick?", _DEVIATIONS),
+        _SMOKE,
+    )
+}
