@@ -164,6 +164,10 @@ class Imagination:
         doubt = None if weights.reward is None else model.reward_doubt(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, doubt)
 
+    def likeliest(self, z: Tensor, action: Tensor, weights: Weights) -> Tensor:
+        """What :meth:`step` would draw least surprisingly: the mean of the likeliest component. Shape (N, Z)."""
+        return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
+
     def score(self, variances: Tensor) -> Tensor:
         """Reduce variances (..., Z) as the filter does. Shape (...)."""
         return self._reduce(variances)

@@ -71,6 +71,18 @@ class ImaginingLearner(Learner):
             self.imagination, encoder, frames, actions, follow=follow, samples=samples, depth=depth, rng=rng
         )
 
+    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        """The likeliest results of actions; see :class:`imagine_bench.capabilities.Forecaster`."""
+        z = torch.stack([self.perception.posterior(frame)[0] for frame in frames])  # [N, Z]
+        weights = self.imagination.draw_weights(torch.Generator(z.device).manual_seed(int(rng.integers(2**63))))
+        likeliest = self.imagination.likeliest(z, torch.as_tensor(actions, device=z.device), weights)
+        return self.perception.encoder.read_macrostate(likeliest)
+
+    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """What the real memory holds; see :class:`imagine_bench.capabilities.Rememberer`."""
+        rows = self.real.arrays()
+        return self.perception.encoder.read_macrostate(torch.as_tensor(rows["mu"])), rows["action"].astype(np.int64)
+
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator
     ) -> Iterator[tuple[Tensor, Tensor, Imagined]]:

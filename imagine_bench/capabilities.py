@@ -151,6 +151,35 @@ class Imaginer(Protocol):
         """
 
 
+@runtime_checkable
+class Forecaster(Protocol):
+    """An agent whose model names what it holds likeliest, apart from what it draws when it imagines."""
+
+    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        """The likeliest result of one macro-action from each of N real frames; changes nothing in the agent.
+
+        Args:
+            frames: Shape (N, 64, 64, 3).
+            actions: Shape (N,).
+            rng: Draws dropout masks.
+
+        Returns:
+            Macrostates, as an evaluation-only probe reads them. Shape (N, M).
+        """
+
+
+@runtime_checkable
+class Rememberer(Protocol):
+    """An agent that can say which transitions it learns from."""
+
+    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Where it acted, as an evaluation-only probe reads it, and what it did, for each real transition it remembers.
+
+        Returns:
+            Macrostates (N, M) and actions (N,).
+        """
+
+
 def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: int) -> list[int] | None:
     """What an :class:`Imaginer` is to imagine: the first ``depth`` of the actions, or None for its own choice.
 

@@ -184,7 +184,7 @@ class _OfBench:
 
 @dataclass(frozen=True, kw_only=True)
 class Generalise(_OfBench):
-    """Ask the trained models for transitions that no training can contain: those out of terminal macrostates."""
+    """Ask the models of a bench, finished or not, for every transition: also those that no training can contain."""
 
     def __call__(self) -> None:
         """Ask and report."""

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.capabilities import Imaginer
 from imagine_bench.environment import describe_environment
-from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.generalisation import answer, probing, summarise
+from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
+from imagine_bench.generalisation import Probing, answer, probing, summarise
 from imagine_bench.interfaces import EXECUTIONS
 from imagine_bench.kinds import kind_of
 from imagine_bench.plans import make_plans, require_threshold
@@ -22,7 +23,7 @@ from imagine_bench.report.plans import plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.seeding import SeedTree, exam
 from imagine_bench.store import load_bench, newest_bench, read_protocol
-from imagine_bench.trained import Trained, best_run, imagining, learners, load_trained, require_control, require_runs
+from imagine_bench.trained import Trained, best_run, learners, load_trained, require_control, require_runs
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -91,6 +92,8 @@ def plan_report(
 def generalisation_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
     """Ask every imagining run of a bench for every transition, and leave the answers in its folder.
 
+    An unfinished bench will do: every run is asked as its last checkpoint left it.
+
     Args:
         folder: A bench's folder; None for the newest.
         root: Folder of all benches.
@@ -101,23 +104,31 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
         What to print.
 
     Raises:
-        ImagineBenchError: No bench, or none that imagines.
+        ImagineBenchError: No bench, or none with an agent that imagines.
     """
-    result = load_bench(_bench_of_agents(folder, root, task))
-    protocol = result.protocol
-    spec = registry.task(protocol.task)
+    bench = _bench_of_agents(folder, root, task)
+    protocol = read_protocol(bench)
+    spec, runs = registry.task(protocol.task), learners(bench)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
     asked = []
-    runs = imagining(result)
     for run in counted(runs, "runs", total=len(runs)):
-        trained = load_trained(run.folder, encoder=encoder)
-        answers = answer(trained.imaginer, probe, SeedTree(run.seed).child("generalisation"))
-        asked.append(Asked(agent=run.agent, seed=run.seed, answers=answers, summary=summarise(probe, answers)))
-    where = result.folder / "generalisation"
-    facts = {**_origin(protocol.hash), "episodes": protocol.budgets[-1], "appearance": protocol.appearance}
+        trained = load_trained(run, encoder=encoder)
+        if isinstance(trained.agent, Imaginer):
+            asked.append(_asked(trained, probe))
+    if not asked:
+        raise ArtefactError(f"No agent of {bench} imagines; give a bench with one that does.")
+    where = bench / "generalisation"
+    facts = {**_origin(protocol.hash), "appearance": protocol.appearance, "frames": "kinematic"}
     write_generalisation(where, asked, probe, spec, facts)
-    head = f"{spec.title}, {protocol.appearance}, after {protocol.budgets[-1]:,} real episodes"
+    head = f"{spec.title}, {protocol.appearance}"
     return "\n".join([head, "", generalisation_table(asked, probe, spec), "", f"Answers:    {where}"])
+
+
+def _asked(trained: Trained, probe: Probing) -> Asked:
+    who = trained.spec
+    answers = answer(trained.imaginer, probe, SeedTree(who.seed).child("generalisation"))
+    summary = summarise(probe, answers)
+    return Asked(agent=who.agent, seed=who.seed, episodes=trained.episodes, answers=answers, summary=summary)
 
 
 def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:

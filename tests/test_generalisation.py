@@ -85,6 +85,40 @@ def test_marks_by_what_comes_of_it(spec: TaskSpec, probe: Probing) -> None:
         assert (marks[name].right, marks[name].end_right, marks[name].reward_error) == (1.0, 1.0, pytest.approx(0.0))
 
 
+class Expert(Cheat):
+    """Also says what it holds likeliest, which is right where it had the transition, and what it had."""
+
+    def __init__(self, probe: Probing, wrong: NDArray[np.bool_], times: NDArray[np.int64]) -> None:
+        super().__init__(probe, wrong)
+        self.times = times
+
+    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        assert np.array_equal(frames, self.probe.frames) and np.array_equal(actions, self.probe.actions)
+        truths = np.array([truth.macrostate for (truth,) in self.probe.possible])
+        return np.where(self.times[:, None] > 0, truths, self.probe.macrostates)
+
+    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return self.probe.macrostates.repeat(self.times, axis=0), self.probe.actions.repeat(self.times)
+
+
+def test_marks_by_how_often_a_transition_was_had(spec: TaskSpec, probe: Probing) -> None:
+    seen = np.flatnonzero(~probe.terminal)
+    times = np.zeros(len(probe.actions), dtype=np.int64)
+    times[seen[:100]], times[seen[100:200]], times[seen[200:203]] = 1, 9, 10
+    wrong = np.isin(np.arange(len(times)), [*seen[:50], *seen[200:202]])
+    answers = answer(Expert(probe, wrong, times), probe, SeedTree(0))
+    assert np.array_equal(answers.times, times)
+    found = summarise(probe, answers)
+    assert (found.unseen_likeliest, found.seen_likeliest) == (0.0, pytest.approx(203 / 324))
+    assert (found.unseen, found.seen) == (1.0, pytest.approx(272 / 324))
+    assert [dataclasses.astuple(part) for part in found.experience.values()] == [
+        (121, 1.0, 0.0), (200, 0.75, 1.0), (3, pytest.approx(1 / 3), 1.0),
+    ]  # fmt: skip
+    asked = [Asked(agent="imagination", seed=0, episodes=9, answers=answers, summary=found)]
+    table = generalisation_table(asked, probe, spec)
+    assert "| imagination, 9 episodes | 1 to 9 times | 200 | 75.0 | 100.0 |" in table
+
+
 def test_rules_that_leave_it_open() -> None:
     end = Outcome(probability=0.5, macrostate=(0,), reward=0.0, terminated=True, success=False)
     on = dataclasses.replace(end, terminated=False)
@@ -107,10 +141,13 @@ def test_a_task_without_terminal_macrostates_says_so(spec: TaskSpec) -> None:
 def test_table_and_files(spec: TaskSpec, probe: Probing, tmp_path: Path) -> None:
     answers = answer(Cheat(probe, probe.terminal & probe.legal), probe, SeedTree(0))
     asked = [
-        Asked(agent="imagination", seed=seed, answers=answers, summary=summarise(probe, answers)) for seed in (0, 1)
+        Asked(agent="imagination", seed=seed, episodes=9, answers=answers, summary=summarise(probe, answers))
+        for seed in (0, 1)
     ]
     table = generalisation_table(asked, probe, spec)
-    assert "828 transitions out of terminal macrostates, 324 others; mean of 2 seed(s)" in table
+    assert "828 transitions out of terminal macrostates, 324 others; mean over seeds" in table
+    assert "| imagination, 9 episodes (2 seed(s)) | thesis |" in table
+    assert "remembers" not in table and "| – |" in table  # what this agent cannot say
     assert "| 87.0 [87.0, 87.0] | 75 (of 20) |" in table  # 720 of 828
     write_generalisation(tmp_path / "out", asked, probe, spec, {})
     rows = (tmp_path / "out" / "transitions.csv").read_text().splitlines()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from imagine_bench.agents import mixture as mdn
@@ -92,6 +93,16 @@ def test_temperature_zero_gives_the_mean_of_a_component_and_scales_the_noise() -
     warm, half = (mdn.sample(mixture, t, torch.Generator().manual_seed(5)) for t in (1.0, 0.5))
     torch.testing.assert_close(half - cold, 0.5 * (warm - cold))
     assert (warm != cold).all()
+
+
+def test_the_likeliest_value_is_the_mean_of_the_largest_component() -> None:
+    mixture = random_mixture(2, N)
+    found = mdn.likeliest(mixture)
+    for pair in np.ndindex(2, N):
+        assert torch.equal(found[pair], mixture.means[pair][int(mixture.log_weights[pair].argmax())])
+    draws = [mdn.sample(mixture.map(lambda part: part[0]), 0.0, torch.Generator().manual_seed(s)) for s in range(99)]
+    distances = (torch.stack(draws) - found[0]).abs().sum(-1)  # [99, N]
+    assert 0.2 < (distances == 0.0).double().mean() < 1.0  # it is drawn, and so are others
 
 
 def test_average_over_weight_samples_averages_coefficients_means_and_variances() -> None:

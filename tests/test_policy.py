@@ -23,6 +23,7 @@ from imagine_bench.interfaces import Observation, TaskSpec
 from imagine_bench.plans import fewest_actions
 from imagine_bench.policy import FRAMES, Ends, Situations, choices, follow, optimal_length, situations
 from imagine_bench.protocol import protocol
+from imagine_bench.quality import generalisation_report
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.rules import greedy
 from imagine_bench.trained import learners, load_trained
@@ -219,6 +220,16 @@ def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytes
     said = capsys.readouterr().out
     assert "| table | 9 | 2 |" in said and "| imaginer | 9 | 1 |" in said and str(folder / "policy") in said
     assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
+    assert main(["generalise", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "imaginer, 9 episodes (1 seed(s))" in said and str(folder / "generalisation") in said
+    assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 192 * 6
+
+
+def test_a_bench_without_an_imagining_agent_has_no_model_to_ask(tmp_path: Path) -> None:
+    result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
+    with pytest.raises(ArtefactError, match=r"No agent of .* imagines"):
+        generalisation_report(result.folder, root=tmp_path, task=None, encoder=None)
 
 
 @pytest.mark.parametrize(
