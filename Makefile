@@ -32,7 +32,7 @@ peers: $(READY)  ## Train a library's agents on TASK, with the budgets and tests
 plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
 	@$(BIN)/imagine-bench plan --task $(TASK) $(ARGS)
 
-generalise: $(READY)  ## Ask the newest bench's models for transitions that no training can contain
+generalise: $(READY)  ## Ask the newest bench's models for every transition, also those that no training can contain
 	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
 
 policy: $(READY)  ## Follow the policies of the newest bench's learners from every start by the rules

@@ -18,9 +18,9 @@ from imagine_bench.agents.imagine.planner import Planner
 from imagine_bench.agents.imagine.settings import DynamicsSettings, ImagineSettings, OutcomeSettings, resolve
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Imaginer, ValueReader
+from imagine_bench.capabilities import Answer, Imaginer, Rememberer, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import AgentState, Observation
+from imagine_bench.interfaces import AgentState, Observation, Transition
 
 
 def same(first: AgentState, second: AgentState) -> bool:
@@ -251,6 +251,30 @@ def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothi
     assert (greedy.p_terminated[:-1] <= 0.5).all()
     with pytest.raises(InvalidValueError, match="must lie in"):
         learner.imagine(frame((0, 1, 0)), actions=np.array([9]), depth=1, rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("factored", [True, False])
+def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored: bool) -> None:
+    learner = agent(dynamics__factored=factored)
+    assert isinstance(learner, Rememberer)
+    assert [len(part) for part in learner.remembered()] == [0, 0]
+    done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
+    for code, action in done:
+        following, reward, terminated = fake_codes.step(code, action)
+        learner.observe(
+            Transition(
+                observation=Observation(frame=frame(code)),
+                action=action,
+                reward=reward,
+                next_observation=Observation(frame=frame(following)),
+                terminated=terminated,
+                truncated=False,
+            ),
+            episode=0,
+        )
+    learner.learn_answer(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
+    macrostates, actions = learner.remembered()
+    assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
 
 
 def test_curiosity_outlearns_random_exploration() -> None:

@@ -19,7 +19,7 @@ from ..perception import load_perception, prepare_torch
 from ..presets import flatten
 from .memory import CodeMemory, CodeTransition
 from .model import StructuredModel, as_codes
-from .pictures import Imagined, picture
+from .pictures import Imagined, one_hot, picture
 from .planner import Planner
 from .questions import last_step, question
 from .settings import ImagineSettings, resolve
@@ -191,6 +191,14 @@ class ImagineAgent:
                 break
             code = self._modelled(steps[-1].code)
         return picture(self.encoder, start, steps)
+
+    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """What it did, answers of a teacher not counted; see :class:`imagine_bench.capabilities.Rememberer`."""
+        rows = [row for row in self.memory.since(0) if row.moves]
+        codes = np.array([self._observed(row.code) for row in rows], dtype=np.int64)
+        sizes = self.encoder.card.code_sizes
+        macrostates = self.encoder.read_macrostate(one_hot(codes.reshape(-1, len(sizes)), sizes))
+        return macrostates, np.array([row.action for row in rows], dtype=np.int64)
 
     def _imagined(self, code: tuple[int, ...], action: int | None, rng: np.random.Generator) -> Imagined:
         """One imagined step of ``action``, or of the greedy one."""

@@ -43,8 +43,7 @@ class Imagined:
 
 def picture(encoder: Encoder, start: tuple[int, ...], steps: Sequence[Imagined]) -> ImaginedRollout:
     """The rollout that bench and recordings show: codes decoded to pictures, and read by the evaluation's probe."""
-    sizes = encoder.card.code_sizes
-    latents = torch.stack([_one_hot(code, sizes) for code in (start, *(step.code for step in steps))])
+    latents = one_hot(np.array([start, *(step.code for step in steps)]), encoder.card.code_sizes)
     frames = encoder.decode(latents)
     unknown = np.array([step.unknown for step in steps], dtype=np.float32)
     return ImaginedRollout(
@@ -62,6 +61,7 @@ def picture(encoder: Encoder, start: tuple[int, ...], steps: Sequence[Imagined])
     )
 
 
-def _one_hot(code: tuple[int, ...], sizes: tuple[int, ...]) -> torch.Tensor:
-    parts = [functional.one_hot(torch.tensor(value), size) for value, size in zip(code, sizes, strict=True)]
-    return torch.cat(parts).float()
+def one_hot(codes: NDArray[np.int64], sizes: tuple[int, ...]) -> torch.Tensor:
+    """Codes (N, P), whose parts have so many values, as what the encoder decodes. Shape (N, sum(sizes))."""
+    parts = zip(torch.as_tensor(codes).unbind(dim=1), sizes, strict=True)
+    return torch.cat([functional.one_hot(part, size) for part, size in parts], dim=1).float()
