@@ -117,6 +117,7 @@ def test_marks_by_how_often_a_transition_was_had(spec: TaskSpec, probe: Probing)
     asked = [Asked(agent="imagination", seed=0, episodes=9, answers=answers, summary=found)]
     table = generalisation_table(asked, probe, spec)
     assert "| imagination, 9 episodes | 1 to 9 times | 200 | 75.0 | 100.0 |" in table
+    assert "of all these by what the model holds likeliest, instead of what it draws, % | 0.0 | – |" in table
 
 
 def test_rules_that_leave_it_open() -> None:
@@ -147,7 +148,7 @@ def test_table_and_files(spec: TaskSpec, probe: Probing, tmp_path: Path) -> None
     table = generalisation_table(asked, probe, spec)
     assert "828 transitions out of terminal macrostates, 324 others; mean over seeds" in table
     assert "| imagination, 9 episodes (2 seed(s)) | thesis |" in table
-    assert "remembers" not in table and "| – |" in table  # what this agent cannot say
+    assert "remembers" not in table and "likeliest" not in table  # what this agent cannot say
     assert "| 87.0 [87.0, 87.0] | 75 (of 20) |" in table  # 720 of 828
     write_generalisation(tmp_path / "out", asked, probe, spec, {})
     rows = (tmp_path / "out" / "transitions.csv").read_text().splitlines()

@@ -59,7 +59,8 @@ def generalisation_table(asked: Sequence[Asked], probe: Probing, task: TaskSpec)
     for name, words in _ROWS.items():
         cells = [_cell([getattr(run, name) for run in runs], name) for runs in groups.values()]
         there = f"{thesis['correct']} (of {thesis['attempted']})" if name == "unseen" and thesis else "–"
-        lines.append(f"| {words} | {' | '.join(cells)} | {there} |")
+        if any(cell != "–" for cell in (*cells, there)):
+            lines.append(f"| {words} | {' | '.join(cells)} | {there} |")
     return "\n".join([*lines, "", *_consequence_lines(groups), *_experience_lines(groups)])
 
 
