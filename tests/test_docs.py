@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -46,3 +47,10 @@ def test_commands_could_be_carried_out() -> None:
             command.planned()
             benches += 1
     assert benches > 20
+
+
+def test_kept_numbers_are_what_every_json_reader_can_read() -> None:
+    files = sorted((ROOT / "docs" / "results").rglob("*.json"))
+    assert len(files) > 100
+    for file in files:
+        json.loads(file.read_text(), parse_constant=lambda word, file=file: pytest.fail(f"{file} holds {word}"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -151,5 +152,7 @@ def test_table_and_files(spec: TaskSpec, probe: Probing, tmp_path: Path) -> None
     assert "remembers" not in table and "likeliest" not in table  # what this agent cannot say
     assert "| 87.0 [87.0, 87.0] | 75 (of 20) |" in table  # 720 of 828
     write_generalisation(tmp_path / "out", asked, probe, spec, {})
+    runs = json.loads((tmp_path / "out" / "summary.json").read_text(), parse_constant=pytest.fail)["runs"]
+    assert [(run["seed"], run["unseen_likeliest"], run["seen"]) for run in runs] == [(0, None, 1.0), (1, None, 1.0)]
     rows = (tmp_path / "out" / "transitions.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * 192 * 6

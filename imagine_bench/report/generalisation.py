@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -124,11 +125,20 @@ def write_generalisation(
     make_folder(folder)
     runs = [{"agent": one.agent, "seed": one.seed, "episodes": one.episodes, **asdict(one.summary)} for one in asked]
     write_bytes(folder / "transitions.csv", _csv(asked, probe).encode())
-    write_json(folder / "summary.json", {**facts, "runs": runs})
+    write_json(folder / "summary.json", {**facts, "runs": _with_null(runs)})
     origin = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
     table = generalisation_table(asked, probe, task)
     page = f"# {task.title}: transitions that no training can contain\n\n{table}\n\n{origin}.\n"
     write_bytes(folder / "generalisation.md", page.encode())
+
+
+def _with_null(value: Any) -> Any:
+    """NaN as None, all the way down: JSON has a word for what is unknown, and none for what is no number."""
+    if isinstance(value, dict):
+        return {name: _with_null(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_with_null(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _number(values: NDArray[np.bool_] | NDArray[np.int64] | None, index: int) -> str:
