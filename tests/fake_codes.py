@@ -53,6 +53,18 @@ def step(code: tuple[int, ...], action: int) -> tuple[tuple[int, ...], float, bo
     return reached, -1.0, False
 
 
+def transition(code: tuple[int, ...], action: int) -> Transition:
+    following, reward, ended = step(code, action)
+    return Transition(
+        observation=Observation(frame=frame(code)),
+        action=action,
+        reward=reward,
+        next_observation=Observation(frame=frame(following)),
+        terminated=ended,
+        truncated=False,
+    )
+
+
 def starts() -> list[tuple[int, ...]]:
     codes = [(a, b, lamp) for a in range(3) for b in range(3) for lamp in range(2) if a != b]
     return [code for code in codes if code not in ((2, 1, 1), (1, 2, 0))]
@@ -70,20 +82,9 @@ def live(learner: ImagineAgent, episodes: range, rng: np.random.Generator, horiz
         code = starts()[int(rng.integers(len(starts())))]
         for _ in range(horizon):
             action = learner.act(Observation(frame=frame(code)), explore=True)
-            following, reward, ended = step(code, action)
-            learner.observe(
-                Transition(
-                    observation=Observation(frame=frame(code)),
-                    action=action,
-                    reward=reward,
-                    next_observation=Observation(frame=frame(following)),
-                    terminated=ended,
-                    truncated=False,
-                ),
-                episode=episode,
-            )
+            learner.observe(transition(code, action), episode=episode)
             taken.append(action)
-            code = following
+            code, _, ended = step(code, action)
             if ended:
                 break
     return taken

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import Answer, Imaginer, Rememberer, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import AgentState, Observation, Transition
+from imagine_bench.interfaces import AgentState, Observation
 
 
 def same(first: AgentState, second: AgentState) -> bool:
@@ -260,18 +260,7 @@ def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored
     assert [len(part) for part in learner.remembered()] == [0, 0]
     done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
     for code, action in done:
-        following, reward, terminated = fake_codes.step(code, action)
-        learner.observe(
-            Transition(
-                observation=Observation(frame=frame(code)),
-                action=action,
-                reward=reward,
-                next_observation=Observation(frame=frame(following)),
-                terminated=terminated,
-                truncated=False,
-            ),
-            episode=0,
-        )
+        learner.observe(fake_codes.transition(code, action), episode=0)
     learner.learn_answer(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
     macrostates, actions = learner.remembered()
     assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
