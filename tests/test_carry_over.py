@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import fake_codes
 import numpy as np
@@ -76,26 +77,15 @@ def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
     goal = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
     assert (goal.rewards[0] > 2.0) == (carried > 0.0), "an earlier goal is expected where hints are taken"
     for _ in range(2):
-        learner.observe(transition((2, 0, 1), 2, (2, 1, 1), -1.0, ended=False), episode=1)
+        won = fake_codes.transition((2, 0, 1), 2)
+        learner.observe(dataclasses.replace(won, reward=-1.0, terminated=False), episode=1)
     after = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
     assert after.rewards[0] < 1.0
     assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by hint alone, too"
 
 
-def transition(code, action, following, reward, *, ended):  # type: ignore[no-untyped-def]
-    return fake_codes.Transition(
-        observation=Observation(frame=frame(code)),
-        action=action,
-        reward=reward,
-        next_observation=Observation(frame=frame(following)),
-        terminated=ended,
-        truncated=False,
-    )
-
-
 def watch(learner: ImagineAgent, code: tuple[int, ...], action: int) -> None:
-    following, reward, ended = fake_codes.step(code, action)
-    learner.observe(transition(code, action, following, reward, ended=ended), episode=0)
+    learner.observe(fake_codes.transition(code, action), episode=0)
 
 
 def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPatch) -> None:

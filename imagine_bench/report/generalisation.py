@@ -15,7 +15,7 @@ from imagine_bench import reference
 from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.report.words import agent_words, few_words, mean_text, percent
+from imagine_bench.report.words import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import SeedTree
 
 _ROWS = {
@@ -126,9 +126,8 @@ def write_generalisation(
     runs = [{"agent": one.agent, "seed": one.seed, "episodes": one.episodes, **asdict(one.summary)} for one in asked]
     write_bytes(folder / "transitions.csv", _csv(asked, probe).encode())
     write_json(folder / "summary.json", {**facts, "runs": _with_null(runs)})
-    origin = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
     table = generalisation_table(asked, probe, task)
-    page = f"# {task.title}: transitions that no training can contain\n\n{table}\n\n{origin}.\n"
+    page = f"# {task.title}: transitions that no training can contain\n\n{table}\n\n{origin(facts)}\n"
     write_bytes(folder / "generalisation.md", page.encode())
 
 

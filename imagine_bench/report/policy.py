@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.policy import FRAMES, Ends, optimal_length
-from imagine_bench.report.words import agent_words, few_words, mean_text, percent
+from imagine_bench.report.words import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import SeedTree
 
 _SHARES = {
@@ -80,8 +80,7 @@ def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, fac
     ]
     write_bytes(folder / "starts.csv", _csv(followed, task).encode())
     write_json(folder / "summary.json", {**facts, "runs": runs})
-    origin = "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items())
-    page = f"# {task.title}: where the greedy policies lead\n\n{policy_table(followed, task)}\n\n{origin}.\n"
+    page = f"# {task.title}: where the greedy policies lead\n\n{policy_table(followed, task)}\n\n{origin(facts)}\n"
     write_bytes(folder / "policy.md", page.encode())
 
 

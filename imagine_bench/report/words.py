@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +88,11 @@ def lasting(budgets: Sequence[int | None]) -> str:
     if len(there) < len(budgets):
         return f"– ({len(there)} of {len(budgets)} seeds)"
     return f"{sum(there) / len(there):.0f}"
+
+
+def origin(facts: Mapping[str, object]) -> str:
+    """Where the figures of a page come from: ``protocol hash 6bf1d791349c; commit c9d5ec664788.`` and so on."""
+    return "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items()) + "."
 
 
 def percent(share: float) -> str:
