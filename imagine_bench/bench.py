@@ -171,7 +171,7 @@ def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Fa
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
-    entry = registry.AGENTS.get(agent)  # regressors have no encoder and rest nowhere
+    entry = registry.agents().get(agent)  # regressors have no encoder and rest nowhere
     needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
     rests = until if entry is not None and not entry.trains_itself else None
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=rests)

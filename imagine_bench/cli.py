@@ -299,7 +299,7 @@ class List:
 
         for title, names in {
             **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
-            **{f"{name} learners": kind.learners for name, kind in KINDS.items()},
+            **{f"{name} learners": kind.learners() for name, kind in KINDS.items()},
             **{f"{name} presets": registry.load(kind.presets) for name, kind in KINDS.items()},
             "studies": STUDIES,
             "executions": EXECUTIONS,

@@ -73,10 +73,10 @@ def _changes(top: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, this package and the packages that decide its numbers, read without importing them."""
+    """Versions of Python, this package, those that decide its numbers and those that offer agents; imports none."""
     found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
     needed = {package: installed(package) for package in PACKAGES}
-    optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
+    optional = {package: installed(package) for package in (*OPTIONAL_PACKAGES, *registry.agent_packages())}
     return {**found, **needed, **{package: version for package, version in optional.items() if version != "missing"}}
 
 

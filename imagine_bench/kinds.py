@@ -7,7 +7,7 @@ regressors. Launchers, locks, run folders, progress, store and command line are 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ class Kind:
 
     Attributes:
         tasks: Its registered tasks.
-        learners: Its registered agents or regressors.
+        learners: Function that gives its agents or regressors, by name.
         draws: Whether its runs need OpenGL.
         protocol: The class of its protocols.
         presets: What each protocol preset changes, by name.
@@ -35,7 +35,7 @@ class Kind:
     """
 
     tasks: Mapping[str, Any]
-    learners: Mapping[str, Any]
+    learners: Callable[[], Mapping[str, Any]]
     draws: bool
     protocol: str
     presets: str
@@ -51,7 +51,7 @@ class Kind:
 KINDS: dict[str, Kind] = {
     "control": Kind(
         tasks=registry.TASKS,
-        learners=registry.AGENTS,
+        learners=registry.agents,
         draws=True,
         protocol="imagine_bench.protocol:Protocol",
         presets="imagine_bench.protocol:PRESETS",
@@ -65,7 +65,7 @@ KINDS: dict[str, Kind] = {
     ),
     "regression": Kind(
         tasks=registry.REGRESSIONS,
-        learners=registry.REGRESSORS,
+        learners=lambda: registry.REGRESSORS,
         draws=False,
         protocol="imagine_bench.regression.protocol:RegressionProtocol",
         presets="imagine_bench.regression.protocol:PRESETS",

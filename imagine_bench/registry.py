@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
 
@@ -124,6 +126,9 @@ AGENTS: dict[str, AgentEntry] = {
 }
 
 
+AGENT_GROUP = "imagine_bench.agents"
+"""Entry points in which installed packages offer agents of their own, each the ``"module:attr"`` of an AgentEntry."""
+
 DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 
@@ -179,6 +184,41 @@ def load(target: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
+def agents() -> dict[str, AgentEntry]:
+    """All agents by name: this suite's, and those that installed packages offer.
+
+    Raises:
+        SetupError: A package offers something that is no agent, or under a name that is taken; the message names it.
+    """
+    return {**AGENTS, **_offered()}
+
+
+@functools.cache
+def _offered() -> dict[str, AgentEntry]:
+    found: dict[str, AgentEntry] = {}
+    for point in entry_points(group=AGENT_GROUP):
+        found[point.name] = _offered_entry(point, taken={*AGENTS, *found})
+    return found
+
+
+def _offered_entry(point: EntryPoint, taken: Collection[str]) -> AgentEntry:
+    offer = f"The package {point.dist.name if point.dist else point.module} offers {point.value} as agent {point.name}"
+    if point.name in taken:
+        raise SetupError(f"{offer}, a name that is taken; give it another, or uninstall the package.")
+    try:
+        entry = point.load()
+    except (ImportError, AttributeError) as error:
+        raise SetupError(f"{offer}, which cannot be loaded ({error}); mend or uninstall the package.") from error
+    if not isinstance(entry, AgentEntry):
+        raise SetupError(f"{offer}, which is {entry!r} and no AgentEntry; mend or uninstall the package.")
+    return entry
+
+
+def agent_packages() -> tuple[str, ...]:
+    """Names of the installed packages that offer agents; none of them is imported."""
+    return tuple(sorted({point.dist.name for point in entry_points(group=AGENT_GROUP) if point.dist}))
+
+
 def task_entry(name: str) -> TaskEntry:
     """The registry line of a task.
 
@@ -191,14 +231,14 @@ def task_entry(name: str) -> TaskEntry:
 
 
 def agent_entry(name: str) -> AgentEntry:
-    """The registry line of an agent.
+    """The registry line of an agent, this suite's or an installed package's.
 
     Raises:
         UnknownNameError: No such agent; the message lists all of them.
+        SetupError: As :func:`agents`.
     """
-    if name not in AGENTS:
-        raise UnknownNameError("agent", name, AGENTS)
-    return AGENTS[name]
+    known = agents()
+    return known[require_known("agent", name, known)]
 
 
 def setting_names(agent: str) -> frozenset[str]:

@@ -77,7 +77,7 @@ def agent_words(agent: str) -> AgentWords:
     """Title and description of an agent; one that is not known here has those of its registry line."""
     if agent in _AGENTS:
         return _AGENTS[agent]
-    entry = registry.AGENTS.get(agent)
+    entry = registry.agents().get(agent)
     spoken = agent.replace("_", " ")
     return AgentWords(spoken, "") if entry is None else AgentWords(entry.title or spoken, entry.description)
 
