@@ -29,6 +29,8 @@ from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
+_BEYOND = 1e12
+"""A latent as large as this is none: an encoder's are of order 1, and beyond it squares of what follows overflow."""
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
@@ -51,7 +53,7 @@ class Imagined:
     """One imagined step of N rollouts.
 
     Attributes:
-        next_z: Shape (N, Z).
+        next_z: Shape (N, Z), within +-1e12; where that is reached, the closed loop has run away.
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).
@@ -152,14 +154,14 @@ class Imagination:
         """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'.
 
         Raises:
-            DivergedError: What the model predicts is NaN or infinite.
+            DivergedError: What the model predicts is NaN.
         """
         model = self.model
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
         predicted = mdn.average(samples, model.members)
-        _require_finite(predicted.log_weights.exp())
-        next_z = mdn.sample(predicted, self.settings.temperature, generator)
-        _require_finite(next_z)
+        _require_numbers(predicted.log_weights)
+        next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-_BEYOND, _BEYOND)
+        _require_numbers(next_z)
         reward, p_terminated = model.assess(z, action, next_z)
         doubt = None if weights.reward is None else model.reward_doubt(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, doubt)
@@ -173,10 +175,14 @@ class Imagination:
         return self._reduce(variances)
 
     def keeps(self, step: Imagined) -> Tensor:
-        """Which transitions the filter lets pass; all of them where there is no filter. Shape (N,), bool."""
+        """Which transitions the filter lets pass; where there is none, all whose latents are any. Shape (N,), bool.
+
+        A variance that is drawn whole and fed back can grow without bound, within some five imagined steps.
+        """
+        keep = step.next_z.abs().amax(dim=-1) < _BEYOND
         if not self.filtered:
-            return torch.ones_like(step.reward, dtype=torch.bool)
-        keep = self.score(decompose(step.samples).epistemic) <= self.threshold
+            return keep
+        keep &= self.score(decompose(step.samples).epistemic) <= self.threshold
         if self.settings.reward_threshold is not None and step.reward_doubt is not None:
             keep &= step.reward_doubt <= self.settings.reward_threshold
         if self.settings.termination_threshold is not None:
@@ -255,6 +261,6 @@ class Imagination:
             snapshot.load_generator(generator, arrays[f"generator/{name}"])
 
 
-def _require_finite(imagined: Tensor) -> None:
-    if not bool(imagined.isfinite().all()):
-        raise DivergedError("What the world model imagines is no longer finite. Lower model.learning_rate.")
+def _require_numbers(imagined: Tensor) -> None:
+    if bool(imagined.isnan().any()):
+        raise DivergedError("What the world model imagines is no longer a number. Lower model.learning_rate.")

@@ -11,6 +11,7 @@ from imagine_bench.agents.imagination import Imagination
 from imagine_bench.agents.memory import RealMemory
 from imagine_bench.agents.mixture import Mixture
 from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
+from imagine_bench.agents.world_model import WorldModel
 
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
@@ -94,16 +95,47 @@ def test_the_filter_discards_the_doubtful_transition_and_the_rest_of_its_rollout
 
 
 @pytest.mark.parametrize("part", ["log_weights", "means", "log_sigmas"])
-def test_imagination_that_is_not_finite_is_named_and_not_stored(part: str) -> None:
+def test_imagination_that_is_not_a_number_is_named_and_not_stored(part: str) -> None:
     class Diverged(CountingModel):
         def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
             sound = super().predict(z, action, weights)
             return dataclasses.replace(sound, **{part: torch.full_like(getattr(sound, part), torch.nan)})
 
     imagination, controller = make(filtered=False, model=Diverged(), temperature=1.0)
-    with pytest.raises(DivergedError, match=r"imagines is no longer finite\. Lower model\.learning_rate\."):
+    with pytest.raises(DivergedError, match=r"imagines is no longer a number\. Lower model\.learning_rate\."):
         imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert stored_counts(imagination) == []
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_rollout_whose_variance_overflows_ends_before_it_with_the_filter_or_without(filtered: bool) -> None:
+    class Exploding(CountingModel):
+        def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+            sound = super().predict(z, action, weights)
+            sigmas = sound.log_sigmas.clone()
+            sigmas[:, z[:, 1].round() == 4] = 89.0  # a variance beyond float32
+            return dataclasses.replace(sound, log_sigmas=sigmas)
+
+    imagination, controller = make(filtered=filtered, model=Exploding(), temperature=1.0)
+    counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
+    assert dataclasses.astuple(counts) == (3, 15, 12)
+    assert [round(count) for count in stored_counts(imagination)] == sorted(3 * [1, 2, 3, 4])
+
+
+def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
+    """As thesis-style imagination did once: log sigmas of 4, 10, 19 and then infinity within five steps."""
+    imagination, _ = make(filtered=False, model=CountingModel(), temperature=1.0)
+    generator = torch.Generator().manual_seed(1)
+    imagination.model = WorldModel(2, 2, WorldModelSettings(), generator)
+    with torch.no_grad():
+        imagination.model.dynamics.weights[-1].mul_(30.0)
+    z, action, kept = torch.ones(8, 2), torch.zeros(8, dtype=torch.int64), []
+    for _ in range(10):
+        step = imagination.step(z, action, imagination.draw_weights(generator), generator)
+        assert all(part.isfinite().all() for part in (step.next_z, step.reward, step.p_terminated))
+        kept.append(imagination.keeps(step))
+        z = step.next_z
+    assert kept[0].all() and not kept[-1].any(), "it began as latents are and did run away"
 
 
 def test_without_the_filter_doubt_is_kept() -> None:
