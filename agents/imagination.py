@@ -171,8 +171,8 @@ class Imagination:
         return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
 
     def score(self, variances: Tensor) -> Tensor:
-        """Reduce variances (..., Z) as the filter does. Shape (...)."""
-        return self._reduce(variances)
+        """Reduce variances (..., Z) as the filter does; one that overflowed is doubt without bound. Shape (...)."""
+        return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def keeps(self, step: Imagined) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all whose latents are any. Shape (N,), bool.

@@ -138,6 +138,12 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
     assert kept[0].all() and not kept[-1].any(), "it began as latents are and did run away"
 
 
+def test_a_variance_that_overflowed_is_doubt_without_bound() -> None:
+    imagination, _ = make(filtered=True, model=CountingModel())
+    variances = torch.tensor([[0.1, 0.2], [0.1, torch.inf], [torch.nan, 0.2]])
+    assert imagination.score(variances).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
+
+
 def test_without_the_filter_doubt_is_kept() -> None:
     imagination, controller = make(filtered=False, model=CountingModel(doubt_at=5))
     counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
