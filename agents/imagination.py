@@ -175,7 +175,7 @@ class Imagination:
         return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def keeps(self, step: Imagined) -> Tensor:
-        """Which transitions the filter lets pass; where there is none, all whose latents are any. Shape (N,), bool.
+        """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
 
         A variance that is drawn whole and fed back can grow without bound, within some five imagined steps.
         """
