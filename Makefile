@@ -4,6 +4,8 @@ TASK ?= arrow_puzzle
 PRESET ?= quick
 LAUNCHER ?= local
 ARGS ?=
+# where a command would take the newest bench of any task, only a TASK that was given narrows it
+OF_TASK = $(if $(filter file,$(origin TASK)),,--task $(TASK))
 PYTEST ?= -n auto --dist loadfile
 
 VENV := .venv
@@ -30,22 +32,22 @@ peers: $(READY)  ## Train a library's agents on TASK, with the budgets and tests
 	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) --agents sb3_dqn sb3_qrdqn sb3_dqn_latents --seeds 0 1 2 3 4 --budgets 100 250 500 1000 2000 $(ARGS)
 
 plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
-	@$(BIN)/imagine-bench plan --task $(TASK) $(ARGS)
+	@$(BIN)/imagine-bench plan $(OF_TASK) $(ARGS)
 
 generalise: $(READY)  ## Ask the newest bench's models for every transition, also those that no training can contain
-	@$(BIN)/imagine-bench generalise --task $(TASK) $(ARGS)
+	@$(BIN)/imagine-bench generalise $(OF_TASK) $(ARGS)
 
 policy: $(READY)  ## Follow the policies of the newest bench's learners from every start by the rules
-	@$(BIN)/imagine-bench policy --task $(TASK) $(ARGS)
+	@$(BIN)/imagine-bench policy $(OF_TASK) $(ARGS)
 
 study: $(READY)  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench study --task $(TASK) --launcher $(LAUNCHER) $(ARGS)
 
 view: $(READY)  ## Open the newest recording in the Rerun viewer
-	@$(BIN)/imagine-bench view $(ARGS)
+	@$(BIN)/imagine-bench view $(OF_TASK) $(ARGS)
 
 report: $(READY)  ## Write the newest bench's report again and show its table
-	@$(BIN)/imagine-bench report $(ARGS)
+	@$(BIN)/imagine-bench report $(OF_TASK) $(ARGS)
 
 encoder: $(READY)  ## Train an encoder for TASK anew and say how it compares to the bundled one
 	@$(BIN)/imagine-bench encoder --task $(TASK) $(ARGS)

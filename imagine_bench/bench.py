@@ -11,7 +11,7 @@ from typing import Any
 
 from imagine_bench import encoders, registry
 from imagine_bench.environment import describe_environment, gl_renderer
-from imagine_bench.errors import InvalidValueError, RunFailedError, UnknownNameError
+from imagine_bench.errors import InvalidValueError, RunFailedError, SetupError, UnknownNameError
 from imagine_bench.kinds import kind_of, require_options
 from imagine_bench.launchers import Failure, Job, Launcher
 from imagine_bench.progress import ProgressBars
@@ -171,7 +171,8 @@ def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Fa
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
-    entry = registry.agents().get(agent)  # regressors have no encoder and rest nowhere
+    acts = store.protocol.task in registry.TASKS
+    entry = registry.agent_entry(agent) if acts else None  # regressors have no encoder and rest nowhere
     needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
     rests = until if entry is not None and not entry.trains_itself else None
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=rests)
@@ -186,7 +187,8 @@ def _noting_time(store: BenchStore, show: Observer) -> Observer:
         with suppress(OSError):  # nobody reads the screen any more; the runs go on
             show(progress)
         if time.monotonic() - noted_s > _NOTE_EVERY_S:
-            store.note_time()
+            with suppress(SetupError):  # a count of seconds stops no run; what they cannot write they say themselves
+                store.note_time()
             noted_s = time.monotonic()
 
     return observe

@@ -23,7 +23,7 @@ from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.kinds import KINDS, kind_of
 from imagine_bench.launchers import LAUNCHERS, launcher
 from imagine_bench.protocol import digest
-from imagine_bench.store import newest_bench, newest_recording, read_protocol
+from imagine_bench.store import newest_bench, newest_recording, read_protocol, require_either
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -37,6 +37,7 @@ _LISTS = (*_ADDING_UP, "--agents", "--seeds", "--budgets", "--after")
 _PRESETS_OWN = "(default: the preset's)"
 _NONE = tyro.conf.arg(help_behavior_hint="(default: none)")
 _NEWEST = tyro.conf.arg(metavar="[PATH]", help_behavior_hint="(default: the newest)")
+_ANY = tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")
 _OF_PRESET = tyro.conf.arg(help_behavior_hint=_PRESETS_OWN)
 
 
@@ -111,6 +112,8 @@ class Report:
 
     folder: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
     """The bench's folder."""
+    task: Annotated[str | None, _ANY] = None
+    """Task whose newest bench is taken."""
     beside: Annotated[tuple[Path, ...], _NONE] = ()
     """Folders of other benches, or of results that were kept, whose agents are shown beside it, or where those are
     the same, whose seeds; all else in their protocols must be the same."""
@@ -119,7 +122,8 @@ class Report:
 
     def __call__(self) -> None:
         """Load and write."""
-        folder = self.folder or newest_bench(self.out)
+        tasks = _only(self.task, self.folder)
+        folder = self.folder or newest_bench(self.out, tasks)
         _show(folder, registry.load(_TOGETHER)([folder, *self.beside], self.out) if self.beside else None)
 
 
@@ -129,7 +133,7 @@ class Plan:
 
     run: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
     """The folder of a run, or of a bench, whose best imagining run is taken."""
-    task: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")] = None
+    task: Annotated[str | None, _ANY] = None
     """Task whose newest bench is taken."""
     count: int = 100
     """Plans."""
@@ -172,7 +176,7 @@ class _OfBench:
 
     folder: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
     """A bench's folder."""
-    task: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")] = None
+    task: Annotated[str | None, _ANY] = None
     """Task whose newest bench is taken."""
     encoder: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the runs', if bundled)")
@@ -243,6 +247,8 @@ class View:
 
     file: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
     """The .rrd file."""
+    task: Annotated[str | None, _ANY] = None
+    """Task whose newest recording is taken."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
@@ -250,7 +256,8 @@ class View:
         """Find and open."""
         from imagine_bench.recording import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
-        open_in_viewer(self.file or newest_recording(self.out))
+        tasks = _only(self.task, self.file)
+        open_in_viewer(self.file or newest_recording(self.out, *tasks))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -398,11 +405,18 @@ def _require_clear(words: Sequence[str]) -> None:
         InvalidValueError: An option that takes a list has no value, or such an option that adds up comes twice.
     """
     for name in _LISTS:
-        places = [place for place, word in enumerate(words) if word == name]
-        if any(words[place + 1 : place + 2] == [] or words[place + 1].startswith("--") for place in places):
+        places = [place for place, word in enumerate(words) if word.partition("=")[0] == name]
+        values = [_first_value(words, place) for place in places]
+        if any(not value or value.startswith("--") for value in values):
             raise InvalidValueError(f"{name} has no value; give at least one behind it, or leave it out.")
         if len(places) > 1 and name in _ADDING_UP:
             raise InvalidValueError(f"{name} comes {len(places)} times; give all its values behind one.")
+
+
+def _first_value(words: Sequence[str], place: int) -> str:
+    """The first value of the option at a place: behind its equals sign, or else the next word."""
+    _, equals, value = words[place].partition("=")
+    return value if equals else next(iter(words[place + 1 :]), "")
 
 
 def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
@@ -427,6 +441,20 @@ def _value(text: str) -> Any:
         return json.loads(text)
     except ValueError:
         return text
+
+
+def _only(task: str | None, given: Path | None) -> tuple[str, ...]:
+    """A task by itself, or none for any.
+
+    Raises:
+        UnknownNameError: No such task; the message lists those of every kind.
+        InvalidValueError: A path was given too.
+    """
+    require_either(given, task)
+    if task is None:
+        return ()
+    kind_of(task)  # knows every name
+    return (task,)
 
 
 def _show(folder: Path, result: Any = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -13,7 +14,7 @@ from PIL import Image
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.files import make_folder
+from imagine_bench.files import make_folder, write_bytes
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.seeding import episode_seed
 
@@ -43,14 +44,13 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
         raise InvalidValueError(f"{out} does not end in .gif, the only format of films; give such an --out.")
     if out.exists():
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
-    pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
     make_folder(out.parent)
+    pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
     colours = pictures[0].quantize(128)
     frames = [picture.quantize(palette=colours, dither=Image.Dither.NONE) for picture in pictures]
-    try:
-        frames[0].save(out, save_all=True, append_images=frames[1:], duration=1000 // _FPS, loop=0, optimize=True)
-    except OSError as error:
-        raise SetupError(f"{out} cannot be written: {error.strerror or error}.") from error
+    whole = io.BytesIO()
+    frames[0].save(whole, "GIF", save_all=True, append_images=frames[1:], duration=1000 // _FPS, loop=0, optimize=True)
+    write_bytes(out, whole.getvalue())
     return out
 
 

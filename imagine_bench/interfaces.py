@@ -24,8 +24,6 @@ Macrostate = NDArray[np.int64]
 
 APPEARANCES = ("clean", "mild", "strong")
 EXECUTIONS = ("physics", "kinematic")
-ENCODER_KINDS = ("latents", "codes")
-"""What an encoder gives: continuous latents, or one-hot codes of discrete parts."""
 DEVICES = ("cpu", "cuda")
 
 

@@ -1,4 +1,4 @@
-"""The kinds of task, and what each brings to the one machinery: the only place where kinds are told apart.
+"""The kinds of task, and what each brings to the one machinery.
 
 A *control* task is acted in, by agents that learn from episodes; a *regression* task is learned from data, by
 regressors. Launchers, locks, run folders, progress, store and command line are the same for both.

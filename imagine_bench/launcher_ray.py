@@ -107,6 +107,8 @@ def _reasons(ray: Any, task: Any, count: int) -> list[str]:
     """Why each of an ended task's runs failed, or empty strings."""
     try:
         reasons: list[str] = ray.get(task)
+    except ray.exceptions.RayTaskError as error:  # raised before the runs could speak for themselves
+        return [f"it could not begin ({error.cause!r})"] * count
     except ray.exceptions.RayError as error:
         return [f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"] * count
     return reasons

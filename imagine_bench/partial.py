@@ -109,7 +109,8 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
 
 def _unfinished(folder: Path) -> RunResult:
     snapshot = load_newest(folder / "checkpoints")
-    assert snapshot is not None, "a run that has reached a budget has a checkpoint"
+    if snapshot is None:  # it had one a moment ago
+        raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
     config = read_json(folder / "config.json", "a run's configuration")
     with reading(folder / "checkpoints", "a run's checkpoint"):
         counters = Counters.of(snapshot)

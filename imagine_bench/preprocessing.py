@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import UnknownNameError
+from imagine_bench.errors import require_known
 
 STRIP_WIDTH = 22
 """Pixels; 64 columns hold three strips that share one column with each neighbour."""
@@ -54,6 +54,4 @@ def preprocess(name: str) -> Preprocess:
     Raises:
         UnknownNameError: No such preprocessing.
     """
-    if name not in PREPROCESSING:
-        raise UnknownNameError("preprocessing", name, PREPROCESSING)
-    return PREPROCESSING[name]
+    return PREPROCESSING[require_known("preprocessing", name, PREPROCESSING)]

@@ -12,6 +12,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.environment import describe_environment
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
+from imagine_bench.files import lock, make_folder
 from imagine_bench.generalisation import Probing, answer, probing, summarise
 from imagine_bench.interfaces import EXECUTIONS
 from imagine_bench.kinds import kind_of
@@ -19,10 +20,10 @@ from imagine_bench.plans import make_plans, require_threshold
 from imagine_bench.policy import choices, follow, situations
 from imagine_bench.progress import counted
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
-from imagine_bench.report.plans import plan_table, write_plans
+from imagine_bench.report.plans import RECORDING, plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.seeding import SeedTree, exam
-from imagine_bench.store import load_bench, newest_bench, read_protocol
+from imagine_bench.store import load_bench, newest_bench, read_protocol, require_either
 from imagine_bench.trained import Trained, best_run, learners, load_trained, require_control, require_runs
 
 _STRIPS = 6
@@ -57,24 +58,32 @@ def plan_report(
 
     Raises:
         ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
+        BusyError: Another process makes the same plans.
     """
     require_known("execution", execution, EXECUTIONS)
     if recorded < 0 or count < 1:
         raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
     require_threshold(max_epistemic)
-    if run is None:
-        run = newest_bench(root, _control(task))
+    run = _chosen(run, root, task)
     if (run / "protocol.json").exists():  # a bench's folder
         require_control(read_protocol(run).task, str(run))
         require_runs(run)
         run = best_run(load_bench(run)).folder
     trained = load_trained(run, encoder=encoder)
+    name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
+    folder = make_folder(run / "plans" / name)
+    with lock(folder / ".lock", f"The folder {folder}"):
+        return _plan(trained, folder, count, recorded, execution, max_epistemic)
+
+
+def _plan(
+    trained: Trained, folder: Path, count: int, recorded: int, execution: str, max_epistemic: float | None
+) -> str:
     plans = list(
         counted(
             make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic), "plans", total=count
         )
     )
-    folder = run / "plans" / f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
     facts = {**_facts(trained), "execution": execution, "max_epistemic": max_epistemic}
     summary = write_plans(folder, plans, trained.task, facts, strips=_STRIPS)
     said = [f"{_title(trained)}, {execution}", "", plan_table(summary, trained.task), ""]
@@ -83,7 +92,7 @@ def plan_report(
     if recorded:
         from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - loading Rerun costs a second
 
-        path = folder / "recording.rrd"
+        path = folder / RECORDING
         record_plans(trained, count=min(recorded, count), execution=execution, max_epistemic=max_epistemic, path=path)
         said.append(f"Recording:  {path} (imagine-bench view opens it)")
     return "\n".join(said)
@@ -167,19 +176,19 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
 
 def _bench_of_agents(folder: Path | None, root: Path, task: str | None) -> Path:
     """The bench that a question is put to: one whose agents can act, and are there."""
-    bench = folder or newest_bench(root, _control(task))
+    bench = _chosen(folder, root, task)
     require_control(read_protocol(bench).task, str(bench))
     require_runs(bench)
     return bench
 
 
-def _control(task: str | None) -> tuple[str, ...]:
-    """The tasks whose newest bench is meant; regressors neither plan nor imagine transitions."""
-    if task is None:
-        return tuple(registry.TASKS)
-    kind_of(task)  # knows every name
-    require_control(task, f"Task {task!r}")
-    return (task,)
+def _chosen(given: Path | None, root: Path, task: str | None) -> Path:
+    """What was given, or else the newest bench of a task in which agents act, or of all such tasks."""
+    require_either(given, task)
+    if task is not None:
+        kind_of(task)  # knows every name
+        require_control(task, f"Task {task!r}")
+    return given or newest_bench(root, tuple(registry.TASKS) if task is None else (task,))
 
 
 def _title(trained: Trained) -> str:

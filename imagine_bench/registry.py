@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, require_known
+from imagine_bench.errors import InvalidValueError, SetupError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
 
@@ -197,7 +197,7 @@ def agents() -> dict[str, AgentEntry]:
 def _offered() -> dict[str, AgentEntry]:
     found: dict[str, AgentEntry] = {}
     for point in entry_points(group=AGENT_GROUP):
-        found[point.name] = _offered_entry(point, taken={*AGENTS, *found})
+        found[point.name] = _offered_entry(point, taken={*AGENTS, *REGRESSORS, *found})
     return found
 
 
@@ -225,9 +225,7 @@ def task_entry(name: str) -> TaskEntry:
     Raises:
         UnknownNameError: No such task; the message lists all of them.
     """
-    if name not in TASKS:
-        raise UnknownNameError("task", name, TASKS)
-    return TASKS[name]
+    return TASKS[require_known("task", name, TASKS)]
 
 
 def agent_entry(name: str) -> AgentEntry:
@@ -299,9 +297,7 @@ def regression(name: str) -> RegressionSpec:
     Raises:
         UnknownNameError: No such task; the message lists all of them.
     """
-    if name not in REGRESSIONS:
-        raise UnknownNameError("regression task", name, REGRESSIONS)
-    spec: RegressionSpec = load(REGRESSIONS[name].spec)
+    spec: RegressionSpec = load(REGRESSIONS[require_known("regression task", name, REGRESSIONS)].spec)
     return spec
 
 
@@ -311,9 +307,7 @@ def regressor_entry(name: str) -> RegressorEntry:
     Raises:
         UnknownNameError: No such regressor; the message lists all of them.
     """
-    if name not in REGRESSORS:
-        raise UnknownNameError("regressor", name, REGRESSORS)
-    return REGRESSORS[name]
+    return REGRESSORS[require_known("regressor", name, REGRESSORS)]
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:

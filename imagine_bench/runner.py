@@ -1,7 +1,8 @@
 """One run: one agent, one seed, through all budgets of a protocol. The only loop that steps an environment to learn.
 
 Whatever is needed to go on is in the newest checkpoint, so a run that was killed at any moment and started again ends
-in the same bits as one that was not; only CPU times differ.
+in the same bits as one that was not; only CPU times differ. (With other runs abreast, where company changes no bits:
+``docs/cluster.md``.)
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from typing import Any
 
 import gymnasium
 
-from imagine_bench import registry, run_folder
+from imagine_bench import encoders, registry, run_folder
 from imagine_bench.capabilities import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
 from imagine_bench.checkpointing import load_newest, save_snapshot
 from imagine_bench.cohort import cpu_time_s
-from imagine_bench.errors import DivergedError
+from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.evaluation import Tally, TrainingStarts, play
 from imagine_bench.files import lock, make_folder
 from imagine_bench.futures import imagined_futures
@@ -79,6 +80,7 @@ class _Run:
         self.task = registry.task(spec.protocol.task)
         self.entry = registry.agent_entry(spec.agent)
         self.seeds = SeedTree(spec.seed)
+        self._require_its_encoder()
         self.agent = registry.make_agent(spec.agent, spec.context())
         if self.entry.learns:
             require_able(self.agent, spec.agent, spec.protocol)
@@ -90,7 +92,17 @@ class _Run:
         if snapshot is not None:
             self.agent.restore(snapshot.agent)
             self.counters = Counters.of(snapshot)
+            if self.counters.rows:  # a kill between a test's checkpoint and its table would leave the table behind
+                run_folder.write_metrics(folder, self.counters.rows)
         self.saved_s = self.reported_s = time.monotonic()
+
+    def _require_its_encoder(self) -> None:
+        """Refuse another file than the protocol's, such as an older one on another node, or one changed since."""
+        wanted = self.spec.protocol.encoder_of(self.entry.encoder_kind) if self.entry.needs_encoder else None
+        if wanted is not None and self.spec.encoder is not None:
+            found = encoders.identity(self.spec.encoder)
+            if found != wanted:
+                raise ArtefactError(f"{self.spec.encoder} is encoder {found}, and this bench is of {wanted}.")
 
     def go_on(self) -> None:
         """Train and test at every budget that is wanted now; after the last one of all, finish."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import run_folder
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.files import lock, make_folder, read_json, reading, write_json
 from imagine_bench.kinds import kind_of
 from imagine_bench.registry import load
@@ -138,6 +138,12 @@ def bench_facts(folder: Path) -> dict[str, Any]:
     return {"environment": environment, "folder": folder, "wall_s": sum(sitting["wall_s"] for sitting in sittings)}
 
 
+def require_either(given: Path | None, task: str | None) -> None:
+    """Raise InvalidValueError where a path and a task are given: what lies at a path is of a task already."""
+    if given is not None and task is not None:
+        raise InvalidValueError(f"Both {given} and --task {task} were given; leave one of them out.")
+
+
 def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
     """The bench folder below ``root`` that was worked on last, of any task or of some.
 
@@ -155,16 +161,18 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
     return max(found, key=lambda path: path.stat().st_mtime).parent
 
 
-def newest_recording(root: Path) -> Path:
-    """The recording below ``root`` that was written last, of a run or of a plan.
+def newest_recording(root: Path, task: str | None = None) -> Path:
+    """The recording below ``root`` that was written last, of a run or of a plan, of any task or of one.
 
     Raises:
         ArtefactError: There is none.
     """
-    found = sorted(root.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
+    where = root / (task or "")
+    found = sorted(where.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
     if not found:
         raise ArtefactError(
-            f"There is no recording below {root}; run a bench with 'imagine-bench bench --task arrow_puzzle'."
+            f"There is no recording below {where}; run a bench with 'imagine-bench bench --task "
+            f"{task or 'arrow_puzzle'}'."
         )
     return found[-1]
 

@@ -61,6 +61,9 @@ def bench_words(out: Path, *more: str) -> list[str]:
         ),
         (["--set", "controller.discount"], "--set 'controller.discount' is not of the form name=value"),
         (["--set", "a=1", "--set", "b=2"], "--set comes 2 times; give all its values behind one."),
+        (["--set=a=1", "--set=b=2"], "--set comes 2 times; give all its values behind one."),
+        (["--set", "a=1", "--set=b=2"], "--set comes 2 times; give all its values behind one."),
+        (["--agents="], "--agents has no value; give at least one behind it, or leave it out."),
         (["--seeds", "--workers", "1"], "--seeds has no value; give at least one behind it, or leave it out."),
         (["--workers", "1", "--agents"], "--agents has no value; give at least one behind it, or leave it out."),
         (["--workers", "0"], "0 workers cannot run anything; give at least 1."),
@@ -89,6 +92,12 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
             "toy_regression is learned from data; a study compares agents that act",
         ),
         (["study", "--task", "toy"], "No task 'toy'."),
+        *(
+            ([command, "a", "--task", "arrow_puzzle"], "Both a and --task arrow_puzzle were given; leave one of them")
+            for command in ("report", "plan", "generalise", "policy", "view")
+        ),
+        (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
+        (["report", "--task", "robot_ik", "--out", str(tmp_path)], "There is no such bench below"),
         (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
         (["view", str(tmp_path / "x.rrd")], "No recording"),

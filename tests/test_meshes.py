@@ -9,15 +9,21 @@ import pytest
 from imagine_bench.tasks.scenes import hand, objects, open_hand
 from imagine_bench.tasks.scenes.cubes import arrow_outline
 from imagine_bench.tasks.scenes.meshes import (
+    Mesh,
     arch,
     box,
     ellipsoid,
     limb,
     merge,
     prism,
-    signed_volume_m3,
     turned_profile,
 )
+
+
+def signed_volume_m3(mesh: Mesh) -> float:
+    """Enclosed volume; positive if every part is closed and its faces look outward (overlaps count twice)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
 def arrow():

@@ -89,6 +89,7 @@ def test_another_packages_agent_is_compared_like_one_of_this_suite(
     ("point", "sentence"),
     [
         ("dqn = their_package:ENTRY", "offers their_package:ENTRY as agent dqn, a name that is taken; give it another"),
+        ("ensemble = their_package:ENTRY", "as agent ensemble, a name that is taken"),
         ("mine = their_package:ENTRY\nmine = their_package:ENTRY", "as agent mine, a name that is taken"),
         ("mine = their_package:NONE", "offers their_package:NONE as agent mine, which cannot be loaded (module "),
         ("mine = no_package:ENTRY", "offers no_package:ENTRY as agent mine, which cannot be loaded (No module named"),

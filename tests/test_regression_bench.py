@@ -20,7 +20,7 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.kinds import KINDS
 from imagine_bench.quality import generalisation_report
 from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext, runner
-from imagine_bench.regression.results import RegressionRun
+from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report import robot_ik, toy_regression
 from imagine_bench.report.page import flat
@@ -56,8 +56,11 @@ def test_every_kind_has_learners_and_all_names_load() -> None:
     names = [name for kind in KINDS.values() for name in kind.tasks]
     assert len(names) == len(set(names))
     for kind in KINDS.values():
-        assert kind.tasks and kind.learners
-        for target in (kind.protocol, kind.plan, kind.run, kind.load_run, kind.result, kind.write_report):
+        assert kind.tasks and kind.learners() and registry.load(kind.presets)
+        for target in (
+            kind.protocol, kind.plan, kind.run, kind.load_run, kind.load_so_far, kind.result, kind.write_report,
+            kind.summary_table,
+        ):  # fmt: skip
             assert callable(registry.load(target))
     for name in registry.REGRESSIONS:
         spec = registry.regression(name)
@@ -132,6 +135,17 @@ def test_a_checkpoint_gives_the_variants_back_in_the_order_of_the_protocol(
     assert list(run(spec, tmp_path / "run", silent).evaluations) == ["base", "low_data", "high_noise"]
     files = [tmp_path / name / "evaluation.npz" for name in ("run", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_runs_of_other_settings_are_not_averaged(toy: RegressionRun, tmp_path: Path) -> None:
+    """As where ``auto`` settled on another precision on another machine."""
+    two = replace(tiny("toy_regression").protocol, seeds=(0, 1))
+    facts = {"protocol": two, "environment": {}, "folder": tmp_path, "wall_s": 0.0}
+    same = replace(toy, seed=1, folder=tmp_path / "seed_1")
+    assert RegressionResult(runs=(toy, same), **facts).of("mc_dropout") == (toy, same)
+    other = replace(same, settings={**toy.settings, "precision": "float64"})
+    with pytest.raises(ArtefactError, match=r"ran with precision '.*' and .*seed_1 with 'float64'"):
+        RegressionResult(runs=(toy, other), **facts)
 
 
 def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path: Path) -> None:

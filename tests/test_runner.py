@@ -269,6 +269,18 @@ def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
     assert final_arrays(tmp_path / "whole")["table"].tobytes() == final_arrays(folder)["table"].tobytes()
 
 
+def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> None:
+    """The checkpoint of a test is written before its row of the table."""
+    folder = tmp_path / "run"
+    do(folder)
+    table = (folder / "metrics.csv").read_text()
+    (folder / "DONE").unlink()
+    (folder / "metrics.csv").unlink()
+    spec = RunSpec(protocol=small(), agent="table", seed=0, until=4)
+    assert runner.run(spec, folder, lambda progress: None) is not None
+    assert (folder / "metrics.csv").read_text() == table
+
+
 def test_every_registered_agent_has_a_target() -> None:
     for entry in registry.AGENTS.values():
-        assert ":" in entry.make
+        assert callable(registry.load(entry.make))

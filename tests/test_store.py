@@ -163,6 +163,12 @@ def test_the_newest_recording_may_be_a_plan_s(tmp_path: Path) -> None:
     assert newest_recording(tmp_path) == plan
     os.utime(run, (1e9 + 1.0, 1e9 + 1.0))
     assert newest_recording(tmp_path) == run
+    other = tmp_path / "robot_ik/quick-0123456789ab/ensemble/seed_0/recording.rrd"
+    other.parent.mkdir(parents=True)
+    other.touch()
+    assert newest_recording(tmp_path) == other and newest_recording(tmp_path, "arrow_puzzle") == run
+    with pytest.raises(ArtefactError, match=r"below .*pick_place; run a bench with .*--task pick_place'"):
+        newest_recording(tmp_path, "pick_place")
 
 
 def test_imagined_rollouts_and_open_loop_come_back(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import csv_text, write_bytes
 from imagine_bench.regression.protocol import RegressionProtocol
+from imagine_bench.results import require_one_setting
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
 
@@ -63,7 +64,7 @@ class RegressionResult:
         wall_s: Wall seconds of the bench, over all its sittings.
 
     Raises:
-        ArtefactError: A run is missing or doubled.
+        ArtefactError: A run is missing or doubled, or two runs of a regressor had different settings.
     """
 
     protocol: RegressionProtocol
@@ -80,6 +81,8 @@ class RegressionResult:
                 f"{self.folder} should hold one run for each of {len(wanted)} regressors and seeds and holds "
                 f"{len(found)}; missing: {sorted(wanted - set(found)) or 'none'}. Run the same bench command again."
             )
+        for agent in self.protocol.agents:
+            require_one_setting([(run.folder, run.settings) for run in self.of(agent)])
 
     @property
     def protocol_hash(self) -> str:

@@ -351,10 +351,10 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 
 
 def _nan_mean(table: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is finite; NaN where nothing is."""
-    finite = np.isfinite(table)
-    count = finite.sum(axis=0)
-    total = np.where(finite, table, 0.0).sum(axis=0)
+    """Mean over the first axis of what is known, boundless doubt included; NaN where nothing is."""
+    known = ~np.isnan(table)
+    count = known.sum(axis=0)
+    total = np.where(known, table, 0.0).sum(axis=0)
     mean: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return mean
 

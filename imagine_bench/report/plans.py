@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, write_bytes, write_json, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.pictures import png, rollout_strip
 from imagine_bench.plans import Plan
@@ -23,6 +23,7 @@ _COLUMNS = (
     *("plan", "start", "shortest", "planned", "done", "solved", "optimal", "refused", "as_imagined", "faults"),
     *("max_epistemic", "actions"),
 )
+RECORDING = "recording.rrd"
 _SHOWN_FAILURES = 12
 
 
@@ -99,6 +100,8 @@ def write_plans(
 ) -> PlanSummary:
     """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and strips of the first plans that failed.
 
+    What an earlier call left there, its recording included, goes.
+
     Args:
         folder: Where to; it is made.
         plans: What became of them.
@@ -110,6 +113,9 @@ def write_plans(
         SetupError: The folder cannot be written.
     """
     make_folder(folder)
+    with writing(folder):
+        for earlier in (*folder.glob("failed_*.png"), folder / RECORDING):
+            earlier.unlink(missing_ok=True)
     summary = summarise(plans)
     write_bytes(folder / "plans.csv", _csv(plans).encode())
     write_json(folder / "summary.json", {**facts, **dataclasses.asdict(summary)})

@@ -159,9 +159,3 @@ def arch(center: ArrayLike, *, radius: float, thickness: float, corners: int = 6
     x, y, z = np.asarray(center, dtype=np.float64)
     angle = np.linspace(-np.pi / 2, np.pi / 2, corners + 1)
     return limb([(x - radius * np.cos(a), y, z + radius * np.sin(a), thickness) for a in angle], sides=sides)
-
-
-def signed_volume_m3(mesh: Mesh) -> float:
-    """Enclosed volume; positive if every part is closed and its faces look outward (overlaps count twice)."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
