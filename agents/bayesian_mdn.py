@@ -102,8 +102,8 @@ class BayesianMDN:
         if not bool(losses.isfinite().all()):
             wrong = [index for index, loss in enumerate(losses.tolist()) if not math.isfinite(loss)]
             raise DivergedError(
-                f"The likelihood of network {wrong[0]} is no longer finite ({losses[wrong[0]].item()}). "
-                "Lower learning_rate or raise sigma_floor."
+                f"The likelihood of network {wrong[0]} of {len(losses)} is no longer finite "
+                f"({losses[wrong[0]].item()}). Lower learning_rate or raise sigma_floor."
             )
         self.optimiser.step(losses.sum())
         return losses.detach()

@@ -1,4 +1,7 @@
-"""The controller: Q-learning by a small network on latents (thesis 5.2.3; Mnih et al. 2015, no target network)."""
+"""The controller: Q-learning by a small network on latents (thesis 5.2.3; Mnih et al. 2015).
+
+A target network, which the thesis has not, only where settings want one.
+"""
 
 from __future__ import annotations
 

@@ -205,10 +205,12 @@ class Encoder:
                 card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
                 tensors = {key: file.get_tensor(key).float() for key in file.keys()}
             coder = empty_coder(card)
+            if coder.latent_size != card.latent_size:
+                raise InvalidValueError(f"its card says {card.latent_size} latents, its network {coder.latent_size}")
             probe = empty_probe(coder.latent_size, card.cardinalities)
             _fill(coder, tensors, "vae.")
             _fill(probe, tensors, "probe.")
-        except (OSError, SafetensorError, RuntimeError, ImagineBenchError) as error:
+        except (OSError, SafetensorError, RuntimeError, TypeError, ValueError, ImagineBenchError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
         return cls(coder, probe, card, device)

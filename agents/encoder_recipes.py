@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from imagine_bench.errors import InvalidValueError, require_known
 
 ARCHITECTURES = ("ha_schmidhuber", "strips", "picture")
+"""Of networks; recipes of codes have another: ``"parts"``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,7 @@ class Recipe:
         return "codes" if self.architecture == "parts" else "latents"
 
     def __post_init__(self) -> None:
+        require_known("encoder architecture", self.architecture, (*ARCHITECTURES, "parts"))
         if min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps) < 1:
             raise InvalidValueError(
                 f"Encoder recipe {self.name!r} has a count below 1; latents, frames, held_out_frames, steps, batch and "

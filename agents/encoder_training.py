@@ -100,7 +100,7 @@ def train_vae(vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generat
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
     n, order = len(data.pictures), torch.empty(0, dtype=torch.int64)
     for step in range(recipe.steps):
-        if len(order) < recipe.batch:
+        while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
         rows, order = order[: recipe.batch], order[recipe.batch :]
         noise = torch.randn((len(rows), vae.latent_size), generator=generator)

@@ -29,8 +29,9 @@ from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
-_BEYOND = 1e12
-"""A latent as large as this is none: an encoder's are of order 1, and beyond it squares of what follows overflow."""
+_BEYOND = 1e9
+"""A latent as large as this is none: an encoder's are of order 1, and its fourth power, of which a controller that
+learns from it has sums in the norm of its gradient, must not overflow."""
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 

@@ -1,4 +1,4 @@
-"""The two memories of algorithm 1, of different kinds and never one buffer (thesis 5.2.2).
+"""The memories of algorithm 1, real and imagined, of different kinds and never one buffer (thesis 5.2.2).
 
 The real memory keeps what the encoder saw, mean and standard deviation, and draws ``z ~ N(mu, sigma)`` anew
 for every batch; the imagined memory keeps imagined latents and is short, since recent imagination is the better one.

@@ -213,8 +213,7 @@ def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
         Cloud of each point, numbered by size from 0; -1 for none. Shape (N,).
     """
     count = len(points)
-    # Away from 0: the tree splits just above a coordinate, and with denormals flushed nothing is just above 0.
-    shifted = points - points.min(axis=0) + 1.0
+    shifted = _from_one(points)
     distance, near = scipy.spatial.cKDTree(shifted).query(shifted, min(_NEIGHBOURS + 1, count))
     rows = np.repeat(np.arange(count), near.shape[1])
     links = scipy.sparse.csr_matrix((np.ones(near.size), (rows, near.ravel())), shape=(count, count))
@@ -230,7 +229,15 @@ def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
     order = [index for index in np.argsort(-sizes, kind="stable") if sizes[index] > _LEAST_SHARE * count]
     number = np.full(len(sizes), -1)
     number[order] = np.arange(len(order))
-    return _mended(points, number[label])
+    return _mended(shifted, number[label])
+
+
+def _from_one(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (N, F) moved away from 0: a tree splits just above a coordinate, and with denormals flushed nothing is
+    just above 0.
+    """
+    moved: NDArray[np.float64] = points - points.min(axis=0) + 1.0
+    return moved
 
 
 def _mended(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from .peer_settings import PeerSettings, resolve
 from .perception import load_perception, prepare_torch
 
 _SEEDS = 2**31
-"""Seeds that numpy's global generator, which the library draws from, can tell apart."""
+"""The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
 
 
 class LibraryAgent:

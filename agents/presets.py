@@ -18,7 +18,6 @@ from .assessment import INPUTS
 from .chapter_3 import CHAPTER_3
 from .chapter_5 import CHAPTER_5
 from .family import Family
-from .layers import dropout_bits
 from .precision import PRECISIONS, settle
 from .ranges import COUNT, FINITE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
 from .settings import START_STATES, Settings
@@ -130,7 +129,7 @@ def _require_ranges(settings: Settings) -> None:
             f"imagination.end_episode {imagination.end_episode} is not above imagination.start_episode "
             f"{imagination.start_episode}: nothing would be imagined. Set it above that, or to null for no end."
         )
-    if dropout_bits(model.dropout) and not (model.dynamics_hidden and (model.shared_hidden or model.reward_hidden)):
+    if model.dropout > 0 and not (model.dynamics_hidden and (model.shared_hidden or model.reward_hidden)):
         raise InvalidValueError(
             "model.dropout acts on hidden layers: give model.dynamics_hidden and model.reward_hidden at least one each "
             "or set it to 0."

@@ -22,7 +22,7 @@ class RegressorSettings(MDNSettings):
 
     Attributes:
         epochs: Passes over the data.
-        final_rate: Learning rate of the last epoch as a share of the first's; in between it falls as a cosine
+        final_rate: What the learning rate falls to after the last epoch, as a cosine, as a share of the first's
             (Loshchilov & Hutter 2017). 1 keeps it, as the thesis does.
         batch_size: Rows an update, at most; None for all, as the thesis names none.
         members: Networks of an ensemble, M; 1 is a single network with dropout.

@@ -46,7 +46,7 @@ class MixtureRegressor:
     """
 
     def __init__(self, context: RegressorContext, settings: RegressorSettings) -> None:
-        _require_data(context.datasets)
+        _require_data(context)
         settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
         self.settings, self.networks = settings, len(context.datasets)
         self._device = prepare_torch(context.device)
@@ -192,13 +192,17 @@ class MixtureRegressor:
     def _require_inputs(self, inputs: Floats) -> None:
         wanted = (self.networks, "N", self._x.shape[-1])
         shape = np.shape(inputs)
-        if len(shape) != 3 or (shape[0], shape[2]) != (wanted[0], wanted[2]) or not np.isfinite(inputs).all():
-            raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, not {shape}.")
+        fits = len(shape) == 3 and (shape[0], shape[2]) == (wanted[0], wanted[2]) and shape[1] > 0
+        if not (fits and np.isfinite(inputs).all()):
+            raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, N at least 1, not {shape}.")
 
 
-def _require_data(datasets: tuple[Dataset, ...]) -> None:
-    if not datasets:
-        raise InvalidValueError("A regressor needs at least one dataset.")
+def _require_data(context: RegressorContext) -> None:
+    datasets = context.datasets
+    if not datasets or len(datasets) != len(context.seeds):
+        raise InvalidValueError(
+            f"A regressor needs at least one dataset and a seed for each, not {len(datasets)} and {len(context.seeds)}."
+        )
     first = _shapes(datasets[0])
     if [len(shape) for shape in first] != [2, 2] or first[0][0] != first[1][0] or first[0][0] < 2:
         raise InvalidValueError(f"Dataset 0 must have inputs (N, X) and targets (N, D), N at least 2, not {first}.")

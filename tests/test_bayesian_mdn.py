@@ -231,11 +231,11 @@ def test_sigmas_stay_between_floor_and_ceiling() -> None:
     assert sigmas[2].item() == pytest.approx(1.0, rel=0.1)  # in between hardly touched
 
 
-def test_a_likelihood_that_is_not_finite_is_named_and_changes_nothing() -> None:
+def test_a_likelihood_that_is_not_finite_is_named_and_leaves_the_weights() -> None:
     model = BayesianMDN(2, 2, _SMALL, [generator(0), generator(1)])
     x, y = data(2)
     y[1, 3, 0] = math.nan
     before = [p.detach().clone() for p in model.network.parameters()]
-    with pytest.raises(DivergedError, match="likelihood of network 1 is no longer finite"):
+    with pytest.raises(DivergedError, match="likelihood of network 1 of 2 is no longer finite"):
         model.update(x, y)
     assert all(torch.equal(a, b) for a, b in zip(before, model.network.parameters(), strict=True))

@@ -211,6 +211,16 @@ def test_questions_lead_where_the_dynamics_do() -> None:
     )
 
 
+def test_a_prior_for_staying_is_no_knowledge() -> None:
+    """Of one part that holds all, it alone would call more than half sure."""
+    learner = agent(dynamics__factored=False)
+    codes = np.array([learner._modelled(code) for code in starts()])
+    assert not likeliest(learner.model, codes)[1].any()
+    live(learner, range(20), np.random.default_rng(0))
+    learner._learn(len(learner.memory))
+    assert (likeliest(learner.model, codes)[1] > 0.5).any()
+
+
 # --- the thesis' agents ------------------------------------------------------------------------------------------
 
 
@@ -229,14 +239,14 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch
     live_on_latents(learner, range(8), np.random.default_rng(0))
     model = learner.imagination.model
     kept = [weight.clone() for weight in model.dynamics.parameters()]
-    forgotten = [weight.clone() for weight in (*model.assessment.parameters(), *learner.controller.parameters())]
+    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.assessment, learner.controller)]
     resumed.restore(learner.state())
     learner.carry_over()
     resumed.carry_over()
     model = learner.imagination.model
     assert all(bool((a == b).all()) for a, b in zip(kept, model.dynamics.parameters(), strict=True))
-    anew = (*model.assessment.parameters(), *learner.controller.parameters())
-    assert any(bool((a != b).any()) for a, b in zip(forgotten, anew, strict=True))
+    for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):
+        assert any(bool((a != b).any()) for a, b in zip(before, part.parameters(), strict=True))
     assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
     assert same_learner(learner.state(), resumed.state())
     rngs = np.random.default_rng(1), np.random.default_rng(1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.controller import Controller
-from imagine_bench.agents.imagination import Imagination
-from imagine_bench.agents.memory import RealMemory
+from imagine_bench.agents.imagination import _BEYOND, Imagination
+from imagine_bench.agents.memory import Batch, RealMemory
 from imagine_bench.agents.mixture import Mixture
-from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
+from imagine_bench.agents.settings import ControllerSettings, ImaginationSettings, Settings, WorldModelSettings
 from imagine_bench.agents.world_model import WorldModel
 
 from imagine_bench.errors import DivergedError, InvalidValueError
@@ -136,6 +137,23 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
         kept.append(imagination.keeps(step))
         z = step.next_z
     assert kept[0].all() and not kept[-1].any(), "it began as latents are and did run away"
+
+
+def test_what_is_kept_of_a_rollout_that_runs_away_can_still_be_learned_from() -> None:
+    """Rows just below the limit leave a controller finite; far beyond it they would end the run."""
+
+    def learn(size: float) -> float:
+        draws = torch.Generator().manual_seed(1)
+        controller = Controller(24, 6, ControllerSettings(), draws)
+        z, next_z = (size * torch.randn(64, 24, generator=draws).sign() for _ in range(2))
+        action, reward = torch.randint(6, (64,), generator=draws), torch.randn(64, generator=draws)
+        loss = controller.update(Batch(z, action, reward, next_z, torch.zeros(64)))
+        assert np.isfinite(controller.arrays()["value"]).all()
+        return loss
+
+    assert np.isfinite(learn(0.99 * _BEYOND))
+    with pytest.raises(DivergedError):
+        learn(1e12)
 
 
 def test_a_variance_that_overflowed_is_doubt_without_bound() -> None:

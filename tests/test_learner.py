@@ -77,9 +77,9 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_to_the_bit(kind: str, monke
 def test_one_seed_acts_alike_until_imagination_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     agents = [make(context(monkeypatch, {"imagination.start_episode": 8})) for make in MAKERS.values()]
     histories = [live(agent, range(8), np.random.default_rng(0)) for agent in agents]
-    assert histories[0] == histories[1] == histories[2]
-    values = [agent.state().arrays["controller/value"] for agent in agents]
-    assert np.array_equal(values[0], values[1])
+    assert all(history == histories[0] for history in histories)
+    values = [agent.state().arrays["controller/value"] for agent in agents[:3]]  # the other two train a second one
+    assert np.array_equal(values[0], values[1]) and np.array_equal(values[0], values[2])
     for agent in agents:
         live(agent, range(8, 10), np.random.default_rng(1))
     assert not np.array_equal(*(agent.state().arrays["controller/value"] for agent in agents[:2]))

@@ -174,7 +174,10 @@ def test_max_norm_holds_after_an_update() -> None:
 def test_without_a_max_norm_weights_grow_as_they_like() -> None:
     model = make(max_norm=None, learning_rate=1.0)
     model.update(chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
-    assert all(network.weights[0].norm(dim=1).max() > 0.5 for network in model.networks)
+    assert all(
+        max(float(weight.detach().norm(dim=1).max()) for weight in network.weights) > 3.0  # the limit of the settings' default
+        for network in model.networks
+    )
 
 
 def test_a_loss_that_is_no_number_stops_the_run() -> None:

@@ -146,14 +146,15 @@ class ImagineAgent:
     def question(self, observation: Observation) -> NDArray[np.int64] | None:
         """What to ask; see :class:`imagine_bench.capabilities.Questioner` and :mod:`.questions`."""
         planning = self.settings.planning
-        return question(
-            self.model,
-            self._modelled(self.code(observation.frame)),
-            depth=planning.depth,
-            codes=planning.states,
-            least=planning.boredom,
-            without=self.memory.in_vain,
-        )
+        with self.meters.cpu_time("time/model_s"):
+            return question(
+                self.model,
+                self._modelled(self.code(observation.frame)),
+                depth=planning.depth,
+                codes=planning.states,
+                least=planning.boredom,
+                without=self.memory.in_vain,
+            )
 
     def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
         """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no answer."""
@@ -162,7 +163,8 @@ class ImagineAgent:
         self.memory.add(
             CodeTransition(code, action, following, reward, terminated, moves=False, pays=answer is not None)
         )
-        self._learn(len(self.memory))
+        with self.meters.cpu_time("time/model_s"):
+            self._learn(len(self.memory))
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Worth of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""

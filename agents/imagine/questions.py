@@ -18,6 +18,7 @@ from .outcomes import Floats
 
 _SURE = 0.5
 """Probability with which each macro-action of a question must lead where it is imagined to."""
+_ROUNDING = 1e-9
 
 Code = tuple[int, ...]
 
@@ -78,11 +79,16 @@ def last_step(model: StructuredModel, start: Code, actions: NDArray[np.int64]) -
 
 
 def likeliest(model: StructuredModel, codes: Codes) -> tuple[Codes, Floats]:
-    """Where every action most probably leads from ``codes`` (N, P), and how probably: (N, A, P) and (N, A)."""
+    """Where every action most probably leads from ``codes`` (N, P), and how probably: (N, A, P) and (N, A).
+
+    Of an action of which nothing is known, probability 0: a prior for staying is no knowledge.
+    """
     parts = model.dynamics.predict(codes)
     following = np.stack([part.expected.argmax(axis=2) for part in parts], axis=2)
     sure = np.prod([part.expected.max(axis=2) for part in parts], axis=0)
-    return following, sure
+    nothing = 1.0 - model.dynamics.parts[0].settings.persistence - _ROUNDING
+    untried = np.all([part.unknown > nothing for part in parts], axis=0)
+    return following, np.where(untried, 0.0, sure)
 
 
 def _doubt(model: StructuredModel, front: list[_Reached], following: Codes) -> Floats:
