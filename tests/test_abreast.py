@@ -6,11 +6,12 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from test_launchers import job
-from test_resume_learners import measured
+from test_resume_learners import KilledError, measured
 from test_runner import final_arrays, small
 
 from imagine_bench import encoders, registry, run_folder, runner
@@ -23,13 +24,13 @@ from imagine_bench.runs import Progress, RunSpec
 SEEDS = (0, 1, 2)
 
 
-def do(root: Path, agent: str, seed: int) -> RunResult | None:
+def do(root: Path, agent: str, seed: int, every_s: float = 20.0) -> RunResult | None:
     overrides = (("imagination.rehearsal_episodes", 5), ("imagination.start_episode", 3))
     protocol = small(
         agents=(agent,), seeds=SEEDS, budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=overrides
     )
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
-    spec = RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=encoder)
+    spec = RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=encoder, checkpoint_every_s=every_s)
     return runner.run(spec, root / f"seed_{seed}", lambda progress: None)
 
 
@@ -45,6 +46,28 @@ def test_learners_side_by_side_end_as_alone(tmp_path: Path, agent: str) -> None:
         for name, array in before.items():
             np.testing.assert_allclose(after[name], array, rtol=1e-3, atol=1e-4, err_msg=name)
     assert measured(abreast[0]) != measured(abreast[1]), "seeds must differ, or agreement shows nothing"
+
+
+def test_one_that_dies_abreast_and_goes_on_alone_ends_as_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent, real, saves = "imagination_uncertainty", runner.save_snapshot, []
+
+    def killing(folder: Path, snapshot: Any) -> Path:
+        if folder.parent.name == "seed_1":
+            saves.append(snapshot)
+            if len(saves) == 8:
+                raise KilledError
+        return real(folder, snapshot)
+
+    alone = do(tmp_path / "alone", agent, 1)
+    monkeypatch.setattr(runner, "save_snapshot", killing)
+    first, second = side_by_side([partial(do, tmp_path / "abreast", agent, seed, 0.0) for seed in (0, 1)])
+    assert isinstance(first, RunResult) and isinstance(second, KilledError)
+    resumed = do(tmp_path / "abreast", agent, 1, 0.0)
+    assert alone is not None and resumed is not None
+    assert [row.successes for row in alone.checkpoints] == [row.successes for row in resumed.checkpoints]
+    before, after = (final_arrays(tmp_path / way / "seed_1") for way in ("alone", "abreast"))
+    for name, array in before.items():
+        np.testing.assert_allclose(after[name], array, rtol=1e-3, atol=1e-4, err_msg=name)
 
 
 def test_what_a_run_costs_abreast_is_its_own(tmp_path: Path) -> None:

@@ -278,6 +278,11 @@ def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
     ):
         with pytest.raises(InvalidValueError, match=words):
             registry.make_regressor("mc_dropout", RegressorContext(datasets=(good, bad), seeds=seeds))
+    with pytest.raises(InvalidValueError, match="a seed for each, not 1 and 2"):
+        registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds))
+    sound = registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds[:1]))
+    with pytest.raises(InvalidValueError, match=r"N at least 1, not \(1, 0, 1\)"):
+        sound.assess(np.zeros((1, 0, 1)), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))

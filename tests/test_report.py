@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.protocol import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, words, write_report
-from imagine_bench.report.data import collect
+from imagine_bench.report.data import _nan_mean, collect
 from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.words import percent, signed_percent
 from imagine_bench.results import BenchResult
@@ -411,3 +411,8 @@ def test_no_two_registered_agents_share_a_colour() -> None:
     colors = [plots.color(agent) for agent in own]
     assert len(own) > 8 and len(set(colors)) == len(colors)
     assert plots.color("an agent that nobody registered").startswith("#")
+
+
+def test_boundless_doubt_is_shown_and_what_nobody_knows_is_left_out() -> None:
+    table = np.array([[1.0, np.inf, np.nan, np.nan], [3.0, 2.0, 4.0, np.nan]])
+    np.testing.assert_array_equal(_nan_mean(table), [2.0, np.inf, 4.0, np.nan])

@@ -23,7 +23,7 @@ LEARNERS = [
 """All of the suite but those that a library trains, which begin anew; fakes of other tests are registered too."""
 
 
-class _KilledError(Exception):
+class KilledError(Exception):
     pass
 
 
@@ -62,12 +62,12 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
     def killing(folder: Path, snapshot: Any) -> Path:
         saves.append(real(folder, snapshot))
         if len(saves) in (5, 9, 15):  # training before and after the first test, and within a test
-            raise _KilledError
+            raise KilledError
         return saves[-1]
 
     monkeypatch.setattr(runner, "save_snapshot", killing)
     for _ in range(3):
-        with pytest.raises(_KilledError):
+        with pytest.raises(KilledError):
             do(tmp_path / "run", agent, 0.0)
     resumed = do(tmp_path / "run", agent, 0.0)
     assert measured(whole) == measured(resumed)
