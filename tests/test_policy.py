@@ -235,7 +235,7 @@ def test_a_bench_without_an_imagining_agent_has_no_model_to_ask(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("folder", "complaint"),
     [
-        ("docs/results/arrow_puzzle_hard-thesis-dqn", "holds kept results and no agents; give a bench's own folder"),
+        ("docs/results/arrow_puzzle_hard-thesis", "holds kept results and no agents; give a bench's own folder"),
         ("docs/results/toy_regression-quick", "is of a regression task, in which no agent acts"),
         ("docs", "There is no docs/protocol.json"),
     ],
