@@ -8,6 +8,7 @@ that checkpoint.
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from imagine_bench.runs import Observer, Progress
 _LOST = 20
 """Times that a task may lose its worker or its node before its runs count as failed."""
 _POLL_S = 0.5
+_ANSWERS_WITHIN_S = 10.0
 _FREED_WITHIN_S = 60.0
 """How long the process of a dead node may hold on to its run's folder."""
 
@@ -62,12 +64,20 @@ class RayCluster:
         address = os.environ.get("RAY_ADDRESS")
         local = {} if address else {"num_cpus": self._workers, "include_dashboard": False}
         try:
+            _require_listening(address)
             ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **local)
-        except (ConnectionError, ValueError) as error:
+        except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
             raise SetupError(
                 f"No Ray cluster answers at RAY_ADDRESS={address} ({reason}); start one, or unset it."
             ) from error
+
+
+def _require_listening(address: str | None) -> None:
+    """Raise OSError where nothing listens at ``host:port``: Ray itself would try for minutes, or end the process."""
+    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWERS_WITHIN_S).close()
 
 
 def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) -> tuple[Failure, ...]:

@@ -117,9 +117,9 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
 
 @needs_ray
 @pytest.mark.slow
-def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "1")
-    with pytest.raises(SetupError, match=r"No Ray cluster answers at RAY_ADDRESS=127\.0\.0\.1:1"):
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", f"{scheme}127.0.0.1:1")
+    with pytest.raises(SetupError, match=rf"No Ray cluster answers at RAY_ADDRESS={scheme}127\.0\.0\.1:1 "):
         RayCluster(1).launch(jobs(tmp_path, (0,), 10), lambda _: None)
     assert list(tmp_path.iterdir()) == []
