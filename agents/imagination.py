@@ -54,7 +54,7 @@ class Imagined:
     """One imagined step of N rollouts.
 
     Attributes:
-        next_z: Shape (N, Z), within +-1e12; where that is reached, the closed loop has run away.
+        next_z: Shape (N, Z), within +-1e9; where that is reached, the closed loop has run away.
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).
