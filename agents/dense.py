@@ -2,8 +2,8 @@
 
 The mathematics is that of ``baddbmm``, ``relu`` and a multiplication by an inverted-dropout mask, differentiated by
 autograd; the tests hold it to that. What is saved: masks and the gate of ReLU act on the bits of a number as one
-integer operation, their factor is applied once, and hidden layers may compute in bfloat16. The output layer
-always computes in float32: a reward of 50 has no decimals in bfloat16.
+integer operation, their factor is applied once, and hidden layers may compute in bfloat16. What the output layer says
+is always computed in float32: a reward of 50 has no decimals in bfloat16. Its gradients are of the hidden layers' type.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ def dense_stack(
         biases: One a layer, (E, 1, out).
         keep: One a hidden layer, (E, N, out), int16: -1 keeps a unit, 0 drops it. None drops nothing.
         scale: What a unit that is kept is multiplied by; not read without ``keep``.
-        dtype: In which the hidden layers compute; the output layer computes in that of the weights.
+        dtype: In which the hidden layers compute forward, and all layers backward; the values of the output layer are
+            computed in the type of the weights.
 
     Returns:
         Shape (E, N, out).
@@ -46,7 +47,7 @@ class _Stack(torch.autograd.Function):
     """``g = relu(g_before W + b / scale^l) & keep`` at hidden layer l, from 0: the activation over ``scale^(l + 1)``.
 
     As ReLU lets a positive factor pass, those of all L layers meet in one, ``scale^L``, which is applied to the last
-    activation and to the gradient that comes back: no weight and no hidden unit is ever multiplied by it.
+    weights and to the gradient that comes back: no other weight and no unit is ever multiplied by it.
     """
 
     @staticmethod
@@ -59,26 +60,26 @@ class _Stack(torch.autograd.Function):
         for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
             inputs.append(g)
             rounded.append(weight.to(dtype))
-            g = _relu_(affine(g, rounded[-1], (bias * scale**-layer).to(dtype)))
+            g = affine(g, rounded[-1], _times(bias, scale**-layer).to(dtype), relu=True)
             if keep is not None:
                 _and_(g, keep[layer])
-        exact = _times(g.to(weights[-1].dtype), scale ** (layers - 1))
-        ctx.save_for_backward(*inputs, *rounded, g, exact, weights[-1])
+        ctx.save_for_backward(*inputs, *rounded, g, weights[-1])
         ctx.scale = scale
-        return affine(exact, weights[-1], biases[-1])
+        return affine(g.to(weights[-1].dtype), _times(weights[-1], scale ** (layers - 1)), biases[-1])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        *pairs, g, exact, last = ctx.saved_tensors
+        *pairs, g, last = ctx.saved_tensors
         inputs, rounded = pairs[: len(pairs) // 2], pairs[len(pairs) // 2 :]
-        by_weight = [product(exact.transpose(1, 2), gradient)]
+        back = _times(gradient, ctx.scale ** len(inputs)).to(g.dtype)
+        by_weight = [product(g.transpose(1, 2), back).to(last.dtype)]
         by_bias = [gradient.sum(dim=1, keepdim=True)]
-        back = product(_times(gradient, ctx.scale ** len(inputs)), last.transpose(1, 2)).to(g.dtype)
+        back = product(back, last.to(g.dtype).transpose(1, 2))
         for layer in reversed(range(len(inputs))):
             x, weight = inputs[layer], rounded[layer]
             _gate_(back, g)
             by_weight.append(product(x.transpose(1, 2), back).to(last.dtype))
-            by_bias.append(back.sum(dim=1, keepdim=True).to(last.dtype) * ctx.scale**-layer)
+            by_bias.append(_times(back.sum(dim=1, keepdim=True).to(last.dtype), ctx.scale**-layer))
             if layer > 0 or ctx.needs_input_grad[0]:
                 back, g = product(back, weight.transpose(1, 2)), x
         by_x = back.to(last.dtype) if ctx.needs_input_grad[0] else None
@@ -91,17 +92,6 @@ def _times(x: Tensor, scale: float) -> Tensor:
 
 def _bits(x: Tensor) -> Tensor:
     return x.view(_BITS[x.itemsize])
-
-
-def _relu_(x: Tensor) -> Tensor:
-    """``x.relu_()``; a bfloat16 below 0 is an integer below 0, for which torch is six times faster.
-
-    So is a NaN with the sign bit set, which becomes 0: gradients are where NaN must be looked for.
-    """
-    if x.itemsize == 2:
-        _bits(x).clamp_min_(0)
-        return x
-    return x.relu_()
 
 
 def _and_(x: Tensor, keep: Tensor) -> None:
