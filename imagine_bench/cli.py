@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from imagine_bench import registry
+from imagine_bench import __version__, registry
 from imagine_bench.archive import is_archive
 from imagine_bench.bench import bench, plan
 from imagine_bench.doctor import examine
@@ -375,11 +375,15 @@ def main(words: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if words is None else list(words)
     command: Any = None
     try:
+        if given == ["--version"]:
+            print(f"imagine-bench {__version__}")
+            return 0
         _require_clear(given)
         command = tyro.cli(
             Command,
             prog="imagine-bench",
-            description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs.",
+            description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
+            "--version says which this is.",
             args=given,
             config=(tyro.conf.OmitArgPrefixes,),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import bench_fakes  # noqa: F401 - registers the fakes
@@ -193,6 +194,11 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for name in ("arrow_puzzle_hard", "imagination_uncertainty", "thesis", "kinematic", "strong", "arrow_puzzle-mild"):
         assert name in out
+
+
+def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"imagine-bench {version('imagine-bench')}\n"
 
 
 def test_who_stops_reading_gets_no_traceback() -> None:
