@@ -22,7 +22,7 @@ _FORMATS = (torch.float32, torch.bfloat16)
 def product(a: Tensor, b: Tensor) -> Tensor:
     """``a @ b`` for each member: (E, N, I) and (E, I, O) give (E, N, O). Any strides; without a gradient of its own."""
     if a.dtype == torch.float32 and _by_onednn(a, b):  # of bfloat16, bmm is oneDNN's already
-        return stacked([_ONEDNN(x, y.t(), None, "none", [], "") for x, y in zip(a, b, strict=True)])
+        return stacked([_ONEDNN(x, y.t(), None, "none", [], "") for x, y in zip(a.unbind(), b.unbind(), strict=True)])
     return torch.bmm(a, b)
 
 
@@ -32,12 +32,14 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, *, relu: bool = False) -> Te
     With ``relu``, what is below 0 becomes 0, by oneDNN in the same pass over memory, as the bias is added.
     """
     if _by_onednn(x, weight):
-        parts, then = zip(x, weight, bias, strict=True), "relu" if relu else "none"
+        parts, then = zip(x.unbind(), weight.unbind(), bias.unbind(), strict=True), "relu" if relu else "none"
         return stacked([_ONEDNN(rows, w.t(), b[0], then, [], "") for rows, w, b in parts])
-    # Of several members with one output each, MKL sums in another order; no member may change another's bits.
-    members = 1 if weight.shape[2] == 1 else len(weight)
-    parts = zip(bias.split(members), x.split(members), weight.split(members), strict=True)
-    result = joined([torch.baddbmm(*part) for part in parts])
+    if weight.shape[2] == 1 < len(weight):
+        # Of several members with one output each, MKL sums in another order; no member may change another's bits.
+        parts = zip(bias.split(1), x.split(1), weight.split(1), strict=True)
+        result = torch.cat([torch.baddbmm(*part) for part in parts])
+    else:
+        result = torch.baddbmm(bias, x, weight)
     return _relu_(result) if relu else result
 
 
