@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -11,10 +12,15 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
 
+from imagine_bench import registry
 from imagine_bench.cli import main, parse_settings
+from imagine_bench.encoders import bundled
 from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.launchers import LocalPool
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.kinds import KINDS
+from imagine_bench.launchers import LAUNCHERS, LocalPool
 from imagine_bench.store import newest_bench
+from imagine_bench.studies import STUDIES
 
 _HERE = Path(__file__).parent
 
@@ -192,8 +198,11 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
 def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     out = capsys.readouterr().out
-    for name in ("arrow_puzzle_hard", "imagination_uncertainty", "thesis", "kinematic", "strong", "arrow_puzzle-mild"):
-        assert name in out
+    words = set(re.split(r"[\s,]+", out))
+    for kind in KINDS.values():
+        assert words >= {*kind.tasks, *kind.learners(), *registry.load(kind.presets)}
+    assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
+    assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}
 
 
 def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,7 +25,6 @@ from torch import Tensor
 
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, UnknownNameError
 from imagine_bench.preprocessing import gray_strips
-from imagine_bench.seeding import SeedTree
 
 CHAPTER_5 = RECIPES["chapter_5"]
 TINY = replace(
@@ -264,12 +263,13 @@ def test_thesis_recipe_trains() -> None:
     assert (untrained.mean(torch.zeros(200, 8)) - target).square().mean() > 2.0 * constant
 
 
-def test_training_and_held_out_frames_differ() -> None:
-    first, second = (
-        draw_frames(arrow_spec(), "mild", 20, SeedTree(0).child(name, "drawn_arrows", "mild").generator())[0]
-        for name in ("encoder_training", "encoder_probe")
-    )
-    assert not any(np.array_equal(a, b) for a in first for b in second)
+def test_training_and_held_out_frames_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw, sets = encoder_training.frame_set, list[encoder_training.FrameSet]()
+    monkeypatch.setattr(encoder_training, "frame_set", lambda *how: (sets.append(draw(*how)), sets[-1])[1])
+    train_encoder(arrow_spec(), recipe=TINY_CONV, appearance="mild", seed=0)
+    first, second = (found.pictures for found in sets)
+    assert (len(first), len(second)) == (TINY_CONV.frames, TINY_CONV.held_out_frames)
+    assert not any(torch.equal(a, b) for a in first for b in second)
 
 
 def test_divergence_stops_training(monkeypatch: pytest.MonkeyPatch) -> None:

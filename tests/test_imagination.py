@@ -273,7 +273,10 @@ def test_rollouts_start_from_the_current_state_or_from_remembered_ones() -> None
         assert {tuple(row) for row in imagination.memory.arrays()["z"].tolist()} == seen
 
 
-def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happened() -> None:
+@pytest.mark.parametrize(("quantile", "threshold", "kept"), [(1.0, 49.0, [3, 0]), (0.0, 0.0, [0, 0])])
+def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happened(
+    quantile: float, threshold: float, kept: list[int]
+) -> None:
     class Graded(CountingModel):
         """Doubts a transition out of (i, c) the more, the larger i: its variance is i squared."""
 
@@ -283,11 +286,11 @@ def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happe
             return Mixture(torch.zeros(2, len(z), 1), means, torch.full_like(means, -9.0))
 
     imagination, controller = make(
-        filtered=True, model=Graded(), depth=1, reduction="max", threshold_quantile=1.0, threshold=99.0
+        filtered=True, model=Graded(), depth=1, reduction="max", threshold_quantile=quantile, threshold=99.0
     )
     accepted = [
         imagination.rollouts(controller, torch.tensor([doubt, 0.0]), remembering(8), 0.5).accepted
         for doubt in (6.9, 7.1)
     ]
-    assert imagination.threshold == 49.0
-    assert accepted == [3, 0]
+    assert imagination.threshold == threshold
+    assert accepted == kept

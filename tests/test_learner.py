@@ -188,6 +188,8 @@ def test_imagining_for_a_picture_changes_nothing_and_follows_its_generator(
     assert same(before, agent.state())
     assert np.array_equal(first.actions, actions)
     assert np.array_equal(first.epistemic, again.epistemic)
+    other = agent.imagine(frame(1), actions=actions, depth=4, rng=np.random.default_rng(4))
+    assert not np.array_equal(first.epistemic, other.epistemic)
     shapes = {name: getattr(first, name).shape for name in first.__dataclass_fields__}
     assert shapes == {
         **dict.fromkeys(("actions", "rewards", "p_terminated", "epistemic", "aleatoric", "modal", "accepted"), (4,)),
@@ -240,6 +242,10 @@ def test_shown_rollouts_stay_rejected_after_the_first_rejection(monkeypatch: pyt
     assert not strict.imagine(frame(0), actions=actions, depth=3, rng=rng).accepted.any()
     free = imagination_agents.make(context(monkeypatch, overrides))
     assert free.imagine(frame(0), actions=actions, depth=3, rng=rng).accepted.all()
+    once = iter([True, False, True])
+    monkeypatch.setattr(strict.imagination, "keeps", lambda step: torch.tensor([next(once)]))
+    shown = strict.imagine(frame(0), actions=actions, depth=3, rng=rng)
+    assert shown.accepted.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_planning_and_scene_have_the_same_servos(arm, turner):
 
 
 @pytest.mark.parametrize(("cube", "clockwise"), list(itertools.product(range(3), (True, False))))
-def test_executed_turn_keeps_joint_speed_and_effort_limits(arm, turner, cube, clockwise):
+def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     place(model, data, (0.05, -0.05, QUARTER_RAD))
     result = turner.turn(data, cube=cube, clockwise=clockwise, capture_motion_hz=1 / TIMESTEP_S)

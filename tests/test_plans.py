@@ -19,6 +19,7 @@ from test_recording import rerun
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.checkpointing import load_newest
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.plans import Plan, carry_out, fewest_actions, make_env, make_plans
@@ -259,6 +260,11 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     result = run(spec, tmp_path / "run", lambda progress: None)
     who = load_trained(result.folder)
     assert who.episodes == 3 and who.task.id == "arrow_puzzle"
+    left = load_newest(result.folder / "checkpoints")
+    assert left is not None
+    taken_up = who.agent.state().arrays
+    assert set(taken_up) == set(left.agent.arrays)
+    assert all(np.array_equal(array, taken_up[name]) for name, array in left.agent.arrays.items())
     first, again = (next(make_plans(load_trained(result.folder), count=1, execution="kinematic")) for _ in range(2))
     assert np.array_equal(first.compared.rollout.actions, again.compared.rollout.actions)
     assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -321,7 +322,14 @@ def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
     start = np.array(spec.rules.start_states[0])
     frame: Frame = spec.render_macrostates(start[None], "clean", rng)[0]
     rollout = FakeImaginer().imagine(frame, actions=None, depth=8, rng=rng)
-    compared = compare_rollout(spec, frame=frame, macrostate=start, rollout=rollout, appearance="clean", rng=rng)
+
+    def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
+        frames = np.zeros((len(states), 64, 64, 3), np.uint8)
+        frames[:, 0, : states.shape[1], 0] = states
+        return frames
+
+    showing = dataclasses.replace(spec, render_macrostates=labelled)
+    compared = compare_rollout(showing, frame=frame, macrostate=start, rollout=rollout, appearance="clean", rng=rng)
     state, over = tuple(int(value) for value in start), False
     for depth, action in enumerate(rollout.actions):
         reward = 0.0
@@ -329,6 +337,7 @@ def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
             (outcome,) = spec.rules.outcomes(state, int(action))
             state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
         assert tuple(compared.real_macrostates[depth]) == state
+        assert tuple(compared.real_frames[depth, 0, : len(state), 0]) == state, "the frames must show what is real"
         assert (compared.real_rewards[depth], compared.real_terminated[depth]) == (reward, over)
     assert over, "the case never met an end: choose another seed"
     assert compared.real_frames.shape == (8, 64, 64, 3)

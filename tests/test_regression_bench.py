@@ -102,7 +102,11 @@ def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) ->
 
         with pytest.raises(_Killed):
             run(spec, tmp_path / "parts", observe)
-    parts = run(spec, tmp_path / "parts", silent)
+    told_after: list[Progress] = []
+    parts = run(spec, tmp_path / "parts", told_after.append)
+    told_whole: list[Progress] = []
+    run(spec, tmp_path / "again", told_whole.append)
+    assert 0 < told_whole[0].done < told_after[0].done, "it must have gone on, not begun anew"
     for mine, theirs in zip(whole.rows, parts.rows, strict=True):
         for name in set(mine) - {"train_cpu_s", "measure_cpu_s"}:
             assert mine[name] == theirs[name] or (np.isnan(mine[name]) and np.isnan(theirs[name])), name
