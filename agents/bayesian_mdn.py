@@ -94,7 +94,7 @@ class BayesianMDN:
             The losses before the step, in nats. Shape (E,).
 
         Raises:
-            DivergedError: A loss is NaN or infinite; the weights are left as they were.
+            DivergedError: A loss or gradient is NaN or infinite; weights and statistics are left as they were.
         """
         masks = self.network.draw_masks(x.shape[1], self._generators)
         outputs = self.network(x.mT.contiguous(), masks).mT  # [E, N, out]
@@ -106,6 +106,7 @@ class BayesianMDN:
                 f"({losses[wrong[0]].item()}). Lower learning_rate or raise sigma_floor."
             )
         self.optimiser.step(losses.sum())
+        self.network.note()
         return losses.detach()
 
     def trained(self) -> TrainedMDN:

@@ -35,6 +35,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         UnknownNameError: An unknown recipe or appearance.
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
+        InvalidValueError: A recipe of codes found no part with two values in so few or such like frames.
     """
     recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)

@@ -130,6 +130,7 @@ def train_encoder(
     Raises:
         UnknownNameError: An unknown recipe or appearance.
         DivergedError: The loss became NaN or infinite.
+        InvalidValueError: A recipe of codes found no part with two values in so few or such like frames.
     """
     recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     require_known("appearance", appearance, APPEARANCES)

@@ -36,8 +36,8 @@ class NormedMLP(nn.Module):
             member is the same network alone and among others.
         dropout: Probability of dropping a unit of a hidden layer that another one follows, in [0, 1). Units right
             before the output stay: their noise is noise of the outputs, which a mixture would take for the data's.
-        precision: Type of the products between hidden layers while training. Parameters, statistics, first and last
-            layer and all predictions are float32 whatever it is.
+        precision: Type of the products between hidden layers while training, and on a CPU that in which each batch's
+            statistics come. Parameters, first and last layer and all predictions are float32 whatever it is.
     """
 
     def __init__(
@@ -52,6 +52,7 @@ class NormedMLP(nn.Module):
         self.sizes, self.members, self.dropout, self.precision = tuple(sizes), len(generators), dropout, precision
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         self.batches = 0
+        self._statistics: list[tuple[Tensor, Tensor]] = []
         device = generators[0].device
         for layer, (n_in, n_out) in enumerate(pairwise(sizes)):
             bound = (6.0 / (n_in + n_out)) ** 0.5
@@ -74,12 +75,12 @@ class NormedMLP(nn.Module):
         return masks.mul_(-kept_scale(self.dropout)).split(hidden, dim=1)
 
     def forward(self, x: Tensor, masks: Sequence[Tensor] | None) -> Tensor:
-        """Map a training batch (E, in, N) to (E, out, N), and note its statistics for :meth:`folded`."""
+        """Map a training batch (E, in, N) to (E, out, N); :meth:`note` takes its statistics for :meth:`folded`."""
         last = len(self.weights) - 1
-        statistics = []
+        self._statistics = []
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x, mean, rstd = torch.native_layer_norm(x, x.shape[-1:], None, None, EPSILON)
-            statistics.append((mean, rstd))
+            self._statistics.append((mean.detach(), rstd.detach()))
             if layer == 0:
                 x = torch.baddbmm(bias, weight, x)  # [E, out, N]
             elif layer < last:
@@ -89,7 +90,6 @@ class NormedMLP(nn.Module):
             if layer < last:
                 x = x.to(self.precision).relu()
                 x = x if masks is None or layer >= len(masks) else x * masks[layer]
-        self._note(statistics)
         return x
 
     def _outputs(self, weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
@@ -102,11 +102,14 @@ class NormedMLP(nn.Module):
         return bias + rounded + rounding
 
     @torch.no_grad()
-    def _note(self, statistics: list[tuple[Tensor, Tensor]]) -> None:
-        """Move the running means and variances toward those of a batch; the first batches count equally."""
+    def note(self) -> None:
+        """Move the running means and variances toward those of the last batch; the first batches count equally.
+
+        On a CPU those of a bfloat16 layer come in bfloat16.
+        """
         self.batches += 1
         share = max(1.0 - MOMENTUM, 1.0 / self.batches)
-        for layer, (mean, rstd) in enumerate(statistics):
+        for layer, (mean, rstd) in enumerate(self._statistics):
             self.get_buffer(f"mean_{layer}").lerp_(mean.float(), share)
             variance = (rstd.float().pow(-2) - EPSILON).clamp_min_(0.0)
             self.get_buffer(f"variance_{layer}").lerp_(variance, share)

@@ -34,7 +34,7 @@ POOL = 2
 FEATURES = 16
 """Principal components of a part's pixels in which values are told apart."""
 EXEMPLARS = 600
-"""Pictures kept a part; a new picture takes the value of the nearest one."""
+"""Drawn, with replacement, of the pictures of a part and kept; a new picture takes the value of the nearest one."""
 _STILL = 0.02  # standard deviation, of the picture's median brightness, below which a pixel shows nothing
 _INDEPENDENT = 0.8  # mean distance (1 - dependence) at which two groups of pixels are two parts
 _LEAST_VARIANCE = 0.02  # share of the picture's variance that makes a part
@@ -122,7 +122,7 @@ def discover(pictures: Tensor, generator: torch.Generator) -> PartsCoder:
 
     Args:
         pictures: Shape (N, C, H, W), in [0, 1]; at most 6000 of them are looked at.
-        generator: Draws which.
+        generator: Draws which, and the exemplars.
 
     Raises:
         InvalidValueError: Nothing in the pictures ever changes, or no part has more than one value.
@@ -278,7 +278,7 @@ def _part(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> _Part | None
 
 
 def _balanced(value: NDArray[np.int64], generator: torch.Generator) -> NDArray[np.int64]:
-    """Rows of exemplars, the same number of each value, some of them twice where there are too few."""
+    """Rows of exemplars, drawn with replacement, as many of each value but for one."""
     kinds = int(value.max()) + 1
     rows: list[NDArray[np.int64]] = []
     for index in range(EXEMPLARS):

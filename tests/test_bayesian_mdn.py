@@ -93,6 +93,7 @@ def test_folding_gives_what_the_normed_network_gives_on_a_batch_of_the_noted_sta
     x, _ = data(2, rows=300)
     for _ in range(3):
         expected = network(x.mT.contiguous(), None).mT  # the same batch again: the noted statistics are its own
+        network.note()
     torch.testing.assert_close(network.folded()(x), expected, rtol=1e-4, atol=1e-4)
 
 
@@ -103,8 +104,7 @@ def test_dropped_units_are_dropped_after_folding_too() -> None:
     mask = [dropout_mask((1, 16), 0.5, generator(5)) for _ in range(2)]
     spread = [(m.float() * -2.0).view(1, 16, 1).expand(1, 16, 200).contiguous() for m in mask]
     expected = network(x.mT.contiguous(), spread).mT
-    network.batches = 0
-    network(x.mT.contiguous(), spread)
+    network.note()
     torch.testing.assert_close(sample_outputs(network.folded(), x[0], mask)[0], expected[0], rtol=1e-3, atol=1e-3)
 
 
@@ -231,11 +231,13 @@ def test_sigmas_stay_between_floor_and_ceiling() -> None:
     assert sigmas[2].item() == pytest.approx(1.0, rel=0.1)  # in between hardly touched
 
 
-def test_a_likelihood_that_is_not_finite_is_named_and_leaves_the_weights() -> None:
+def test_a_likelihood_that_is_not_finite_is_named_and_leaves_weights_and_statistics() -> None:
     model = BayesianMDN(2, 2, _SMALL, [generator(0), generator(1)])
     x, y = data(2)
     y[1, 3, 0] = math.nan
-    before = [p.detach().clone() for p in model.network.parameters()]
+    before = [values.clone() for values in model.network.state_dict().values()]
     with pytest.raises(DivergedError, match="likelihood of network 1 of 2 is no longer finite"):
         model.update(x, y)
-    assert all(torch.equal(a, b) for a, b in zip(before, model.network.parameters(), strict=True))
+    after = model.network.state_dict().values()
+    assert len(before) > len(list(model.network.parameters())), "the running statistics must be among them"
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)) and model.network.batches == 0

@@ -56,6 +56,22 @@ def test_what_was_never_seen_is_unknown_and_chance_is_learned_as_chance() -> Non
     noisy = dynamics.predict(np.array([[0, 0]]))[1]
     assert noisy.expected[0, 1] == pytest.approx(np.full(3, 1 / 3), abs=0.08)
     assert noisy.unknown[0, 1] < 0.01 < noisy.unknown[0, 0], "noise that is known is not novel"
+    assert noisy.seen[0, 1] == pytest.approx(noisy.expected[0, 1], abs=0.01) and not noisy.seen[0, 0].any()
+
+
+@pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7), (3, 3, 2)])
+def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, ...]) -> None:
+    """Whether a tie between what was seen and the prior is rounded up or down must not decide it."""
+    model, rng = StructuredModel(sizes, 2, ImagineSettings()), np.random.default_rng(0)
+    code = (0,) * len(sizes)
+    for _ in range(3):
+        model.add(CodeTransition(code, 0, code, -1.0, False))
+    expected = [part.expected[0, 1] for part in model.dynamics.predict(np.array([code]))]
+    drawn = [model.sample(np.array(code), 1, rng) for _ in range(400)]
+    assert [sure for _, sure in drawn] == pytest.approx([np.prod([chance.max() for chance in expected])] * 400)
+    stayed = np.mean([not following.any() for following, _ in drawn])
+    assert stayed == pytest.approx(np.prod([chance[0] for chance in expected]), abs=0.1) and stayed < 0.8
+    assert all(not model.sample(np.array(code), 0, rng)[0].any() for _ in range(20)), "seen to stay"
 
 
 def outcomes_of(rows: list[CodeTransition], sizes: tuple[int, ...] = (3, 3, 2)) -> Outcomes:
@@ -222,6 +238,17 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_to_the_bit(factored: bool) 
 def test_a_foreign_snapshot_is_refused() -> None:
     with pytest.raises(ArtefactError, match=r"settings\.dynamics\.factored"):
         agent().restore(agent(dynamics__factored=False).state())
+
+
+@pytest.mark.parametrize(("name", "value"), [("code_sizes", [3, 3, 5]), ("n_actions", ACTIONS + 2)])
+def test_a_snapshot_of_other_parts_or_actions_is_refused(name: str, value: object) -> None:
+    learner = agent()
+    live(learner, range(2), np.random.default_rng(0))
+    before = learner.state()
+    foreign = AgentState(arrays=agent().state().arrays, values={**before.values, name: value})
+    with pytest.raises(ArtefactError, match=f"{name!r} is .* in the snapshot and"):
+        learner.restore(foreign)
+    assert same(before, learner.state())
 
 
 def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothing() -> None:

@@ -245,6 +245,8 @@ class ImagineAgent:
             "exploration": self.rng.bit_generator.state,
             "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
+            "code_sizes": list(self.sizes),
+            "n_actions": self.n_actions,
         }
         return AgentState(arrays=snapshot.prefixed("memory", self.memory.arrays()), values=values)
 
@@ -254,7 +256,7 @@ class ImagineAgent:
         Raises:
             ArtefactError: It does not fit this agent; nothing was changed.
         """
-        snapshot.require_fit(state, self.state(), equal=("settings",))
+        snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
         self.memory.load(snapshot.below("memory", state.arrays))
         self._start_anew()
         for began in state.values["tasks"]:

@@ -27,7 +27,8 @@ class PartPrediction:
 
     Attributes:
         expected: Predictive probability of each value. Shape (N, A, K).
-        seen: The same from observed frequencies alone, zeros where nothing was seen. Shape (N, A, K).
+        seen: The same from what was observed alone: that the action leaves the part as it is, if it was ever tried, and
+            frequencies; zeros where nothing was. Shape (N, A, K).
         unknown: Weight of the prior in ``expected``. Shape (N, A).
     """
 
@@ -90,11 +91,13 @@ class PartDynamics:
         prior *= (1.0 - settings.persistence) / prior.sum()
         self.evidence = np.tile(np.log([settings.persistence, *prior]), (n_actions, 1))
         """Log prior plus log evidence that the action leaves the part alone, then of each table. Shape (A, 1 + T)."""
+        self._tried = np.zeros(n_actions)
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
         slip, concentration = self.settings.slip, self.settings.concentration
         stayed = value == code[self.part]
+        self._tried[action] = 1.0
         self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / max(1, self.values - 1))
         for index, table in enumerate(self.tables):
             counts = table.counts[action, int(table.row(code[None])[0])]
@@ -112,7 +115,7 @@ class PartDynamics:
         """What every action would lead to in ``codes`` (N, P)."""
         weight, prior = self.weights(), self.settings.concentration
         stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.part]][:, None, :]  # [N, A, K]
-        expected, seen, unknown = stay.copy(), stay, np.zeros(stay.shape[:2])
+        expected, seen, unknown = stay, stay * self._tried[:, None], np.zeros(stay.shape[:2])
         for index, table in enumerate(self.tables):
             counts = table.counts[:, table.row(codes)].transpose(1, 0, 2)  # [N, A, K]
             total, own = counts.sum(axis=2, keepdims=True), weight[None, :, 1 + index, None]
