@@ -169,27 +169,6 @@ def test_decay_leaves_first_units_their_bends() -> None:
     assert (spread < 1e-6 * spread.amax()).float().mean() < 0.1
 
 
-def random_mixtures(shape: tuple[int, ...], dtype: torch.dtype) -> Mixture:
-    g = generator(3)
-    weights = torch.randn(*shape[:-1], generator=g, dtype=dtype).log_softmax(-1)
-    return Mixture(
-        weights, 3 * torch.randn(*shape, generator=g, dtype=dtype), torch.randn(*shape, generator=g, dtype=dtype)
-    )
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_the_three_parts_are_the_variance_of_all_samples_together(dtype: torch.dtype, tolerance: float) -> None:
-    """Identity 4.24 against a float64 mixture of all T K components."""
-    samples = random_mixtures((50, 30, 10, 3), dtype)
-    parts = decompose(samples)
-    weights = samples.log_weights.double().exp().movedim(0, 1).reshape(30, -1, 1) / 50
-    means, sigmas = (v.double().movedim(0, 1).reshape(30, -1, 3) for v in (samples.means, samples.log_sigmas.exp()))
-    mean = (weights * means).sum(1, keepdim=True)
-    total = (weights * (sigmas**2 + (means - mean) ** 2)).sum(1)
-    found = (parts.epistemic + parts.aleatoric + parts.modal).double()
-    assert ((found - total).abs() / total).max() < tolerance
-
-
 def gaussians(means: list[float], sigma: float) -> Mixture:
     """T mixtures of one component for one row of one dimension."""
     count = len(means)

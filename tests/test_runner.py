@@ -231,15 +231,17 @@ def test_stopping_anywhere_changes_nothing(tmp_path: Path, monkeypatch: pytest.M
 
 
 _CHILD = """
-import json, sys
+import json, signal, sys
 from pathlib import Path
 import bench_fakes
 from imagine_bench import runner
 from imagine_bench.protocol import Protocol
 from imagine_bench.runs import RunSpec
 
-save = runner.save_snapshot
+save, saves = runner.save_snapshot, iter(range(int(sys.argv[3])))
 def saying(folder, snapshot):
+    if next(saves, None) is None:
+        signal.pause()  # whoever is to kill this is late
     print("saving", flush=True)
     return save(folder, snapshot)
 
@@ -255,7 +257,7 @@ def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
     folder, settings = tmp_path / "run", json.dumps(small(**changes).as_dict())
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     for saves, delay_s in ((13, 0.0), (31, 0.002), (26, 0.009)):  # in training, in a test, and in the midst of writing
-        command = [sys.executable, "-c", _CHILD, str(folder), settings]
+        command = [sys.executable, "-c", _CHILD, str(folder), settings, str(saves)]
         with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
             assert child.stdout is not None
             lines = [child.stdout.readline() for _ in range(saves)]
