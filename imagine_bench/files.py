@@ -8,6 +8,7 @@ import fcntl
 import hashlib
 import io
 import json
+import math
 import os
 import socket
 import time
@@ -93,6 +94,15 @@ def write_bytes(path: Path, content: bytes) -> None:
             sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def with_null(value: Any) -> Any:
+    """NaN as None, all the way down: JSON has a word for what is unknown, and none for what is no number."""
+    if isinstance(value, dict):
+        return {name: with_null(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [with_null(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def write_json(path: Path, value: Any) -> None:

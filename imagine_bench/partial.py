@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from imagine_bench import run_folder
 from imagine_bench.checkpointing import has_checkpoint, load_newest
 from imagine_bench.errors import ArtefactError
 from imagine_bench.files import read_json, reading
 from imagine_bench.protocol import Protocol
-from imagine_bench.results import BenchResult, RunResult
+from imagine_bench.results import BenchResult, Checkpoint, RunResult
 from imagine_bench.runs import Counters
 from imagine_bench.store import BenchStore, bench_facts, load_bench, read_protocol
+
+_MEANS = ("time/", "loss/", "imagination/")
+"""Diagnostics that are means since the test before."""
 
 
 def load_so_far(folder: Path) -> BenchResult:
@@ -95,7 +100,7 @@ def _load(folder: Path) -> RunResult:
 
 def cut(result: RunResult, part: Protocol) -> RunResult:
     """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
-    kept = tuple(row for row in result.checkpoints if row.episodes in part.budgets)
+    kept = _as_if_untested(result.checkpoints, part.budgets)
     episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
     return dataclasses.replace(
         result,
@@ -105,6 +110,31 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
         imagined=result.imagined if whole else (),
         courses=result.courses if whole else (),
     )
+
+
+def _as_if_untested(rows: Sequence[Checkpoint], budgets: Collection[int]) -> tuple[Checkpoint, ...]:
+    """The rows at some budgets; what agents said of the time since a test that is left out counts for the next."""
+    kept, since, before = list[Checkpoint](), list[Checkpoint](), 0
+    for row in rows:
+        since.append(row)
+        if row.episodes in budgets:
+            kept.append(row if len(since) == 1 else _over(since, before))
+            since, before = [], row.env_steps
+    return tuple(kept)
+
+
+def _over(rows: Sequence[Checkpoint], before: int) -> Checkpoint:
+    """The last of some rows with the mean times a real step of all of them, who began after ``before`` steps.
+
+    Means over losses and over imagined transitions are left out: how many there were of these is not kept.
+    """
+    last, steps = rows[-1], np.diff([before, *(row.env_steps for row in rows)])
+    said = {name: value for name, value in last.diagnostics.items() if not name.startswith(_MEANS)}
+    for name in {name for row in rows for name in row.diagnostics if name.startswith("time/")}:
+        values = np.array([row.diagnostics.get(name, np.nan) for row in rows])
+        if np.isfinite(values).any() and steps.sum() > 0:
+            said[name] = float(np.nansum(values * steps) / steps.sum())
+    return dataclasses.replace(last, diagnostics=said)
 
 
 def _unfinished(folder: Path) -> RunResult:

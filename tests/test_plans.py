@@ -185,6 +185,13 @@ def test_what_is_written_holds_every_plan(tmp_path: Path) -> None:
     assert len(list((tmp_path / "plans").glob("failed_*.png"))) == min(12, summary.attempted - summary.solved) > 0
 
 
+def test_what_is_written_is_json_where_no_plan_was_solved(tmp_path: Path) -> None:
+    refused = carried_out(Dreamer(choose=lambda state: 0, accepts=False), 2)
+    write_plans(tmp_path / "plans", refused, TASK, {}, strips=1)
+    text = (tmp_path / "plans" / "summary.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail)["mean_length"] is None
+
+
 def test_new_plans_leave_nothing_of_the_old_ones(tmp_path: Path) -> None:
     folder = tmp_path / "plans"
     write_plans(folder, carried_out(Dreamer(choose=lambda state: 0), 12), TASK, {}, strips=3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.kinds import KINDS
 from imagine_bench.quality import generalisation_report
 from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext, runner
-from imagine_bench.regression.results import RegressionResult, RegressionRun
+from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
 from imagine_bench.report import robot_ik, toy_regression
 from imagine_bench.report.page import flat
@@ -150,6 +151,16 @@ def test_runs_of_other_settings_are_not_averaged(toy: RegressionRun, tmp_path: P
     other = replace(same, settings={**toy.settings, "precision": "float64"})
     with pytest.raises(ArtefactError, match=r"ran with precision '.*' and .*seed_1 with 'float64'"):
         RegressionResult(runs=(toy, other), **facts)
+
+
+def test_measures_that_an_older_version_had_not_are_empty_cells(toy: RegressionRun, tmp_path: Path) -> None:
+    older = [{name: value for name, value in row.items() if name != "crps"} for row in toy.rows[:2]]
+    folder = Path(shutil.copytree(toy.folder, tmp_path / "run"))
+    finish(folder, [*older, *toy.rows[2:]], toy.evaluations)
+    found = load_run(folder)
+    assert np.isnan(found.values("base", "crps")).all()
+    np.testing.assert_array_equal(found.values("low_data", "crps"), toy.values("low_data", "crps"))
+    assert np.isfinite(found.values("base", "coverage_0.8")).all()
 
 
 def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path: Path) -> None:

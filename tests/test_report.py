@@ -363,6 +363,22 @@ def test_few_seeds_are_called_few(count: int, warned: bool) -> None:
     assert bool(words.few_words(count)) is warned
 
 
+@pytest.mark.parametrize("agents", [("dqn", "imagination"), ("imagination", "imagination_uncertainty"), ("dqn",)])
+def test_few_seeds_are_called_few_whoever_is_compared(agents: tuple[str, ...], tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, budgets=(5, 10))
+    assert words.few_words(3)[0] in words.answers(collect(bench_result(tmp_path, protocol=protocol)))
+
+
+def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(result: BenchResult) -> None:
+    data = collect(result)
+    loop = data.open_loop["imagination"]
+    none = dataclasses.replace(loop, aleatoric=np.zeros_like(loop.aleatoric))
+    panels = plots.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes
+    fewer = plots.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": none})).axes
+    assert len(panels[3].lines) == len(fewer[3].lines) + 1
+    assert panels[3].get_yscale() == fewer[3].get_yscale() == "log"
+
+
 def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(SetupError, match=r"Cannot write .*a part of that path is a file"):

@@ -77,6 +77,13 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     assert "| appearance | mild | table |" in (tmp_path / "out" / "study.md").read_text()
 
 
+def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
+    alone = dataclasses.replace(STUDY, variants=STUDY.variants[:1])
+    write_study(tmp_path / "out", alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
+    assert not (tmp_path / "out" / "study.png").exists()
+    assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
+
+
 def test_tuning_runs_are_tested_on_starts_that_no_reported_run_meets(tmp_path: Path) -> None:
     seeds: dict[int, list[int]] = {}
     real_reset = runner.gymnasium.make

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_results import bench_result
 from test_runner import small
 
 from imagine_bench.archive import load_archive
@@ -16,6 +17,8 @@ from imagine_bench.bench import bench
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.launchers import launcher
+from imagine_bench.partial import cut
+from imagine_bench.protocol import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.results import BenchResult
 from imagine_bench.store import load_bench
@@ -52,6 +55,22 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
     assert joined.folder not in (first, second) and joined.folder.name.startswith("together-")
     assert dataclasses.asdict(joined.protocol)["evaluation_episodes"] == 3
+
+
+def test_what_was_said_of_the_time_since_a_test_that_is_not_shown_counts_for_the_next(tmp_path: Path) -> None:
+    """Interval means, over 10, 20 and 70 steps, of which the first two end in one test that is shown."""
+    whole = Protocol(task="arrow_puzzle", preset="quick", budgets=(10, 30, 100))
+    run = bench_result(tmp_path, protocol=whole).of("imagination")[0]
+    rows = tuple(
+        dataclasses.replace(
+            row, env_steps=row.episodes, diagnostics={"time/model_s": time_s, "loss/x": 1.0, "epsilon": e}
+        )
+        for row, time_s, e in zip(run.checkpoints, (0.1, 0.4, 0.2), (0.9, 0.5, 0.1), strict=True)
+    )
+    cut_run = cut(dataclasses.replace(run, checkpoints=rows), dataclasses.replace(whole, budgets=(30, 100)))
+    first, second = cut_run.checkpoints
+    assert first.diagnostics == {"time/model_s": pytest.approx((10 * 0.1 + 20 * 0.4) / 30), "epsilon": 0.5}
+    assert second == rows[2]
 
 
 @pytest.mark.parametrize(

@@ -113,9 +113,9 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def rows_csv(rows: Sequence[Row]) -> str:
-    """Rows as CSV."""
-    names = list(rows[0])
-    return csv_text([names, *([row[name] for name in names] for row in rows)])
+    """Rows as CSV; what one was not measured by, as an older version made it, is an empty cell."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
 
 
 def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
@@ -141,7 +141,9 @@ def load_run(folder: Path) -> RegressionRun:
         agent=config["agent"],
         seed=config["seed"],
         settings=config["settings"],
-        rows=tuple({name: value if name == "variant" else float(value) for name, value in row.items()} for row in rows),
+        rows=tuple(
+            {name: value if name == "variant" else float(value) for name, value in row.items() if value} for row in rows
+        ),
         evaluations=run_folder.grouped(run_folder.read_arrays(folder / EVALUATION)),
         folder=folder,
         recording=recording if recording.is_file() else None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference
-from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
+from imagine_bench.files import csv_text, make_folder, with_null, write_bytes, write_json
 from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.report.words import agent_words, few_words, mean_text, origin, percent
@@ -125,19 +124,10 @@ def write_generalisation(
     make_folder(folder)
     runs = [{"agent": one.agent, "seed": one.seed, "episodes": one.episodes, **asdict(one.summary)} for one in asked]
     write_bytes(folder / "transitions.csv", _csv(asked, probe).encode())
-    write_json(folder / "summary.json", {**facts, "runs": _with_null(runs)})
+    write_json(folder / "summary.json", {**facts, "runs": with_null(runs)})
     table = generalisation_table(asked, probe, task)
     page = f"# {task.title}: transitions that no training can contain\n\n{table}\n\n{origin(facts)}\n"
     write_bytes(folder / "generalisation.md", page.encode())
-
-
-def _with_null(value: Any) -> Any:
-    """NaN as None, all the way down: JSON has a word for what is unknown, and none for what is no number."""
-    if isinstance(value, dict):
-        return {name: _with_null(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_with_null(part) for part in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _number(values: NDArray[np.bool_] | NDArray[np.int64] | None, index: int) -> str:

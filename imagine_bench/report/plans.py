@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.files import csv_text, make_folder, write_bytes, write_json, writing
+from imagine_bench.files import csv_text, make_folder, with_null, write_bytes, write_json, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.pictures import png, rollout_strip
 from imagine_bench.plans import Plan
@@ -118,7 +118,7 @@ def write_plans(
             earlier.unlink(missing_ok=True)
     summary = summarise(plans)
     write_bytes(folder / "plans.csv", _csv(plans).encode())
-    write_json(folder / "summary.json", {**facts, **dataclasses.asdict(summary)})
+    write_json(folder / "summary.json", {**facts, **with_null(dataclasses.asdict(summary))})
     failures = [plan for plan in plans if not plan.solved]
     write_bytes(folder / "plans.md", (_page(summary, failures, task)).encode())
     write_bytes(folder / "plans.png", png(_stack(_varied(plans, strips), task)))

@@ -177,13 +177,15 @@ def open_loop_figure(data: ReportData) -> Figure:
         panels[1].plot(depth, loop.reward_mae, label=title, **style)
         panels[2].plot(depth, 100.0 * loop.termination_error, label=title, **style)
         for name, line in _KINDS:
-            panels[3].plot(depth, getattr(loop, name), linestyle=line, color=color(agent))
+            if getattr(loop, name).any():  # an agent that knows no such kind says 0
+                panels[3].plot(depth, getattr(loop, name), linestyle=line, color=color(agent))
     for name, line in _KINDS:
         panels[3].plot([], [], linestyle=line, label=name, color=_INK)
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    panels[3].set(title="Uncertainty", ylabel="variance in latent space", yscale=_log_if_positive(data))
+    measure = "variance of latents; of “imagine”, probability" if "imagine" in data.open_loop else "variance of latents"
+    panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
         axes.legend(fontsize=8, loc="best")
@@ -222,7 +224,7 @@ def futures_figure(data: ReportData) -> Figure:
 
 def _log_if_positive(data: ReportData) -> str:
     values = [getattr(loop, name) for loop in data.open_loop.values() for name, _ in _KINDS]
-    joined = np.concatenate(values)
+    joined = np.concatenate([value for value in values if value.any()] or [np.zeros(1)])
     return "log" if (joined[np.isfinite(joined)] > 0).all() else "linear"
 
 

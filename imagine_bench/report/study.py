@@ -41,7 +41,7 @@ def study_table(study: Study, lines: Sequence[Line]) -> str:
 
 
 def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
-    """Write ``study.md``, ``seeds.csv``, ``summary.csv``, ``runs.json`` and ``study.png``.
+    """Write ``study.md``, ``seeds.csv``, ``summary.csv``, ``runs.json`` and, if anything is compared, ``study.png``.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -51,13 +51,15 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
         f"# {study.question}\n\n{study.execution}, {study.appearance}, tuning seeds "
         f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, "
         f"differences in points with 95 % bootstrap intervals over seeds. {' '.join(few_words(len(study.seeds)))}\n\n"
-        "![Differences](study.png)\n\n"
     )
+    compared = [line for line in lines if line.difference]
+    if compared:
+        head += "![Differences](study.png)\n\n"
+        write_bytes(folder / "study.png", _plot(study, compared))
     write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
     write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())
     write_bytes(folder / "summary.csv", _summary(study, lines).encode())
     write_json(folder / "runs.json", [_origin(line) for line in lines])
-    write_bytes(folder / "study.png", _plot(study, lines))
 
 
 def _origin(line: Line) -> dict[str, Any]:
@@ -92,12 +94,11 @@ def _summary(study: Study, lines: Sequence[Line]) -> str:
     return csv_text(rows)
 
 
-def _plot(study: Study, lines: Sequence[Line]) -> bytes:
+def _plot(study: Study, compared: Sequence[Line]) -> bytes:
     """Differences in points with their intervals, a panel a budget, a row a variant."""
-    compared = [line for line in lines if line.difference]
-    usual = Counter(line.variant.against for line in compared).most_common(1)[0][0] if compared else None
+    usual = Counter(line.variant.against for line in compared).most_common(1)[0][0]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 1.6 + 0.27 * max(1, len(compared))), layout="constrained")
+        figure = Figure(figsize=(10.0, 1.6 + 0.27 * len(compared)), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(study.budgets), sharey=True))
         for index, (axes, budget) in enumerate(zip(panels, study.budgets, strict=True)):
             axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)

@@ -157,8 +157,7 @@ def answers(data: ReportData) -> list[str]:
         sentences.append(
             "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
         )
-    else:
-        sentences += few_words(len(data.result.protocol.seeds))
+    sentences += few_words(len(data.result.protocol.seeds))
     return sentences
 
 
