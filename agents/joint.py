@@ -31,6 +31,8 @@ def gradients(optimisers: Sequence[FlatAdam], losses: Losses) -> tuple[Tensor, T
     Returns:
         Losses, shape (terms, S), and gradients, shape (S, P).
     """
+    # Every greenlet has this flag for itself, and in a cohort the one that is here did not prepare torch.
+    torch.set_flush_denormal(True)
     vectors = _side_by_side(optimisers).detach().requires_grad_()
     like = optimisers[0].parameters
     parts = vectors.split([parameter.numel() for parameter in like], dim=1)

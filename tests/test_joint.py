@@ -12,9 +12,11 @@ from imagine_bench.agents import joint
 from imagine_bench.agents.controller import Controller
 from imagine_bench.agents.controller import update_together as update_controllers
 from imagine_bench.agents.memory import Batch
+from imagine_bench.agents.perception import prepare_torch
 from imagine_bench.agents.settings import ControllerSettings, WorldModelSettings
 from imagine_bench.agents.world_model import ModelLosses, Update, WorldModel, update_together
 
+from imagine_bench.cohort import side_by_side
 from imagine_bench.errors import DivergedError
 
 Z, A = 6, 3
@@ -119,6 +121,29 @@ def test_company_may_change_and_a_snapshot_is_a_model_s_own() -> None:
         assert_same(one.optimiser.arrays(), other.optimiser.arrays(), 1e-5)
         z, action = batches(1)[0].z, batches(1)[0].action
         torch.testing.assert_close(other.predict(z, action, None).means, one.predict(z, action, None).means)
+
+
+def test_denormals_are_flushed_where_a_cohort_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The flag belongs to a greenlet, and what a cohort does together is done by another than its members.
+
+    Moments of units that have died decay through the denormals; on some processors each costs a hundred times more.
+    """
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor cannot flush them")
+    tiny = torch.full((64,), 1e-39)
+    assert (tiny * 0.5).any(), "they must count before"
+    descend, found = WorldModel.descend, []
+    monkeypatch.setattr(
+        WorldModel, "descend", lambda self, *how: (found.append(bool((tiny * 0.5).any())), descend(self, *how))[1]
+    )
+
+    def work(seed: int) -> None:
+        prepare_torch("cpu")
+        model = WorldModel(Z, A, SMALL, torch.Generator().manual_seed(seed))
+        model.update(batches(1, seed)[0], torch.Generator().manual_seed(seed))
+
+    ended = side_by_side([lambda: work(0), lambda: work(1)])
+    assert ended == [None, None] and found == [False, False]
 
 
 def test_one_tensor_is_not_copied() -> None:
