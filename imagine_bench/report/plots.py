@@ -184,7 +184,7 @@ def open_loop_figure(data: ReportData) -> Figure:
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    measure = "variance of latents; of “imagine”, probability" if "imagine" in data.open_loop else "variance of latents"
+    measure = "variance of latents" + ("\n(“imagine”: probability)" if "imagine" in data.open_loop else "")
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
