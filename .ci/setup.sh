@@ -35,9 +35,11 @@ apt_install() {
 
 make_venv() {
     local python
-    if [ -x "$venv/bin/python" ] && suits "$venv/bin/python" && "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
-        return
+    if [ -x "$venv/bin/python" ] && suits "$venv/bin/python"; then
+        "$venv/bin/python" -m pip --version >/dev/null 2>&1 && return
+        "$venv/bin/python" -m ensurepip >/dev/null 2>&1 && return  # uv makes environments without pip
     fi
+    [ ! -d "$venv" ] || say "replacing $venv, whose Python is none of 3.11 to 3.13 or cannot install anything"
     if python=$(find_python); then
         "$python" -m venv --clear "$venv" >/dev/null 2>&1 && return
         root_on_debian || fail "$python cannot make a virtual environment; on Debian or Ubuntu: apt-get install python3-venv."

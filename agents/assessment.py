@@ -1,4 +1,4 @@
-"""What a transition earns and whether it ends the episode: the r- and d-networks (thesis 3.1.2, 5.2.3).
+"""What a transition earns and whether it ends the episode: the r- and d-networks (thesis 3.1.2, 5.2.2).
 
 The thesis reads both from the next state alone, ``r(z')`` and ``d(z')``. Where a right and a wrong macro-action lead to
 pictures that are alike, that cannot tell the two apart; reading the whole transition can.

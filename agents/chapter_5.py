@@ -55,7 +55,9 @@ _QUICK: dict[str, Deviation] = {
         0.0, "sampled latents leave what the networks know: at 1, 16 points less (factors)"
     ),
     "imagination.exploration": Deviation(0.2, "a greedy rollout repeats the real actions; no gain shown (deviations)"),
-    "imagination.weight_samples": Deviation(10, "CPU time; the filter needs a rank, not a precise variance"),
+    "imagination.weight_samples": Deviation(
+        10, "acts only where dropout is set again: without it the three members are the samples"
+    ),
     "imagination.termination_threshold": Deviation(
         0.02, "chosen for 2,000 episodes, where the model half knows of wrong ends; early it costs (factors)"
     ),

@@ -1,4 +1,4 @@
-"""The controller: Q-learning by a small network on latents (thesis 5.2.3; Mnih et al. 2015).
+"""The controller: Q-learning by a small network on latents (thesis 5.2.2; Mnih et al. 2015).
 
 A target network, which the thesis has not, only where settings want one.
 """

@@ -29,9 +29,9 @@ from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
-_BEYOND = 1e9
-"""A latent as large as this is none: an encoder's are of order 1, and its fourth power, of which a controller that
-learns from it has sums in the norm of its gradient, must not overflow."""
+_BEYOND = 1e6
+"""A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
+is in the norm of the gradient of a controller that learns from it, which must not overflow."""
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
@@ -54,7 +54,7 @@ class Imagined:
     """One imagined step of N rollouts.
 
     Attributes:
-        next_z: Shape (N, Z), within +-1e9; where that is reached, the closed loop has run away.
+        next_z: Shape (N, Z), within +-1e6; where that is reached, the closed loop has run away.
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).

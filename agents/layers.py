@@ -123,7 +123,7 @@ def by_network(networks: Iterable[MemberMLP], parameters: Sequence[Tensor]) -> l
 def clip_unit_norms(networks: Sequence[MemberMLP], limit: float) -> None:
     """Scale the incoming weights of each unit down to a Euclidean norm of at most ``limit``.
 
-    "The norm of the weights in each layer" (thesis 5.2.3) is read as the max-norm constraint of Keras, per unit:
+    "The norm of the weights in each layer" (thesis 5.2.2) is read as the max-norm constraint of Keras, per unit:
     a norm of 3 on a whole 512 x 512 matrix would cripple it.
     """
     weights = [weight for network in networks for weight in network.weights]

@@ -53,10 +53,11 @@ class _Ring:
 
     def _write(self, rows: dict[str, Tensor]) -> None:
         count = len(next(iter(rows.values())))
+        kept = min(count, self.capacity)
         device = next(iter(self._columns.values())).device
-        index = torch.arange(self.added, self.added + count, device=device) % self.capacity
+        index = torch.arange(self.added + count - kept, self.added + count, device=device) % self.capacity
         for name, values in rows.items():
-            self._columns[name][index] = values
+            self._columns[name][index] = values[-kept:]
         self.added += count
 
     def _draw(self, count: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:

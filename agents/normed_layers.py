@@ -37,7 +37,8 @@ class NormedMLP(nn.Module):
         dropout: Probability of dropping a unit of a hidden layer that another one follows, in [0, 1). Units right
             before the output stay: their noise is noise of the outputs, which a mixture would take for the data's.
         precision: Type of the products between hidden layers while training, and on a CPU that in which each batch's
-            statistics come. Parameters, first and last layer and all predictions are float32 whatever it is.
+            statistics come. Parameters, the values of first and last layer and all predictions are float32 whatever it
+            is.
     """
 
     def __init__(

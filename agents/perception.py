@@ -47,8 +47,7 @@ def prepare_torch(device: str) -> torch.device:
     """Set torch up for small networks: one thread, freed memory kept, and denormals flushed.
 
     Denormals make Adam's moments 10 times slower on some processors. In a cohort, as in every bench, joint updates run
-    on a stack of their own, whose register this does not set. On a Zen 5 no cost of that was seen, and setting it would
-    change the bits of every kept result.
+    on a stack of their own, whose register this does not set: :func:`agents.joint.gradients` does.
 
     Raises:
         UnknownNameError: No such device name.

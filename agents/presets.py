@@ -20,7 +20,7 @@ from .chapter_5 import CHAPTER_5
 from .family import Family
 from .precision import PRECISIONS, settle
 from .ranges import COUNT, FINITE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
-from .settings import START_STATES, Settings
+from .settings import START_STATES, Settings, WorldModelSettings
 from .uncertainty import REDUCTIONS
 
 FAMILIES: dict[str, Family] = {"chapter_3": CHAPTER_3, "chapter_5": CHAPTER_5}
@@ -98,6 +98,7 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> Settings:
     values = {name: deviation.value for name, deviation in deviations.items()}
     settings = checked_values(chosen.thesis, {**values, **overrides})
     _require_ranges(settings)
+    _require_read(settings.model, chosen.thesis.model, overrides)
     return settings
 
 
@@ -133,6 +134,21 @@ def _require_ranges(settings: Settings) -> None:
         raise InvalidValueError(
             "model.dropout acts on hidden layers: give model.dynamics_hidden and model.reward_hidden at least one each "
             "or set it to 0."
+        )
+
+
+def _require_read(model: WorldModelSettings, thesis: WorldModelSettings, overrides: Mapping[str, Any]) -> None:
+    """Raise InvalidValueError for sizes of networks that there are not, and for networks whose sizes nobody gave."""
+    own = ("model.reward_hidden", "model.termination_hidden")
+    for name in own:
+        if model.shared_hidden and overrides.get(name):
+            raise InvalidValueError(
+                f"{name} {overrides[name]} is not read beside model.shared_hidden {model.shared_hidden}, the hidden "
+                "layers of one network for both outputs; leave it out, or set model.shared_hidden to []."
+            )
+    if thesis.shared_hidden and not model.shared_hidden and not overrides.keys() >= set(own):
+        raise InvalidValueError(
+            f"Without model.shared_hidden each output has a network of its own: give {' and '.join(own)} too."
         )
 
 

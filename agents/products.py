@@ -15,8 +15,12 @@ from torch import Tensor
 _ONEDNN_FROM = 2**20
 """Multiplications of one product from which oneDNN is ahead of the lower overhead of the other calls."""
 _ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None) if torch.backends.mkldnn.is_available() else None
-_FORMATS = (torch.float32, torch.bfloat16)
-"""What oneDNN multiplies."""
+_FORMATS = (
+    (torch.float32, torch.bfloat16)
+    if _ONEDNN is not None and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    else (torch.float32,)
+)
+"""What oneDNN multiplies; bfloat16 not on processors without AVX-512, where torch's own calls emulate it."""
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:

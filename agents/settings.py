@@ -14,7 +14,7 @@ START_STATES = ("current", "remembered")
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelSettings:
-    """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.3).
+    """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.2).
 
     Attributes:
         dynamics_hidden: Units a hidden layer of the dynamics network.
@@ -42,7 +42,8 @@ class WorldModelSettings:
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
         precision: In which hidden layers train: float32, bfloat16, or auto, which is bfloat16 where the device has
-            instructions for it. Weights, moments, output layers, losses and predictions are always float32.
+            instructions for it; the gradients of output layers' weights come in it too. Weights, moments, the values
+            of output layers, losses and predictions are always float32.
     """
 
     dynamics_hidden: tuple[int, ...] = (256, 256, 256)
@@ -68,7 +69,7 @@ class WorldModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSettings:
-    """The DQN on latents (thesis 5.2.3).
+    """The DQN on latents (thesis 5.2.2).
 
     Attributes:
         hidden: Units a hidden layer.
@@ -143,7 +144,7 @@ class ImaginationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class MemorySettings:
-    """How many transitions each memory keeps; the oldest go first (thesis 5.2.3).
+    """How many transitions each memory keeps; the oldest go first (thesis 5.2.2).
 
     Attributes:
         real: Transitions of the real memory.

@@ -34,7 +34,7 @@ class Elbo(NamedTuple):
 def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
     """KL(N(mu, sigma^2) || N(0, 1)) summed over latents: -1/2 sum(1 + log sigma^2 - mu^2 - sigma^2).
 
-    The thesis prints it with the wrong sign and without 1/2 (equations 2.7, 3.1 and 5.1; DIGEST 6).
+    The thesis prints it with the wrong sign and without 1/2 (equations 2.7, 3.1 and 5.1), an erratum.
 
     Args:
         mu: Means. Shape (N, Z).

@@ -1,4 +1,4 @@
-"""The environment model: a mixture density network for the dynamics, and what the next state means (thesis 5.2.3).
+"""The environment model: a mixture density network for the dynamics, and what the next state means (thesis 5.2.2).
 
 ``p(z' | z, a)`` says where a macro-action leads; :mod:`.assessment` what it earns and whether the episode ends there.
 Networks share no weights (but reward and termination, where they have one trunk); one backward pass through the sum of

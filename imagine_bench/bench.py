@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from imagine_bench import encoders, registry
+from imagine_bench import encoders, registry, run_folder
 from imagine_bench.environment import describe_environment, gl_renderer
 from imagine_bench.errors import InvalidValueError, RunFailedError, SetupError, UnknownNameError
 from imagine_bench.kinds import kind_of, require_options
@@ -72,9 +72,15 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
     names = {"encoder": "latents", "codes": "codes"}
     filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
     whole = protocol(task, preset, **{**changes, **filled})
-    if encoder or whole.after or whole.demonstrations or whole.questions:
+    rests_on_others = any(map(_rests_on_others, whole.agents))
+    if encoder or whole.after or whole.demonstrations or whole.questions or rests_on_others:
         _check_abilities(whole, paths)
     return whole, paths
+
+
+def _rests_on_others(agent: str) -> bool:
+    """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
+    return registry.agent_entry(agent).trains_itself or agent not in registry.AGENTS
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
@@ -160,7 +166,8 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
 def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
     """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
     failures: list[Failure] = []
-    with ProgressBars([_job(store, paths, *pair, None).spec for pair in store.missing()]) as show:
+    specs = [_job(store, paths, *pair, None).spec for pair in store.missing()]
+    with ProgressBars(specs, _done_before(store)) as show:
         for until in store.protocol.waves:
             failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
             pairs = [pair for pair in store.missing(until) if pair not in failed]
@@ -168,6 +175,14 @@ def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Fa
             if jobs:
                 failures += launcher.launch(jobs, _noting_time(store, show))
     return failures
+
+
+def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:
+    """How much of each unfinished run lies before its last test; only runs that act are tested on the way."""
+    if store.protocol.task not in registry.TASKS:
+        return {}
+    reached = {pair: run_folder.reached(store.run_folder(*pair)) for pair in store.missing()}
+    return {pair: store.protocol.work(pair[0], until) for pair, until in reached.items() if until}
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
@@ -197,8 +212,9 @@ def _noting_time(store: BenchStore, show: Observer) -> Observer:
 def _warn(changed: Sequence[str], folder: Path) -> None:
     if changed:
         print(
-            f"Note: {folder} was begun with another {', '.join(changed)}. Runs it finished are kept as they are; give "
-            "another folder with --out to run all of them anew."
+            f"Note: {folder} was begun with another {', '.join(changed)}. Runs it finished are kept as they are, "
+            "others go on from their checkpoints with what is here now; give another folder with --out to run all of "
+            "them anew."
         )
 
 

@@ -107,7 +107,7 @@ def load_snapshot(checkpoint: Path) -> Snapshot:
     """
     path = checkpoint / "state.json"
     state = read_json(path, "a checkpoint's state")
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
+    if state.get("format") != FORMAT:
         raise ArtefactError(f"{path} was not written as {FORMAT!r}. It was left untouched.")
     try:
         agent = _unpacked(checkpoint / "agent.safetensors", state["sha256"])

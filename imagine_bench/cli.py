@@ -108,7 +108,7 @@ class Bench:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write a bench's report again, from its files, and show its table; of an unfinished bench, what there is."""
+    """Write a bench's report again, from its files, and show its table; of agents' unfinished ones, what there is."""
 
     folder: Annotated[Path | None, tyro.conf.Positional, _NEWEST] = None
     """The bench's folder."""
@@ -233,9 +233,9 @@ class StudyCommand:
 
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
         where = launcher(self.launcher, self.workers)
-        part = f"-{digest(sorted(self.variants))}" if self.variants else ""
-        folder = self.out / self.task / f"study-{study.name}{part}"
         lines = run_study(study, self.task, root=self.out, launcher=where)
+        runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
+        folder = self.out / self.task / f"study-{study.name}-{runs}"
         write_study(folder, study, lines)
         print(study_table(study, lines))
         print(f"\nStudy:      {folder / 'study.md'}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import platform
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -73,11 +75,32 @@ def _changes(top: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, this package, those that decide its numbers and those that offer agents; imports none."""
+    """Versions of Python, this package, those that decide its numbers and those that offer agents; imports none.
+
+    One that offers agents is likely still being written: the beginning of its sources' digest follows its version.
+    """
     found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
     needed = {package: installed(package) for package in PACKAGES}
-    optional = {package: installed(package) for package in (*OPTIONAL_PACKAGES, *registry.agent_packages())}
-    return {**found, **needed, **{package: version for package, version in optional.items() if version != "missing"}}
+    optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
+    offering = {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.agent_packages().items()}
+    return {
+        **found,
+        **needed,
+        **{name: version for name, version in optional.items() if version != "missing"},
+        **offering,
+    }
+
+
+def _sources(modules: Iterable[str]) -> str:
+    """Beginning of a digest of the Python files of top modules, none of which is imported; those that lack add none."""
+    digest = hashlib.sha256()
+    for spec in filter(None, map(importlib.util.find_spec, sorted(modules))):
+        folders = spec.submodule_search_locations
+        files = [Path(spec.origin)] if spec.origin and not folders else []
+        for path in files + sorted(path for folder in folders or () for path in Path(folder).rglob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
 
 
 def installed(package: str) -> str:

@@ -21,15 +21,15 @@ from typing import Any
 from imagine_bench.errors import ArtefactError, BusyError, ImagineBenchError, SetupError
 
 _REASONS = {
-    errno.EACCES: "you may not write there; choose another folder with --out or change its permissions",
-    errno.EPERM: "you may not write there; choose another folder with --out or change its permissions",
-    errno.EROFS: "that file system is read-only; choose another folder with --out",
+    errno.EACCES: "you may not write there; choose another folder or change its permissions",
+    errno.EPERM: "you may not write there; choose another folder or change its permissions",
+    errno.EROFS: "that file system is read-only; choose another folder",
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
     errno.EDQUOT: "your disk quota is used up; free some space and run the same command again",
-    errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder with --out",
-    errno.EEXIST: "a part of that path is a file, not a folder; choose another folder with --out",
-    errno.ENOLCK: "that file system cannot lock files; choose a local folder with --out",
-    errno.ENOTSUP: "that file system cannot lock files; choose a local folder with --out",
+    errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
+    errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
+    errno.ENOLCK: "that file system cannot lock files; choose a local folder",
+    errno.ENOTSUP: "that file system cannot lock files; choose a local folder",
 }
 
 
@@ -221,5 +221,5 @@ def _acquire(handle: int, path: Path, busy: str, deadline_s: float) -> None:
                 raise
         if time.monotonic() >= deadline_s:
             holder = os.pread(handle, 200, 0).decode(errors="replace") or "another process"
-            raise BusyError(f"{busy} is in use by {holder}; wait for it, stop it, or choose another folder with --out.")
+            raise BusyError(f"{busy} is in use by {holder}; wait for it, stop it, or choose another folder.")
         time.sleep(0.05)

@@ -50,7 +50,7 @@ class RayCluster:
         """Carry out every job; see :class:`imagine_bench.launchers.Launcher`.
 
         Raises:
-            SetupError: There is no cluster at ``RAY_ADDRESS``.
+            SetupError: There is no cluster at ``RAY_ADDRESS``, or none with the GPU that the runs ask for.
         """
         import ray  # noqa: PLC0415 - as above
 
@@ -81,12 +81,16 @@ def _require_listening(address: str | None) -> None:
 
 
 def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) -> tuple[Failure, ...]:
+    gpus = int(any(job.spec.protocol.device == "cuda" for group in groups for job in group))
+    if ray.cluster_resources().get("GPU", 0) < gpus:
+        raise SetupError("No node of the Ray cluster has a GPU for device 'cuda'; add one, or use device 'cpu'.")
     here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
         ray.get_runtime_context().get_node_id(), soft=False
     )
     board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
     work = ray.remote(
         num_cpus=1,
+        num_gpus=gpus,
         max_calls=1,  # a fresh process for each cohort: no threads, GL contexts or open logs of another
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
@@ -100,7 +104,10 @@ def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) 
         for task in ended:
             group = running.pop(task)
             reasons = _reasons(ray, task, len(group))
-            failures += [Failure(job=job, reason=reason) for job, reason in zip(group, reasons, strict=True) if reason]
+            failed = [Failure(job=job, reason=reason) for job, reason in zip(group, reasons, strict=True) if reason]
+            for failure in failed:
+                on_progress(failure.progress)
+            failures += failed
     for progress in ray.get(board.take.remote()):
         on_progress(progress)
     return tuple(failures)

@@ -57,6 +57,12 @@ class Failure:
     job: Job
     reason: str
 
+    @property
+    def progress(self) -> Progress:
+        """What an observer is told of it."""
+        spec = self.job.spec
+        return Progress(agent=spec.agent, seed=spec.seed, phase="failed", done=0, work=spec.work, detail=self.reason)
+
 
 def cohorts(jobs: Sequence[Job], workers: int, abreast: int | None = None) -> list[tuple[Job, ...]]:
     """Jobs in groups of one agent that go on side by side in one process, in the order of their first jobs.
@@ -116,7 +122,7 @@ class Launcher(Protocol):
 
         Args:
             jobs: Independent of one another; each resumes by itself.
-            on_progress: Told now and then, from this process, how far each is.
+            on_progress: Told now and then, from this process, how far each is, and at once of one that failed.
 
         Returns:
             The jobs that failed.
@@ -151,7 +157,7 @@ class LocalPool:
                 for child in running:
                     child.forward(on_progress)
                 ended = [child for child in running if child.ended]
-                failures += [failure for child in ended for failure in child.failures()]
+                failures += [failure for child in ended for failure in child.failures(on_progress)]
                 running = [child for child in running if child not in ended]
         finally:
             for child in running:  # all at once, so that a second interrupt meanwhile finds none at work
@@ -165,7 +171,7 @@ class _Child:
     """Jobs side by side in a process of their own."""
 
     def __init__(self, jobs: tuple[Job, ...]) -> None:
-        self._jobs, self._reasons = jobs, dict[int, str]()
+        self._jobs, self._failures = dict(enumerate(jobs)), list[Failure]()
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._receiver, sender = context.Pipe(duplex=False)
         name = f"{jobs[0].spec.agent}/{jobs[0].folder.name}"
@@ -184,10 +190,18 @@ class _Child:
         """Whether the process is gone and everything it sent was read."""
         return self._receiver.closed and not self.process.is_alive()
 
-    def failures(self) -> list[Failure]:
+    def failures(self, on_progress: Observer) -> list[Failure]:
         """The jobs of this ended process that failed; one that said nothing died with the process."""
-        reasons = [self._reasons.get(index, self._death) for index in range(len(self._jobs))]
-        return [Failure(job=job, reason=reason) for job, reason in zip(self._jobs, reasons, strict=True) if reason]
+        for index in list(self._jobs):
+            self._end(index, self._death, on_progress)
+        return self._failures
+
+    def _end(self, index: int, reason: str, on_progress: Observer) -> None:
+        """Note that a job is over, and tell why if it failed."""
+        job = self._jobs.pop(index)
+        if reason:
+            self._failures.append(Failure(job=job, reason=reason))
+            on_progress(self._failures[-1].progress)
 
     @property
     def _death(self) -> str:
@@ -203,7 +217,7 @@ class _Child:
             if isinstance(message, Progress):
                 on_progress(message)
             else:
-                index, self._reasons[index] = message
+                self._end(*message, on_progress)
 
     def _next(self) -> Progress | tuple[int, str] | None:
         """What it sent next, or None for now; after the last message the process is gone."""

@@ -1,7 +1,7 @@
 """What a task may declare about how its frames are read. Numpy only, so that both sides share it.
 
 The thesis makes the arrow puzzle's frames grey and cuts them into three vertical strips, one cube each, fed as
-three channels (section 5.2.1); those of the task with a human stay whole and in colour (section 3.2.1).
+three channels (section 5.2.2); those of the task with a human stay whole and in colour (section 3.2.1).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TypeVar
 
@@ -23,19 +23,21 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     Args:
         specs: The runs to come, to their ends even where they rest on the way.
+        done: How much of each run earlier sittings did, by agent and seed, as far as is known before it goes on.
     """
 
-    def __init__(self, specs: Sequence[RunSpec]) -> None:
+    def __init__(self, specs: Sequence[RunSpec], done: Mapping[tuple[str, int], int] | None = None) -> None:
         self._works = {(spec.agent, spec.seed): spec.work for spec in specs}
-        self._work, self._finished = sum(self._works.values()), set[tuple[str, int]]()
-        self._done: dict[tuple[str, int], int] = {}
-        self._before = 0
+        self._finished = set[tuple[str, int]]()
+        self._done = dict(done or {})
+        self._before = dict(self._done)
+        self._seen = set[tuple[str, int]]()
         self._began_s = self._shown_s = time.monotonic()
         self._total: tqdm | None = None
         self._lines: list[tuple[tuple[str, int] | None, tqdm]] = []
         if sys.stderr.isatty():
             form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
-            self._total = tqdm(total=self._work, desc=self._description(), bar_format=form, leave=False)
+            self._total = tqdm(total=sum(self._works.values()), desc=self._description(), bar_format=form, leave=False)
 
     def __exit__(self, *error: object) -> None:
         for _, line in self._lines:
@@ -46,9 +48,13 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
         run, rests = (progress.agent, progress.seed), progress.phase == "done"
+        if progress.phase == "failed":
+            self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
+            return
         work = self._works[run]
-        if run not in self._done:  # what an earlier sitting did took no time now and promises nothing
-            self._before += progress.done
+        if run not in self._seen:  # what an earlier sitting did took no time now and promises nothing
+            self._seen.add(run)
+            self._before[run] = progress.done
         self._done[run] = progress.done
         if rests and progress.done >= work:
             self._finished.add(run)
@@ -58,14 +64,22 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
             self._shown_s = time.monotonic()
             print(f"{self._description()},{self._times()}; {_sentence(progress, work)}", file=sys.stderr, flush=True)
 
+    def _drop(self, run: tuple[str, int], sentence: str) -> None:
+        """Say that a run failed; what it lacks will not be done."""
+        self._works[run] = self._done.get(run, 0)
+        if self._total is not None:
+            self._total.total = sum(self._works.values())
+            self._show_on_bars(self._total, run, "")
+        tqdm.write(sentence, file=sys.stderr)
+
     def _description(self) -> str:
         return f"{len(self._finished)} of {len(self._works)} runs done"
 
     def _times(self) -> str:
         """Time gone and, once there is something to judge by, time left."""
         gone_s, done = time.monotonic() - self._began_s, sum(self._done.values())
-        played = done - self._before
-        left = f", {tqdm.format_interval(gone_s * (self._work - done) / played)} left" if played else ""
+        played, missing = done - sum(self._before.values()), sum(self._works.values()) - done
+        left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
         return f" {tqdm.format_interval(gone_s)} gone{left}"
 
     def _show_on_bars(self, total: tqdm, run: tuple[str, int], text: str) -> None:

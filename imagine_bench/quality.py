@@ -114,8 +114,15 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
 
     Raises:
         ImagineBenchError: No bench, or none with an agent that imagines.
+        BusyError: Another process asks the same.
+        SetupError: The bench's folder cannot be written.
     """
     bench = _bench_of_agents(folder, root, task)
+    with lock(bench / ".generalisation.lock", f"The folder {bench / 'generalisation'}"):
+        return _generalise(bench, encoder)
+
+
+def _generalise(bench: Path, encoder: str | None) -> str:
     protocol = read_protocol(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
     probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
@@ -156,8 +163,15 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
 
     Raises:
         ImagineBenchError: No bench, or none with a learner that can be taken up again.
+        BusyError: Another process asks the same.
+        SetupError: The bench's folder cannot be written.
     """
     bench = _bench_of_agents(folder, root, task)
+    with lock(bench / ".policy.lock", f"The folder {bench / 'policy'}"):
+        return _follow_policies(bench, encoder)
+
+
+def _follow_policies(bench: Path, encoder: str | None) -> str:
     protocol = read_protocol(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
     met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))

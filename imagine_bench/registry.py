@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
-from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
 from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
 
 
@@ -214,9 +214,16 @@ def _offered_entry(point: EntryPoint, taken: Collection[str]) -> AgentEntry:
     return entry
 
 
-def agent_packages() -> tuple[str, ...]:
-    """Names of the installed packages that offer agents; none of them is imported."""
-    return tuple(sorted({point.dist.name for point in entry_points(group=AGENT_GROUP) if point.dist}))
+def agent_packages() -> dict[str, frozenset[str]]:
+    """The installed packages that offer agents, by name, and where their entries lie: names of top modules.
+
+    None of them is imported.
+    """
+    found: dict[str, frozenset[str]] = {}
+    for point in entry_points(group=AGENT_GROUP):
+        if point.dist:
+            found[point.dist.name] = found.get(point.dist.name, frozenset()) | {point.module.partition(".")[0]}
+    return dict(sorted(found.items()))
 
 
 def task_entry(name: str) -> TaskEntry:
@@ -275,7 +282,8 @@ def task(name: str) -> TaskSpec:
         ("env_id", entry.env_id, spec.env_id),
         ("horizon", entry.horizon, spec.horizon),
         ("n_actions", spec.rules.n_actions, spec.n_actions),
-        ("number of macrostate_values", len(spec.rules.states[0]), len(spec.macrostate_values)),
+        ("number of macrostate_names", len(spec.rules.states[0]), len(spec.macrostate_names)),
+        ("numbers of macrostate_values", _numbers_of_values(spec.rules), tuple(map(len, spec.macrostate_values))),
     ):
         if ours != theirs:
             raise InvalidValueError(
@@ -283,6 +291,11 @@ def task(name: str) -> TaskSpec:
                 "make them one."
             )
     return spec
+
+
+def _numbers_of_values(rules: Rules) -> tuple[int, ...]:
+    """How many values each coordinate of a macrostate takes."""
+    return tuple(1 + max(values) for values in zip(*rules.states, strict=True))
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:

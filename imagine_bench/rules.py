@@ -53,7 +53,8 @@ def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray
     macrostates, known = np.asarray(macrostates), set(rules.states)
     width = len(rules.states[0])
     if macrostates.ndim != 2 or macrostates.shape[1] != width or not np.issubdtype(macrostates.dtype, np.integer):
-        raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {macrostates.shape}.")
+        given = f"{macrostates.dtype} of shape {macrostates.shape}"
+        raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {given}.")
     for row in macrostates.tolist():
         if tuple(row) not in known:
             raise InvalidValueError(f"No macrostate {tuple(row)}; give one of {len(known)}, such as {rules.states[0]}.")

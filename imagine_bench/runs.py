@@ -19,7 +19,7 @@ from imagine_bench.results import Checkpoint
 from imagine_bench.seeding import SeedTree
 
 _FUTURES = "futures/"
-Phase = Literal["training", "rehearsing", "testing", "imagining", "recording", "done"]
+Phase = Literal["training", "rehearsing", "testing", "imagining", "recording", "done", "failed"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Progress:
         work: Episodes to play.
         episode: Training episodes done.
         success: Share of successes among recent training episodes, or in the running test; None before the first.
-        detail: What a run without episodes is doing, in words; None where episodes say it.
+        detail: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
     """
 
     agent: str

@@ -29,12 +29,12 @@ Goal = Callable[[tuple[int, ...]], bool]
 
 
 def toward_human(macrostate: tuple[int, ...]) -> bool:
-    """The arrow pointed at points toward the human (thesis 5.3.1)."""
+    """The arrow pointed at points toward the human (thesis 5.2.1)."""
     return macrostate[macrostate[N_CUBES]] == TOWARD_HUMAN
 
 
 def toward_human_alone(macrostate: tuple[int, ...]) -> bool:
-    """The same, and no arrow points toward the agent (thesis 5.4, the hard variant)."""
+    """The same, and no arrow points toward the agent (the hard variant, thesis 5.2.3)."""
     return toward_human(macrostate) and TOWARD_AGENT not in macrostate[:N_CUBES]
 
 

@@ -40,7 +40,7 @@ class ArrowWorld:
 
     Attributes:
         model: Compiled scene, this world's own.
-        data: Its state; derived positions are up to date after every method.
+        data: Its state; derived positions are up to date from the start and after every method.
     """
 
     def __init__(self, level: Appearance) -> None:
@@ -54,6 +54,8 @@ class ArrowWorld:
         self._pointed = 0
         self._rest_qpos, self._rest_ctrl = at_rest(self.model)
         self._executor: TurnExecutor | None = None
+        self.data.qpos[:] = self._rest_qpos
+        self._update()
 
     # --- putting -------------------------------------------------------------------------------------------------
 

@@ -53,7 +53,7 @@ class Reading:
 
 
 class World(Protocol):
-    """A scene at run time. After each method all derived positions of ``data`` are up to date."""
+    """A scene at run time. From the start and after each method all derived positions of ``data`` are up to date."""
 
     model: mujoco.MjModel
     data: mujoco.MjData

@@ -111,6 +111,9 @@ def make_env(**options: Any) -> MacroEnv:
     after a wrong action         the human withdraws both hands, so that the end can be seen
     after a handover             the object lies in the palm, which stays; whatever is done then changes nothing
     a drop, a miss               a fault with its reason; the human did not get what they asked for: as a wrong action
+    handed over, but tipped      it lies in the palm: a success, with a fault
+    put back tipped, turned or   not what was asked for: the human withdraws, as after a wrong action, with a fault
+    off its place
     success                      a handover into the open palm; thesis, footnote 2 of chapter 3
     time limit                   50 actions, which cuts off an optimal agent once in 25,000 episodes
     ============================ ===================================================================================

@@ -54,7 +54,7 @@ class PickWorld:
 
     Attributes:
         model: Compiled scene, this world's own.
-        data: Its state; derived positions are up to date after every method.
+        data: Its state; derived positions are up to date from the start and after every method.
     """
 
     def __init__(self, level: Appearance) -> None:
@@ -71,6 +71,7 @@ class PickWorld:
         self._rest_qpos, self._rest_ctrl = at_rest(self.model)
         self._tcp_at_rest_m = self._tcp_of(self._rest_qpos)
         self._executor: CarryExecutor | None = None
+        self._update()
 
     def _tcp_of(self, qpos: Floats) -> Floats:
         """The tool centre point in the world. Shape (3,)."""

@@ -148,7 +148,10 @@ def _solve_one(
     target_m: Floats,
     starts_rad: list[NDArray[np.float64]],
 ) -> Floats:
-    best_rad, best_m = starts_rad[0], np.inf
+    best_rad, best_m = (
+        starts_rad[0],
+        np.inf,
+    )  # of an error that also grows with the tool's angle: not below the distance
     for start in starts_rad:
         configuration.update(start)
         height = configuration.get_transform_frame_to_world(_TIP, "site").translation()[2]

@@ -58,13 +58,13 @@ def distance_to_workspace(points_m: Floats) -> Floats:
     return np.maximum(nearest - LINKS_M[1] - LINKS_M[2], 0.0)
 
 
-def require_reachable(points_m: Floats) -> None:
-    """Raise InvalidValueError where a point (N, 2) lies outside of the workspace, with its distance."""
+def require_reachable(points_m: Floats, tolerance_m: float = 0.0) -> None:
+    """Raise InvalidValueError where a point (N, 2) lies further outside of the workspace than that, by how much."""
     missing_m = distance_to_workspace(points_m)
-    if (missing_m > 0).any():
+    if (missing_m > tolerance_m).any():
         row = int(missing_m.argmax())
         raise InvalidValueError(
-            f"{int((missing_m > 0).sum())} of {len(points_m)} targets are unreachable; the farthest, "
+            f"{int((missing_m > tolerance_m).sum())} of {len(points_m)} targets are unreachable; the farthest, "
             f"{np.round(points_m[row], 3).tolist()} m, lies {missing_m[row]:.3f} m outside of the workspace. "
             "Choose targets whose distance_to_workspace is 0."
         )
@@ -128,7 +128,7 @@ def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
         InvalidValueError: A place lies outside of the workspace.
     """
     require_variant(variant)
-    require_reachable(np.maximum(np.abs(inputs) - 1e-6, 0.0) * np.sign(inputs))  # a stretched arm rests on the edge
+    require_reachable(inputs, tolerance_m=1e-6)  # a stretched arm rests on the edge
     return missed(inputs, predictions)
 
 

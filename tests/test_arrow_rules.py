@@ -1,4 +1,4 @@
-"""The rules against the exact facts that the thesis' puzzle has (shared/thesis/DIGEST.md, section 4)."""
+"""The rules against the exact facts that the thesis' puzzle has (chapter 5), counted by enumeration."""
 
 from __future__ import annotations
 

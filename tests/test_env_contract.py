@@ -118,12 +118,13 @@ def test_the_horizon_truncates_and_does_not_terminate(task):
     env.close()
 
 
-@pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_values"])
+@pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_names", "macrostate_values"])
 def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, monkeypatch):
     spec = registry.task("arrow_puzzle")
     wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
     monkeypatch.setattr("imagine_bench.tasks.arrow_puzzle.SPEC", dataclasses.replace(spec, **{field: wrong}))
-    what = {"action_names": "n_actions 5", "macrostate_values": "macrostate_values 3"}.get(field, f"{field} {wrong!r}")
+    numbers = {"action_names": "n_actions 5", "macrostate_names": "names 3", "macrostate_values": r"values \(4, 4, 4\)"}
+    what = numbers.get(field, f"{field} {wrong!r}")
     with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
         registry.task("arrow_puzzle")
 
@@ -175,7 +176,8 @@ def test_a_closed_environment_holds_no_opengl_context():
     env = make(**KINEMATIC, render_mode="rgb_array").unwrapped
     env.reset(seed=0)
     env.render()
-    renderers = env._eye, env._picture
+    env.human_view(64, 48)
+    renderers = env._eye, env._picture, env._human
     assert all(renderer._canvas is not None for renderer in renderers)
     env.close()
     assert all(renderer._canvas is None for renderer in renderers)
@@ -333,8 +335,8 @@ def test_a_wrong_action_is_refused(kinematic, action):
 @pytest.mark.parametrize(
     ("macrostates", "message"),
     [
-        (np.zeros((2, 3), np.int64), r"of shape \(N, 4\), not \(2, 3\)"),
-        (np.zeros((2, 4)), r"must be integers"),
+        (np.zeros((2, 3), np.int64), r"of shape \(N, 4\), not int64 of shape \(2, 3\)"),
+        (np.zeros((2, 4)), r"must be integers of shape \(N, \d\), not float64 of shape \(2, 4\)"),
         (np.full((1, 4), 3), r"No macrostate \(3, 3, 3, 3\); give one of 192, such as \(0, 0, 0, 0\)"),
         (np.full((1, 4), -1), r"No macrostate \(-1, -1, -1, -1\)"),
     ],

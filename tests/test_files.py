@@ -43,7 +43,7 @@ def test_json_comes_back(tmp_path: Path) -> None:
     ("code", "sentence"),
     [
         (errno.ENOSPC, "the disk is full; free some space and run the same command again"),
-        (errno.EACCES, "you may not write there; choose another folder with --out"),
+        (errno.EACCES, "you may not write there; choose another folder"),
         (errno.EROFS, "that file system is read-only"),
     ],
 )
@@ -92,7 +92,10 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
     with child.stdout:
         assert child.stdout.readline() == "held\n"
         with (
-            pytest.raises(BusyError, match=rf"The folder is in use by process {child.pid} on .*--out"),
+            pytest.raises(
+                BusyError,
+                match=rf"The folder is in use by process {child.pid} on .*; wait for it, stop it, or choose another",
+            ),
             lock(path, "The folder"),
         ):
             pass

@@ -117,6 +117,25 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
 
 @needs_ray
 @pytest.mark.slow
+def test_a_cluster_without_a_gpu_does_not_wait_for_one_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "num_gpus": 0, "include_dashboard": False})
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    (here,) = jobs(tmp_path, (0,), 10)
+    spec = dataclasses.replace(here.spec, protocol=dataclasses.replace(here.spec.protocol, device="cuda"))
+    try:
+        with pytest.raises(SetupError, match="No node of the Ray cluster has a GPU for device 'cuda'"):
+            RayCluster(1).launch([dataclasses.replace(here, spec=spec)], lambda _: None)
+    finally:
+        cluster.shutdown()
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_ray
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["", "ray://"])
 def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     monkeypatch.setenv("RAY_ADDRESS", f"{scheme}127.0.0.1:1")

@@ -37,18 +37,38 @@ def test_a_failed_run_is_named_and_stops_no_other(tmp_path: Path) -> None:
     assert "failing seed 1 begins or goes on" in log and "Traceback" in log and "breaks on purpose" in log
     assert not run_folder.is_done(jobs[0].folder) and run_folder.is_done(jobs[1].folder)
     assert [progress.seed for progress in told if progress.phase == "done"] == [0]
+    assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
+        (1, failure.reason)
+    ]
+
+
+def test_a_failed_run_is_told_while_others_of_its_process_go_on(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, "failing", 1), job(tmp_path, "failing", 0, budgets=(100_000,))]
+    told: list[Progress] = []
+
+    def stop_when_it_is_known(progress: Progress) -> None:
+        told.append(progress)
+        if {one.phase for one in told} >= {"failed", "training"} and progress.seed == 0 and progress.episode > 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        LocalPool(1, abreast=2).launch(jobs, stop_when_it_is_known)
 
 
 def test_a_process_that_is_killed_is_a_failure(tmp_path: Path) -> None:
     victim = job(tmp_path, "table", 0, budgets=(100_000,))
 
+    told: list[Progress] = []
+
     def kill(progress: Progress) -> None:
+        told.append(progress)
         for child in psutil.Process().children():
             if "spawn_main" in " ".join(child.cmdline()):
                 child.send_signal(signal.SIGKILL)
 
     (failure,) = LocalPool(1).launch([victim], kill)
     assert failure.reason == "its process was killed by SIGKILL (out of memory?)"
+    assert (told[-1].phase, told[-1].detail) == ("failed", failure.reason)
 
 
 def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) -> None:

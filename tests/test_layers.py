@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -114,6 +118,21 @@ def test_hidden_layers_in_bfloat16_point_the_same_way() -> None:
         assert abs(mine.norm() / other.norm() - 1.0) < 0.01
     with torch.no_grad():
         torch.testing.assert_close(network(x, masks), theirs, msg="predictions are float32")
+
+
+def test_bfloat16_works_on_a_processor_without_instructions_for_it() -> None:
+    """A process whose libraries are told that there is no AVX-512; elsewhere than on x86 that changes nothing."""
+    script = (
+        "import torch\n"
+        "from imagine_bench.agents.products import affine\n"
+        "draws = torch.Generator().manual_seed(0)\n"
+        "x, weight, bias = (torch.randn(1, n, 64, generator=draws).bfloat16() for n in (512, 64, 1))\n"
+        "exact = (x.double() @ weight.double() + bias.double()).relu()\n"
+        "assert (affine(x, weight, bias, relu=True) - exact).abs().max() < 0.01 * exact.max()\n"
+    )
+    limited = {**os.environ, "ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
+    done = subprocess.run([sys.executable, "-c", script], env=limited, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_gradients_under_dropout_against_finite_differences() -> None:

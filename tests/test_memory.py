@@ -52,6 +52,16 @@ def test_the_imagined_memory_keeps_only_recent_imagination() -> None:
     assert torch.equal(batch.next_z, batch.z + 0.5)
 
 
+def test_more_rows_at_once_than_there_is_room_for_leave_the_last_in_pairs() -> None:
+    memory = ImaginedMemory(3, 2, CPU)
+    z = torch.arange(8, dtype=torch.float32)[:, None].expand(8, 2)
+    memory.add(Batch(z, torch.zeros(8, dtype=torch.int64), z[:, 0], z + 0.5, torch.zeros(8)))
+    assert (len(memory), memory.added) == (3, 8)
+    batch = memory.sample(100, torch.Generator().manual_seed(0))
+    assert set(batch.reward.tolist()) == {5.0, 6.0, 7.0}
+    assert torch.equal(batch.next_z, batch.z + 0.5)
+
+
 @pytest.mark.parametrize("count", [3, 20])
 def test_a_memory_is_restored_exactly_and_independently(count: int) -> None:
     memory, other = RealMemory(8, 2, CPU), RealMemory(8, 2, CPU)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -58,6 +60,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     (site / "their_package.py").write_text(_MODULE)
     (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 1.2\n")
     monkeypatch.syspath_prepend(site)
+    monkeypatch.delitem(sys.modules, "their_package", raising=False)  # that of another test
 
     def write(point: str) -> None:
         (facts / "entry_points.txt").write_text(f"[{registry.AGENT_GROUP}]\n{point}\n")
@@ -78,11 +81,21 @@ def test_another_packages_agent_is_compared_like_one_of_this_suite(
     size = ["--agents", "their_agent", "--budgets", "2", "--evaluation-episodes", "2"]
     assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 0
     folder = newest_bench(tmp_path / "runs")
-    assert json.loads((folder / "environment.json").read_text())["versions"]["their-package"] == "1.2"
+    noted = json.loads((folder / "environment.json").read_text())["versions"]["their-package"]
+    assert re.fullmatch(r"1\.2\+[0-9a-f]{8}", noted) and versions()["their-package"] == noted
     assert "Theirs" in (folder / "report" / "index.html").read_text()
     metrics = (folder / "their_agent/seed_0/metrics.csv").read_text().splitlines()
     row = dict(zip(metrics[0].split(","), metrics[-1].split(","), strict=True))
     assert float(row["diagnostics/real_transitions"]) == float(row["env_steps"]) > 0
+
+
+def test_sources_that_changed_are_another_version(install: Install, tmp_path: Path) -> None:
+    install("their_agent = their_package:ENTRY")
+    before, module = versions()["their-package"], tmp_path / "site" / "their_package.py"
+    module.write_text(_MODULE.replace("return 2", "return 3"))
+    assert versions()["their-package"] != before
+    module.write_text(_MODULE)
+    assert versions()["their-package"] == before
 
 
 @pytest.mark.parametrize(
@@ -98,7 +111,7 @@ def test_another_packages_agent_is_compared_like_one_of_this_suite(
 )
 def test_an_offer_that_is_no_agent_is_refused_by_name(install: Install, point: str, sentence: str) -> None:
     install(point)
-    assert versions()["their-package"] == "1.2", "what is broken can still be named"
+    assert versions()["their-package"].startswith("1.2+"), "what is broken can still be named"
     with pytest.raises(SetupError) as caught:
         registry.agent_entry("dqn")
     assert str(caught.value).startswith("The package their-package ") and sentence in str(caught.value)

@@ -387,7 +387,12 @@ def test_a_recording_shows_the_human_answer_when_the_motion_is_over():
     env.capture_motion_hz = 20.0
     env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})
     *_, info = env.step(1)
+    data, standing = env._world.data, env.agent_view()
+    fields = ("qpos", "mocap_pos", "mocap_quat", "xpos", "xquat")
+    before = {name: getattr(data, name).copy() for name in fields}
     motion, film = env.motion(), env.film(64, 48)
+    assert all(np.array_equal(getattr(data, name), before[name]) for name in fields), "a film changes nothing"
+    assert np.array_equal(env.agent_view(), standing)
     hand = motion.poses_in_world[:, motion.body_names.index("hand")]
     car = motion.poses_in_world[:, motion.body_names.index("car")]
     env.close()

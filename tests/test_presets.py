@@ -38,12 +38,15 @@ def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None
         "model.updates_per_step": 16,
         "model.batch_size": 512,
         "controller.hidden": (512, 256, 128),
+        "model.learning_rate": 1e-3,
         "controller.learning_rate": 1e-3,
         "controller.batch_size": 64,
+        "controller.updates_per_step": 1,
         "controller.epsilon_min": 0.001,
         "controller.epsilon_max": 0.8,
         "controller.epsilon_decay": 0.03,
         "imagination.start_episode": 1000,
+        "imagination.updates_per_step": 1,
         "imagination.breadth": 3,
         "imagination.depth": 10,
         "imagination.temperature": 1.0,
@@ -52,6 +55,25 @@ def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None
         "memory.imagined": 3_000,
     }
     assert {name: flat[name] for name in printed} == printed
+    of_the_suite = {  # what algorithm 1 has not, at rest
+        "model.members": 1,
+        "model.shared_hidden": (),
+        "model.assessment_input": "next_state",
+        "model.reward_scale": 1.0,
+        "model.spread": 1.0,
+        "model.balance": 0.0,
+        "model.predict_change": False,
+        "model.gradient_clip": None,
+        "controller.gradient_clip": None,
+        "controller.target_rate": 1.0,
+        "imagination.end_episode": None,
+        "imagination.start_states": "current",
+        "imagination.exploration": 0.0,
+        "imagination.threshold_quantile": None,
+        "imagination.reward_threshold": None,
+        "imagination.termination_threshold": None,
+    }
+    assert {name: flat[name] for name in of_the_suite} == of_the_suite
 
 
 def test_chapter_3_has_the_numbers_of_section_3_2_2() -> None:
@@ -84,6 +106,17 @@ def test_every_deviation_is_applied_and_has_a_reason(family: str, preset: str) -
         assert flat[name] == deviation.value != thesis[name]
         assert len(deviation.reason) > 20
     assert {name for name in flat if flat[name] != thesis[name]} == set(FAMILIES[family].presets[preset])
+
+
+def test_sizes_that_no_network_has_are_refused() -> None:
+    with pytest.raises(InvalidValueError, match=r"model\.reward_hidden \[64\] is not read beside model\.shared_hidden"):
+        resolve_in("quick", {"model.reward_hidden": [64]}, "chapter_3")
+    with pytest.raises(InvalidValueError, match=r"Without model\.shared_hidden .* model\.termination_hidden too"):
+        resolve_in("quick", {"model.shared_hidden": [], "model.reward_hidden": [64]}, "chapter_3")
+    apart = {"model.shared_hidden": [], "model.reward_hidden": [64], "model.termination_hidden": [32]}
+    assert resolve_in("quick", apart, "chapter_3").model.reward_hidden == (64,)
+    assert resolve("thesis", {"model.shared_hidden": []}) == resolve("thesis", {})
+    assert resolve("thesis", {"model.shared_hidden": [8]}).model.shared_hidden == (8,)
 
 
 def test_an_unknown_family_lists_what_exists() -> None:

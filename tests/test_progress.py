@@ -72,6 +72,52 @@ def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.Capt
     assert again.startswith("1 of 6 runs done")
 
 
+def after_ten_hours(monkeypatch: pytest.MonkeyPatch, *told: Progress, done: dict[tuple[str, int], int]) -> None:
+    """Show all but the last at the beginning, the last one ten hours later."""
+    now_s = [0.0]
+    monkeypatch.setattr("imagine_bench.progress.time.monotonic", lambda: now_s[0])
+    with ProgressBars(specs(), done) as show:
+        for progress in told[:-1]:
+            show(progress)
+        now_s[0] = 36_000.0
+        show(told[-1])
+
+
+def test_time_left_is_of_what_no_sitting_has_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three runs of 19 parts have done 9 each before, three of 5 nothing; 10 more take ten hours, 35 are left."""
+    before = {("table", seed): 9 for seed in SEEDS}
+    begins = Progress(agent="table", seed=0, phase="training", done=9, work=WORK)
+    after_ten_hours(monkeypatch, begins, far("table", 0, "done"), done=before)
+    assert "10:00:00 gone, 35:00:00 left" in capsys.readouterr().err
+
+
+def test_a_run_that_fails_is_named_at_once_and_asks_for_no_more_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begins = Progress(agent="table", seed=0, phase="training", done=9, work=WORK)
+    failed = Progress(agent="table", seed=1, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke")
+    after_ten_hours(monkeypatch, begins, failed, far("table", 0, "done"), done={})
+    said, line = capsys.readouterr().err.splitlines()
+    assert said == "table seed 1 failed: RuntimeError: it broke"
+    assert line.startswith("1 of 6 runs done") and "34:00:00 left" in line  # of 72 parts 19 are done, 19 will not be
+
+
+def test_a_run_that_fails_leaves_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    failed = Progress(agent="table", seed=1, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke")
+    with ProgressBars(specs()) as show:
+        show(far("table", 0))
+        show(far("table", 1))
+        show(failed)
+        show(far("random", 0))
+        at_last = rows(terminal)
+    assert "table seed 1 failed: RuntimeError: it broke\n" in terminal.getvalue()
+    assert [at_last[row].split(":")[0] for row in (1, 2)] == ["table seed 0", "random seed 0"]
+
+
 def test_items_are_counted_when_they_are_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,8 +42,20 @@ def measured(result: RunResult) -> list[dict[str, Any]]:
     for row in result.checkpoints:
         values = dataclasses.asdict(row)
         values["diagnostics"] = {k: v for k, v in values["diagnostics"].items() if not k.startswith("time/")}
-        rows.append({name: repr(value) for name, value in values.items() if not name.endswith("_cpu_s")})
+        rows.append({name: exact(value) for name, value in values.items() if not name.endswith("_cpu_s")})
     return rows
+
+
+def exact(value: Any) -> Any:
+    """A value to compare to the bit; the text of an array would round its numbers and leave most of them out."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    if isinstance(value, dict):
+        return {name: exact(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [exact(part) for part in value]
+    assert value is None or isinstance(value, int | float | str | np.generic), type(value)
+    return repr(value)
 
 
 def own_values(folder: Path) -> str:

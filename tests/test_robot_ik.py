@@ -111,7 +111,10 @@ def test_babbling_is_what_was_reached_and_the_joints_with_noise() -> None:
 def test_unreachable_targets_are_refused_with_their_distance() -> None:
     with pytest.raises(InvalidValueError, match=r"1 of 2 targets are unreachable.*\[1.2, 0.0\] m, lies 0.200 m out"):
         ik.errors("1000", np.array([[0.5, 0.0], [1.2, 0.0]]), np.zeros((2, 3)))
-    assert ik.errors("1000", np.array([[1.0, 0.0]]), np.zeros((1, 3)))[0] < 1e-3  # the edge itself is reachable
+    at_a_stop = np.array([[2 * np.pi / 3, 2 * np.pi / 3 - 0.1, 0.0]])  # the edge there is hollow
+    for edge, joints_rad in ((np.array([[1.0, 0.0]]), np.zeros((1, 3))), (ik.forward(at_a_stop), at_a_stop)):
+        assert ik.distance_to_workspace(edge)[0] < 1e-9
+        assert ik.errors("1000", edge, joints_rad)[0] < 1e-3  # the edge itself is reachable
 
 
 @pytest.mark.parametrize("variant", ["19", "1000001", "-5", "many", "1e3"])

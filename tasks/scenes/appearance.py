@@ -22,7 +22,7 @@ class Appearance:
         name: The level's name.
         object_offset_m: Of every loose object's start, along x and along y.
         object_yaw_rad: Of every loose object's start.
-        hand_offset_m: Of the human's hand, along each axis, every frame.
+        hand_offset_m: Of the human's hand, along each axis, every frame until an object lies in its palm.
         hand_yaw_rad: Of the human's hand about the vertical through its fingertip, every frame.
         light_fraction: Of the brightness of all lights together, every frame.
         colour_fraction: Of each colour channel of each material, every frame.
@@ -43,7 +43,8 @@ class Appearance:
     @property
     def varies_every_frame(self) -> bool:
         """Whether anything but the objects' start varies."""
-        return self.hand_offset_m > 0 or self.light_fraction > 0 or self.camera_offset_m > 0
+        hand, camera = (self.hand_offset_m, self.hand_yaw_rad), (self.camera_offset_m, self.camera_angle_rad)
+        return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.colour_fraction))
 
 
 LEVELS: dict[str, Appearance] = {
@@ -114,7 +115,7 @@ class Looks:
         if level.colour_fraction:
             tint = 1.0 + level.colour_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
             model.mat_rgba[self._materials, :_CHANNELS] = np.minimum(self._rgba[:, :_CHANNELS] * tint, 1.0)
-        if level.camera_offset_m:
+        if level.camera_offset_m or level.camera_angle_rad:
             shift, turn = rng.uniform(-1.0, 1.0, (2, 3))
             model.cam_pos[self._camera] = self._camera_pos + level.camera_offset_m * shift
             model.cam_quat[self._camera] = _turned(self._camera_quat, level.camera_angle_rad * turn)
