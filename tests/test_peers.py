@@ -12,6 +12,7 @@ from test_runner import same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import encoders, registry, run_folder, runner
+from imagine_bench.bench import plan
 from imagine_bench.capabilities import SelfTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.evaluation import TrainingStarts
@@ -139,13 +140,20 @@ def test_it_is_never_taken_up_again_half_way() -> None:
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from imagine_bench.agents import peers
 
+    present = peers.importlib.import_module
+
     def missing(name: str) -> Any:
-        raise ImportError(f"No module named {name!r}")
+        if name == "sb3_contrib":
+            raise ImportError(f"No module named {name!r}")
+        return present(name)
 
     context = spec("sb3_qrdqn").context()
     monkeypatch.setattr(peers.importlib, "import_module", missing)
-    with pytest.raises(SetupError, match=r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"):
+    sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
+    with pytest.raises(SetupError, match=sentence):
         peers.make_qrdqn(context)
+    with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
+        plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from test_waves import Inline, bench
 from imagine_bench import encoders, registry
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
+from imagine_bench.files import lock
 from imagine_bench.interfaces import Observation, TaskSpec
 from imagine_bench.plans import fewest_actions
 from imagine_bench.policy import FRAMES, Ends, Situations, choices, follow, optimal_length, situations
@@ -216,6 +217,10 @@ def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytes
     assert [path.relative_to(folder).as_posix() for path in learners(folder)] == [
         "table/seed_0", "table/seed_1", "imaginer/seed_0",
     ]  # fmt: skip
+    for command, held in (("policy", ".policy.lock"), ("generalise", ".generalisation.lock")):
+        with lock(folder / held, "This"):
+            assert main([command, str(folder)]) == 2
+        assert "is in use by process" in capsys.readouterr().err
     assert main(["policy", str(folder)]) == 0
     said = capsys.readouterr().out
     assert "| table | 9 | 2 |" in said and "| imaginer | 9 | 1 |" in said and str(folder / "policy") in said
