@@ -71,7 +71,8 @@ ENSEMBLE: dict[str, Deviation] = {
 }
 """What a deep ensemble changes of every preset; its epochs are those of :func:`_ensemble_epochs`."""
 ENSEMBLE_SHARE = 10
-"""Five members for a tenth of the epochs cost half of one network with dropout: it must not win by arithmetic."""
+"""Five members for a tenth of the epochs cost half of one network with dropout: as preset it must not win by
+arithmetic. Epochs that are set are each member's."""
 ENSEMBLE_EPOCHS = 120
 """Below so many epochs members have hardly learned; they get them where that costs no more than the one network."""
 
@@ -83,7 +84,7 @@ _RANGES = {
     "gradient_clip": POSITIVE,
     "sigma_floor": between(1e-9, 1.0),
     "sigma_ceiling": between(1.0, 1e9),
-    "weight_samples": between(2, 10_000, "the spread of one sample is 0"),
+    "weight_samples": between(2, 1_000, "the spread of one sample is 0"),
     "components": between(1, 1_000),
     "members": between(1, 1_000),
     "batch_size": Range(lambda value: value >= 8, "must be at least 8: layers are standardised over a batch"),
@@ -130,7 +131,7 @@ def resolve_all(preset: str, overrides: Mapping[str, Any]) -> tuple[RegressorSet
 
 
 def _ensemble_epochs(epochs: int) -> int:
-    """Epochs of each member where one network trains for ``epochs``; all members together never cost more."""
+    """Epochs of each member where one network trains for ``epochs``: all preset members together cost no more."""
     fair = max(1, epochs // ENSEMBLE["members"].value)
     return min(fair, max(ENSEMBLE_EPOCHS, epochs // ENSEMBLE_SHARE))
 

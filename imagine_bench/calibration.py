@@ -19,6 +19,8 @@ from imagine_bench.regression import Floats, Mixtures
 LEVELS = (0.5, 0.8, 0.95)
 """Central intervals whose coverage is reported."""
 _LOG_2PI = math.log(2.0 * math.pi)
+_AT_ONCE = 2**24
+"""Pairs of components, in all dimensions, that a score compares at a time: 128 MiB an array."""
 
 
 def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
@@ -69,12 +71,15 @@ def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
     """
     weights, means, variances = mixtures.weights, mixtures.means, mixtures.sigmas**2
     away = _mean_size(outcomes[..., None, :] - means, variances)  # [..., K, D]
-    between = _mean_size(
-        means[..., :, None, :] - means[..., None, :, :], variances[..., :, None, :] + variances[..., None, :, :]
-    )  # [..., K, K, D]
-    first = np.einsum("...k,...kd->...d", weights, away)
-    second = np.einsum("...k,...l,...kld->...d", weights, weights, between)
-    score: Floats = first - 0.5 * second
+    score: Floats = np.einsum("...k,...kd->...d", weights, away)
+    step = max(1, _AT_ONCE // max(1, means.size))
+    for start in range(0, means.shape[-2], step):
+        some = slice(start, start + step)
+        between = _mean_size(
+            means[..., some, None, :] - means[..., None, :, :],
+            variances[..., some, None, :] + variances[..., None, :, :],
+        )  # [..., step, K, D]
+        score = score - 0.5 * np.einsum("...k,...l,...kld->...d", weights[..., some], weights, between)
     return score
 
 

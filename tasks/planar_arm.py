@@ -1,4 +1,4 @@
-"""The planar arm in MuJoCo: what a joint configuration really reaches, mink's solution, pictures, motion."""
+"""The planar arm in MuJoCo: what a joint configuration really reaches, mink's solution, motion."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, Motion, Shape3D
+from imagine_bench.interfaces import Motion, Shape3D
 from imagine_bench.regression import Floats
 
-from .rendering import Renderer, View
 from .scene_reader import body_names, poses_of, shapes_of
-from .scenes.constants import SCENE_GROUP
 
 MOVE_S = 1.6
 """Simulated seconds of a movement; the servos have come to rest by then (a test says how near)."""
 _START_RAD = np.zeros(3)
 _TIP = "tip"
 _IK_TOLERANCE_M, _IK_STEPS, _IK_STARTS = 1e-4, 60, 8
-_AGENT_VIEW = View(camera="agent", groups=(SCENE_GROUP,), slices=12)
-_TABLE_Z_M = 0.0
 
 
 class PlanarArm:
@@ -37,7 +33,6 @@ class PlanarArm:
         self._data = mujoco.MjData(self.model)
         self._site = self.model.site(_TIP).id
         self._steps = round(MOVE_S / self.model.opt.timestep)
-        self._renderers: dict[View, Renderer] = {}
 
     def execute(self, joints_rad: Floats) -> Floats:
         """Let the servos move the arm from rest at zero to each configuration, and measure where its tip comes to rest.
@@ -112,33 +107,6 @@ class PlanarArm:
     def shapes(self) -> tuple[Shape3D, ...]:
         """Every drawable part."""
         return shapes_of(self.model)
-
-    def picture(self, joints_rad: Floats, target_m: Floats | None = None, *, large: int = 0) -> Frame:
-        """The arm at a configuration (3,), with a target (2,) on the table.
-
-        Args:
-            joints_rad: Shape (3,).
-            target_m: Where the target lies, if there is one.
-            large: 0 for the 64 x 64 view from above, else the width of the large view in pixels.
-        """
-        view = _AGENT_VIEW
-        if large:
-            view = View(camera="human", width=large, height=3 * large // 4, groups=(SCENE_GROUP,), shadow_px=2048,
-                        samples=4, slices=32, sky=True)  # fmt: skip
-        if view not in self._renderers:
-            self._renderers[view] = Renderer(self.model, view)
-        mujoco.mj_resetData(self.model, self._data)
-        self._data.qpos[:] = joints_rad
-        if target_m is not None:
-            self._data.mocap_pos[0] = (*target_m, _TABLE_Z_M)
-        mujoco.mj_forward(self.model, self._data)
-        return self._renderers[view].frame(self._data)
-
-    def close(self) -> None:
-        """Free the renderers."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
 
 
 def _solve_one(

@@ -142,12 +142,12 @@ def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[
 
     Returns:
         ``decision/...``: ``points`` and where the tip came to rest instead, ``reached`` (E, DECISIONS, CANDIDATES, 2),
-        ``error``, ``joints`` and one entry a score of the same leading shape, ``mink_error`` of the first candidate of
-        each choice (E, DECISIONS).
-        ``disc/...``: ``error``, scores and ``outside_m`` of the same choices among points of the whole disc of the
-        stretched arm, some of them out of reach.
-        ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, and the three
-        uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
+        ``error``, ``joints``, ``outside_m`` and one entry a score of the same leading shape, ``mink_error`` of the
+        first candidate of each choice (E, DECISIONS).
+        ``disc/...``: the same but ``mink_error`` of choices among points of the whole disc of the stretched arm, some
+        of them out of reach.
+        ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, ``stationarity``
+        (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
     """
     count = DECISIONS * CANDIDATES
     parts = {"map": _map(variant, assess, len(seeds))}

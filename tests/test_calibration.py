@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from imagine_bench import calibration
 from imagine_bench.calibration import auroc, coverage, crps, log_score, probability_transform, transform_distance
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.regression import Mixtures
@@ -34,6 +35,14 @@ def test_crps_is_the_integral_of_the_squared_difference_of_distributions() -> No
             below = integrate.quad(lambda t, r=row, k=d: distribution(m, r, k, t) ** 2, -20, y, limit=200)[0]
             above = integrate.quad(lambda t, r=row, k=d: (1 - distribution(m, r, k, t)) ** 2, y, 20, limit=200)[0]
             assert closed[row, d] == pytest.approx(below + above, rel=1e-6)
+
+
+def test_crps_in_parts_is_that_of_all_pairs_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    m, outcomes = mixture(components=7), np.zeros((4, 2))
+    whole = crps(m, outcomes)
+    for pairs in (1, 2 * m.means.size, 3 * m.means.size):
+        monkeypatch.setattr(calibration, "_AT_ONCE", pairs)
+        np.testing.assert_allclose(crps(m, outcomes), whole, rtol=1e-12)
 
 
 def test_crps_of_one_gaussian_and_of_a_point() -> None:

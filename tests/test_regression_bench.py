@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from imagine_bench.agents import regressor_settings
+from test_recording import contents, times
 
 from imagine_bench import registry
 from imagine_bench.bench import plan
@@ -20,7 +21,8 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.kinds import KINDS
 from imagine_bench.quality import generalisation_report
-from imagine_bench.regression import SCORES, Dataset, Mixtures, RegressorContext, runner
+from imagine_bench.regression import SCORES, Assessment, Dataset, Mixtures, RegressorContext, runner
+from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
 from imagine_bench.report import robot_ik, toy_regression
@@ -80,10 +82,70 @@ def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> No
     for variant in ("base", "low_data", "high_noise"):
         found = toy.evaluations[variant]
         assert found["epistemic"].shape == (2, 1000) and (found["epistemic"] > 0).all()
-        total = found["epistemic"] + found["aleatoric"] + found["modal"]
-        np.testing.assert_allclose(total, found["total"], rtol=1e-6)
         assert (found["stationarity"] <= np.log(5) + 1e-9).all() and (found["stationarity"] >= 0).all()
-    assert toy.recording is not None and toy.recording.stat().st_size > 10_000
+    assert toy.recording is not None
+    named = contents(toy.recording)
+    for variant in ("base", "low_data", "high_noise"):
+        kinds = [f"{kind}/{what}" for kind in ("epistemic", "modal", "aleatoric") for what in ("estimated", "true")]
+        for part in ("y/training", "y/prediction", *kinds):
+            assert named[f"/{variant}/{part}"] == {"x_hundredths"}, part
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_variances_and_surprise_are_those_of_all_weight_samples_pooled(agent: str) -> None:
+    """Of targets far from 0 and from unit variance, so that they must be scaled back rightly."""
+    rng, context = np.random.default_rng(0), tiny_context(agent, scale=50.0, shift=300.0)
+    regressor = registry.make_regressor(agent, context)
+    regressor.train(2)
+    inputs = rng.normal(size=(2, 20, 1))
+    said, pooled = regressor.assess(inputs, rng), regressor.pooled(inputs)
+    weights = pooled.weights[..., None]
+    mean = (weights * pooled.means).sum(axis=-2, keepdims=True)
+    variance = (weights * (pooled.sigmas**2 + (pooled.means - mean) ** 2)).sum(axis=-2)
+    np.testing.assert_allclose(said.epistemic + said.aleatoric + said.modal, variance, rtol=1e-3)
+    np.testing.assert_allclose(said.mean, mean[..., 0, :], rtol=1e-5)
+    assert 10.0 < np.sqrt(variance).mean() < 250.0 and abs(mean.mean() - 300.0) < 100.0
+    np.testing.assert_allclose(said.surprise, log_score(pooled, said.prediction), atol=1e-3)
+
+
+def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
+    rng = np.random.default_rng(1)
+    inputs = rng.normal(size=(64, 1))
+    data = Dataset(inputs=inputs, targets=shift + scale * (np.sin(inputs) + 0.3 * rng.normal(size=(64, 1))))
+    overrides = {**dict(_overrides(agent)), "batch_size": 32}
+    return RegressorContext(
+        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), preset="smoke", overrides=overrides
+    )
+
+
+class Knowing:
+    """Says one thing everywhere, and knows how wrong that is: its epistemic variance, and the negative of its modal."""
+
+    def assess(self, inputs: np.ndarray, rng: np.random.Generator) -> Assessment:
+        prediction = np.zeros((*inputs.shape[:2], 1))
+        toy = registry.regression("toy_regression")
+        wrong = np.stack([toy.errors("base", *pair) for pair in zip(inputs, prediction, strict=True)])[..., None]
+        constant = np.zeros(wrong.shape)
+        return Assessment(
+            prediction=prediction, mean=prediction, epistemic=wrong, aleatoric=constant, modal=-wrong,
+            stationarity=constant[..., 0], drawn=constant[..., 0], surprise=-wrong[..., 0],
+            predictive=self.pooled(inputs),
+        )  # fmt: skip
+
+    def pooled(self, inputs: np.ndarray) -> Mixtures:
+        shape = (*inputs.shape[:2], 1)
+        return Mixtures(weights=np.ones(shape), means=np.zeros((*shape, 1)), sigmas=np.full((*shape, 1), 1e6))
+
+
+def test_errors_are_paired_with_the_scores_of_the_same_points() -> None:
+    task, networks = registry.regression("toy_regression"), (SeedTree(0), SeedTree(1))
+    rows, arrays = calibrate(task, Knowing(), "base", networks, points=60, rng=np.random.default_rng(0))
+    assert arrays["error"].shape == (2, 60) and not np.array_equal(*arrays["error"])
+    for row in rows:
+        assert 0.0 < row["wrong"] < 1.0
+        assert row["auroc_epistemic"] == 1.0 and row["auroc_modal"] == row["auroc_surprise"] == 0.0
+        assert row["auroc_total"] == row["auroc_aleatoric"] == row["auroc_stationarity"] == 0.5
+        assert row["coverage_0.5"] == 1.0, "so wide a prediction has every outcome near its median"
 
 
 class _Killed(Exception):
@@ -203,7 +265,12 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
     for name in ("results", "table_4_1", "ratio_to_random", "disc", "disc_ratio_to_random", "calibration", "auroc"):
         assert (report / f"{name}.csv").stat().st_size > 50
     assert (report / "report.md").stat().st_size > 1000
-    assert (folder / "mc_dropout" / "seed_0" / "recording.rrd").stat().st_size > 10_000
+    recording = folder / "mc_dropout" / "seed_0" / "recording.rrd"
+    named = contents(recording)
+    for part in ("candidates", "chosen", "outside", "miss", "error", "story"):
+        assert named[f"/choice/{part}"] >= {"sim_time", "choice"}, part
+    assert min(times(recording, "/choice/story", "choice")) == 1, "counted as its words do"
+    assert any(path.startswith("/scene") for path in named)
     assert main(words) == 0  # nothing is missing: the same table again, from the files
     notice, *again = capsys.readouterr().out.splitlines()
     assert notice == f"All runs lie in {folder} already; nothing was run."

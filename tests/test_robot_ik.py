@@ -123,17 +123,6 @@ def test_sample_counts_out_of_range_name_the_range(variant: str) -> None:
         ik.require_variant(variant)
 
 
-def test_pictures_show_the_arm_and_the_target() -> None:
-    arm = ik.arm()
-    small = arm.picture(np.zeros(3), np.array([0.0, 0.7]))
-    assert small.shape == (64, 64, 3)
-    moved = arm.picture(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.7]))
-    elsewhere = arm.picture(np.zeros(3), np.array([0.0, -0.7]))
-    assert (small != moved).any(axis=-1).sum() > 30 and 2 <= (small != elsewhere).any(axis=-1).sum() < 40
-    assert arm.picture(np.zeros(3), large=320).shape == (240, 320, 3)
-    arm.close()
-
-
 def test_decisions_are_carried_out_by_the_arm() -> None:
     """Of networks that say what they like: the arm rests where equation 4.29 puts the joints, and misses by that."""
 

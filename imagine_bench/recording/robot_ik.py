@@ -48,17 +48,18 @@ def record(
         log_shapes(recording, scene.shapes())
         clock_s = 0.0
         for choice in range(CHOICES):
+            number = choice + 1
             points, scores = (data[f"decision/{key}"][0, choice] for key in ("points", "epistemic"))
             chosen = int(scores.argmin())
-            _at(recording, clock_s, choice)
+            _at(recording, clock_s, number)
             _show_candidates(recording, data, points, scores, chosen)
             _say(recording, name, variant, data, choice, chosen, arrived=False)
             motion = scene.movement(data["decision/joints"][0, choice, chosen], _HZ)
             still = dataclasses.replace(motion, time_s=motion.time_s[:1], poses_in_world=motion.poses_in_world[:1])
-            log_motion(recording, still, end_s=clock_s, sequences={"choice": choice}, only_moved=False)
+            log_motion(recording, still, end_s=clock_s, sequences={"choice": number}, only_moved=False)
             clock_s += _LOOK_S + float(motion.time_s[-1])
-            log_motion(recording, motion, end_s=clock_s, sequences={"choice": choice}, only_moved=False)
-            _at(recording, clock_s, choice)
+            log_motion(recording, motion, end_s=clock_s, sequences={"choice": number}, only_moved=False)
+            _at(recording, clock_s, number)
             _show_error(recording, data["decision/reached"][0, choice, chosen], points[chosen])
             error_m = float(data["decision/error"][0, choice, chosen])
             recording.log("/choice/error", rr.Scalars(error_m), strict=True)
@@ -80,9 +81,9 @@ def _layout(variant: str) -> rrb.Blueprint:
     return rrb.Blueprint(layout, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
 
 
-def _at(recording: rr.RecordingStream, clock_s: float, choice: int) -> None:
+def _at(recording: rr.RecordingStream, clock_s: float, number: int) -> None:
     recording.set_time("sim_time", duration=clock_s)
-    recording.set_time("choice", sequence=choice)
+    recording.set_time("choice", sequence=number)
 
 
 def _lifted(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,7 @@
-"""The toy functions and what a network says about them, along x: timeline ``x``, entities ``/<variant>/...``."""
+"""The toy functions and what a network says about them, along x.
+
+Timeline ``x_hundredths``, entities ``/<variant>/...``.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,8 @@ _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86
 _PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (150, 150, 150), (190, 190, 196)
 _SHOWN = (-30, 40)
 _TICKS = 100
-"""Steps of the timeline per unit of x, which is a sequence."""
+"""Steps of the timeline per unit of x: a timeline counts whole numbers."""
+_TIMELINE = "x_hundredths"
 
 
 def record(
@@ -60,17 +64,17 @@ def _layout(variants: list[str], name: str) -> rrb.Blueprint:
 
     columns = [
         rrb.Vertical(
-            view(variant, "y", f"data and predictions ({name})"),
-            *(view(variant, kind, f"{kind} (std of y)") for kind in _KINDS),
+            view(variant, "y", f"data and predictions ({name}), over 100 x"),
+            *(view(variant, kind, f"{kind} (std of y), over 100 x") for kind in _KINDS),
         )
         for variant in variants
     ]
     panels = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
-    return rrb.Blueprint(rrb.Horizontal(*columns), *panels, rrb.TimePanel(state="collapsed", timeline="x"))
+    return rrb.Blueprint(rrb.Horizontal(*columns), *panels, rrb.TimePanel(state="collapsed", timeline=_TIMELINE))
 
 
 def _times(x: NDArray[np.float64]) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn("x", sequence=np.round(x * _TICKS).astype(np.int64))]
+    return [rr.TimeColumn(_TIMELINE, sequence=np.round(x * _TICKS).astype(np.int64))]
 
 
 def _points(

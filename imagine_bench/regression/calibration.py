@@ -81,5 +81,5 @@ def _pooled(regressor: Regressor, inputs: Floats, targets: Floats) -> tuple[Floa
         transforms.append(probability_transform(mixtures, targets[:, part]))
         for point in range(start, min(start + _CHUNK, CRPS_POINTS, inputs.shape[1])):
             one = Mixtures(**{n: getattr(mixtures, n)[:, point - start] for n in ("weights", "means", "sigmas")})
-            scores.append(crps(one, targets[:, point]))  # [E, D]; a point at a time: (T K)^2 numbers each
+            scores.append(crps(one, targets[:, point]))  # [E, D]
     return np.concatenate(transforms, axis=1), np.stack(scores, axis=1)

@@ -106,7 +106,7 @@ def _decisions(result: RegressionResult) -> Section:
             "hindsight, mink is the error of inverse kinematics with a known model of the arm, the ceiling.",
             *few_words(len(protocol.seeds) * protocol.networks, "networks"),
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
-            "is measured. Here no place outside of the workspace is asked for; the maps below show the distance there.",
+            "is measured. Here no place outside of the workspace is asked for; the maps below show where it ends.",
         ),
         pictures=(_ratio_picture(result, against),),
         tables=(

@@ -100,6 +100,8 @@ def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
     """``2.36 (0.45)``: mean and standard deviation, as the thesis prints them."""
     count = len(values)
     mean = sum(values) / count
+    if math.isnan(mean):
+        return "–"
     if count < 2:
         return f"{mean:.2f}"
     spread = (sum((value - mean) ** 2 for value in values) / (count - 1)) ** 0.5

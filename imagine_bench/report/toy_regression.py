@@ -38,7 +38,8 @@ def sections(result: RegressionResult) -> list[Section]:
                 "Values are the median over networks, in brackets the smallest and the largest.",
             ),
             tables=[table for table in tables if table.rows],
-            answers=answers or ["Every claim compares a variant with the variant base; run that too."],
+            answers=answers
+            or ["What little data and much noise do is said against base: run low_data or high_noise beside it."],
         ),
         Section(
             title="Figure 4.1: what is uncertain, and why",
