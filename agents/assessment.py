@@ -6,14 +6,14 @@ pictures that are alike, that cannot tell the two apart; reading the whole trans
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from imagine_bench.errors import require_known
 
-from .layers import Masks, MemberMLP, by_network
+from .layers import Masks, MemberMLP, Parameters
 from .precision import hidden_dtype
 from .settings import WorldModelSettings
 from .weight_samples import sample_outputs
@@ -75,8 +75,8 @@ class Assessment(nn.Module):
         z: Tensor,
         action: Tensor,
         next_z: Tensor,
-        masks: Sequence[Masks | None] | None = None,
-        parameters: Sequence[Tensor] | None = None,
+        masks: Sequence[Iterable[Tensor] | None] | None = None,
+        parameters: Sequence[Parameters] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Rewards and termination logits of N transitions of S seeds, without ``masks`` deterministic: (S, N) each.
 
@@ -85,11 +85,11 @@ class Assessment(nn.Module):
             action: Shape (S, N).
             next_z: Shape (S, N, Z).
             masks: Those of each network, or None where it drops nothing.
-            parameters: Those of S networks, one network after the other, instead of its own.
+            parameters: Those of S networks for each network, instead of its own.
         """
         read = self._read(z, action, next_z)
         drawn = [None] * len(self.networks) if masks is None else masks
-        own = [None] * len(self.networks) if parameters is None else by_network(self.networks, parameters)  # type: ignore[arg-type]
+        own = [None] * len(self.networks) if parameters is None else parameters
         outputs = [network(read, *rest) for network, *rest in zip(self.networks, drawn, own, strict=True)]
         reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [S, N, 2] to [S, N] and [S, N]
         return reward, logit

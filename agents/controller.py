@@ -19,7 +19,7 @@ from imagine_bench.errors import DivergedError
 
 from . import joint
 from .flat_adam import FlatAdam
-from .layers import MemberMLP
+from .layers import MemberMLP, Parameters
 from .memory import Batch
 from .settings import ControllerSettings
 
@@ -103,7 +103,7 @@ class Controller(nn.Module):
             self.target.load(arrays["target"])
 
 
-def bellman_errors(controllers: Sequence[Controller], batch: Batch, parameters: Sequence[Tensor]) -> Tensor:
+def bellman_errors(controllers: Sequence[Controller], batch: Batch, parameters: Parameters) -> Tensor:
     """Mean squared Bellman errors of S controllers of one shape; no gradient flows through the targets.
 
     Args:

@@ -8,7 +8,7 @@ is always computed in float32: a reward of 50 has no decimals in bfloat16. Its g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -21,8 +21,8 @@ _BITS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 def dense_stack(
-    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], keep: Sequence[Tensor] | None, scale: float,
-    dtype: torch.dtype,
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], keep: Iterable[Tensor] | None, scale: float,
+    dtype: torch.dtype, gradients: Sequence[Tensor] = (),
 ) -> Tensor:  # fmt: skip
     """A differentiable stack: ``relu(x W + b) * mask`` at each hidden layer, linear at the last.
 
@@ -30,16 +30,18 @@ def dense_stack(
         x: Shape (E, N, in).
         weights: One a layer, (E, in, out).
         biases: One a layer, (E, 1, out).
-        keep: One a hidden layer, (E, N, out), int16: -1 keeps a unit, 0 drops it. None drops nothing.
+        keep: One a hidden layer, (E, N, out), int16: -1 keeps a unit, 0 drops it; each is asked for when its layer is
+            done. None drops nothing.
         scale: What a unit that is kept is multiplied by; not read without ``keep``.
         dtype: In which the hidden layers compute forward, and all layers backward; the values of the output layer are
             computed in the type of the weights.
+        gradients: Where those of weights, then biases, are written; empty: in new memory.
 
     Returns:
         Shape (E, N, out).
     """
-    masks, scale = (None, 1.0) if keep is None else (tuple(keep), scale)
-    output: Tensor = _Stack.apply(x, masks, scale, dtype, *weights, *biases)
+    masks, scale = (None, 1.0) if keep is None else (iter(keep), scale)
+    output: Tensor = _Stack.apply(x, masks, scale, dtype, gradients, *weights, *biases)
     return output
 
 
@@ -52,8 +54,9 @@ class _Stack(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, keep: tuple[Tensor, ...] | None, scale: float, dtype: torch.dtype, *parameters: Tensor
-    ) -> Tensor:
+        ctx: Any, x: Tensor, keep: Iterator[Tensor] | None, scale: float, dtype: torch.dtype,
+        gradients: Sequence[Tensor], *parameters: Tensor,
+    ) -> Tensor:  # fmt: skip
         layers = len(parameters) // 2
         weights, biases = parameters[:layers], parameters[layers:]
         g, inputs, rounded = x.to(dtype), [], []
@@ -62,28 +65,30 @@ class _Stack(torch.autograd.Function):
             rounded.append(weight.to(dtype))
             g = affine(g, rounded[-1], _times(bias, scale**-layer).to(dtype), relu=True)
             if keep is not None:
-                _and_(g, keep[layer])
+                _and_(g, next(keep))
         ctx.save_for_backward(*inputs, *rounded, g, weights[-1])
-        ctx.scale = scale
+        ctx.scale, ctx.gradients, ctx.shapes = scale, gradients, [parameter.shape for parameter in parameters]
         return affine(g.to(weights[-1].dtype), _times(weights[-1], scale ** (layers - 1)), biases[-1])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         *pairs, g, last = ctx.saved_tensors
         inputs, rounded = pairs[: len(pairs) // 2], pairs[len(pairs) // 2 :]
+        gradients = ctx.gradients or [last.new_empty(shape) for shape in ctx.shapes]
+        by_weight, by_bias = gradients[: len(inputs) + 1], gradients[len(inputs) + 1 :]
         back = _times(gradient, ctx.scale ** len(inputs)).to(g.dtype)
-        by_weight = [product(g.transpose(1, 2), back).to(last.dtype)]
-        by_bias = [gradient.sum(dim=1, keepdim=True)]
+        by_weight[-1].copy_(product(g.transpose(1, 2), back))
+        torch.sum(gradient, dim=1, keepdim=True, out=by_bias[-1])
         back = product(back, last.to(g.dtype).transpose(1, 2))
         for layer in reversed(range(len(inputs))):
             x, weight = inputs[layer], rounded[layer]
             _gate_(back, g)
-            by_weight.append(product(x.transpose(1, 2), back).to(last.dtype))
-            by_bias.append(_times(back.sum(dim=1, keepdim=True).to(last.dtype), ctx.scale**-layer))
+            by_weight[layer].copy_(product(x.transpose(1, 2), back))
+            by_bias[layer].copy_(back.sum(dim=1, keepdim=True)).mul_(ctx.scale**-layer)
             if layer > 0 or ctx.needs_input_grad[0]:
                 back, g = product(back, weight.transpose(1, 2)), x
         by_x = back.to(last.dtype) if ctx.needs_input_grad[0] else None
-        return by_x, None, None, None, *reversed(by_weight), *reversed(by_bias)
+        return by_x, None, None, None, None, *gradients
 
 
 def _times(x: Tensor, scale: float) -> Tensor:
@@ -100,6 +105,6 @@ def _and_(x: Tensor, keep: Tensor) -> None:
 
 
 def _gate_(gradient: Tensor, h: Tensor) -> None:
-    """Clear the gradient wherever ``h``, which is never negative, is 0."""
-    bits = _bits(h)
-    _bits(gradient).bitwise_and_(bits.neg().bitwise_right_shift_(8 * h.itemsize - 1))
+    """Clear the gradient wherever ``h``, which is never negative, is 0; as integers, for which torch is faster."""
+    bits = _bits(gradient)
+    torch.ops.aten.threshold_backward.grad_input(bits, _bits(h), 0, grad_input=bits)

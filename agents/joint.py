@@ -7,17 +7,17 @@ learns alone is the case S = 1 of the same code.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from .flat_adam import FlatAdam
-from .layers import Masks
+from .layers import MemberMLP, Parameters
 from .memory import Batch
 from .products import joined, stacked
 
-Losses = Callable[[Sequence[Tensor]], Tensor]
+Losses = Callable[[Parameters], Tensor]
 """From the parameters of S models of E members, each (S E, ...), to their losses (terms, S)."""
 
 
@@ -33,11 +33,19 @@ def gradients(optimisers: Sequence[FlatAdam], losses: Losses) -> tuple[Tensor, T
     """
     # Every greenlet has this flag for itself, and in a cohort the one that is here did not prepare torch.
     torch.set_flush_denormal(True)
-    vectors = _side_by_side(optimisers).detach().requires_grad_()
-    like = optimisers[0].parameters
-    parts = vectors.split([parameter.numel() for parameter in like], dim=1)
-    terms = losses([part.reshape(-1, *parameter.shape[1:]) for part, parameter in zip(parts, like, strict=True)])
-    (gradient,) = torch.autograd.grad(terms.sum(), vectors)
+    vectors = _side_by_side(optimisers).detach()
+    gradient = torch.empty_like(vectors)  # each layer writes its own where it belongs
+    sizes = [parameter.numel() for parameter in optimisers[0].parameters]
+    homes = gradient.split(sizes, dim=1)
+    shapes = [(-1, *parameter.shape[1:]) for parameter in optimisers[0].parameters]
+    values, written = (
+        [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        for parts in (vectors.split(sizes, dim=1), homes)
+    )
+    terms = losses(Parameters([value.requires_grad_() for value in values], written))
+    for home, found in zip(homes, torch.autograd.grad(terms.sum(), values), strict=True):
+        if found.data_ptr() != home.data_ptr():  # several members of several models: reshaping was a copy
+            home.copy_(found.view(home.shape))
     return terms.detach(), gradient
 
 
@@ -59,9 +67,12 @@ def batches(parts: Sequence[Batch]) -> Batch:
     return Batch(**{name: stacked([getattr(part, name) for part in parts]) for name in names})
 
 
-def masks(parts: Sequence[Masks | None]) -> Masks | None:
-    """The dropout masks of S models' E members as those of S E members."""
-    drawn = [part for part in parts if part is not None]
-    if not drawn:
+def masks(network: MemberMLP, rows: int, generators: Sequence[torch.Generator]) -> Iterator[Tensor] | None:
+    """The dropout masks of S models' E members as those of S E members, or None where nothing is dropped.
+
+    Each is drawn when it is asked for, that is when its layer has been computed: so it is read from a near cache.
+    """
+    if network.dropout == 0.0:
         return None
-    return tuple(joined(layer) for layer in zip(*drawn, strict=True))
+    layers = network.sizes[1:-1]
+    return (joined([network.draw_mask(hidden, rows, generator) for generator in generators]) for hidden in layers)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
 
@@ -18,6 +19,20 @@ from .dense import dense_stack
 
 Masks = tuple[Tensor, ...]
 """One dropout mask a hidden layer, each (E, N, H), int16: -1 keeps a unit, 0 drops it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Weights and biases of networks of one shape, other than those that a module holds.
+
+    Attributes:
+        values: Network by network its weights, then its biases, each with a leading axis of as many as there are.
+        gradients: Where the gradients of these are written, of the same shapes; empty: in new memory.
+    """
+
+    values: Sequence[Tensor]
+    gradients: Sequence[Tensor] = ()
+
 
 _INT64_MIN = -(2**63)
 _PROBABILITY_BITS = 8
@@ -47,13 +62,20 @@ def dropout_mask(shape: Sequence[int], dropout: float, generator: torch.Generato
     """
     count = math.prod(shape)
     words = torch.empty(-(-count // 64), dtype=torch.int64, device=generator.device)
-    digits = f"{dropout_bits(dropout):0{_PROBABILITY_BITS}b}".rstrip("0")
-    kept = torch.full_like(words, -1)
-    for digit in reversed(digits):
-        words.random_(_INT64_MIN, None, generator=generator)
-        kept = kept & words if digit == "1" else kept | words
+    last, *digits = _digits(dropout)
+    kept = words.random_(_INT64_MIN, None, generator=generator) if last else words.fill_(-1)
+    for digit in digits:
+        fresh = torch.empty_like(words).random_(_INT64_MIN, None, generator=generator)
+        kept = kept & fresh if digit else kept | fresh
     fields = kept.view(torch.int16)[None, :] << _shifts(generator.device)  # [16, 4 words]: one bit each, at the sign
     return fields.bitwise_right_shift_(15).view(-1)[:count].view(*shape)
+
+
+@lru_cache(maxsize=64)
+def _digits(dropout: float) -> tuple[bool, ...]:
+    """The binary digits of the probability, the last one that is set first; (False,) if none is."""
+    digits = f"{dropout_bits(dropout):0{_PROBABILITY_BITS}b}".rstrip("0")
+    return tuple(digit == "1" for digit in reversed(digits)) or (False,)
 
 
 @lru_cache(maxsize=8)
@@ -95,28 +117,31 @@ class MemberMLP(nn.Module):
         """Fresh dropout masks of every hidden layer for ``rows`` rows, or None where nothing is dropped."""
         if self.dropout == 0.0:
             return None
-        return tuple(dropout_mask((self.members, rows, h), self.dropout, generator) for h in self.sizes[1:-1])
+        return tuple(self.draw_mask(hidden, rows, generator) for hidden in self.sizes[1:-1])
 
-    def forward(self, x: Tensor, masks: Masks | None = None, parameters: Sequence[Tensor] | None = None) -> Tensor:
+    def draw_mask(self, hidden: int, rows: int, generator: torch.Generator) -> Tensor:
+        """A fresh dropout mask of a layer of so many hidden units: (E, N, H)."""
+        return dropout_mask((self.members, rows, hidden), self.dropout, generator)
+
+    def forward(self, x: Tensor, masks: Iterable[Tensor] | None = None, parameters: Parameters | None = None) -> Tensor:
         """Map (E, N, in) to (E, N, out); without ``masks`` no unit is dropped and the result is deterministic.
 
         Args:
             x: Shape (E, N, in).
-            masks: From :meth:`draw_masks`.
-            parameters: Weights, then biases, of as many networks of this shape as ``x`` has, instead of its own.
+            masks: From :meth:`draw_masks`, or one a hidden layer that is drawn when it is asked for.
+            parameters: Those of as many networks of this shape as ``x`` has, instead of its own.
         """
-        layers = len(self.weights)
-        weights = self.weights if parameters is None else parameters[:layers]
-        biases = self.biases if parameters is None else parameters[layers:]
+        chosen = Parameters([*self.weights, *self.biases]) if parameters is None else parameters
+        weights, biases = chosen.values[: len(self.weights)], chosen.values[len(self.weights) :]
         exact = weights[0].dtype
         dtype = self.hidden_dtype if torch.is_grad_enabled() and exact == torch.float32 else exact
-        return dense_stack(x, list(weights), list(biases), masks, kept_scale(self.dropout), dtype)
+        return dense_stack(x, weights, biases, masks, kept_scale(self.dropout), dtype, chosen.gradients)
 
 
-def by_network(networks: Iterable[MemberMLP], parameters: Sequence[Tensor]) -> list[Sequence[Tensor]]:
-    """Parameters of several networks, one after the other, as one sequence a network."""
+def by_network(networks: Iterable[MemberMLP], parameters: Parameters) -> list[Parameters]:
+    """Those of several networks, one after the other, network by network."""
     ends = list(accumulate((2 * len(network.weights) for network in networks), initial=0))
-    return [parameters[start:end] for start, end in pairwise(ends)]
+    return [Parameters(parameters.values[a:b], parameters.gradients[a:b]) for a, b in pairwise(ends)]
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ the losses trains them all. The dynamics may be an ensemble of E networks, which
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,7 +22,7 @@ from . import joint
 from . import mixture as mdn
 from .assessment import Assessment
 from .flat_adam import FlatAdam
-from .layers import Masks, MemberMLP, by_network, clip_unit_norms
+from .layers import Masks, MemberMLP, Parameters, by_network, clip_unit_norms
 from .memory import Batch
 from .mixture import Mixture
 from .precision import hidden_dtype
@@ -96,7 +96,7 @@ class WorldModel(nn.Module):
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
     def _mixture(
-        self, z: Tensor, action: Tensor, masks: Masks | None, parameters: Sequence[Tensor] | None = None
+        self, z: Tensor, action: Tensor, masks: Iterable[Tensor] | None, parameters: Parameters | None = None
     ) -> Mixture:
         """``p(z' | z, a)`` of every row (S, N) by every member of the seed's ensemble, with leading axes (S E, N)."""
         settings = self.settings
@@ -111,7 +111,7 @@ class WorldModel(nn.Module):
         """Rows of S seeds (S, N, ...) for each of their E members. Shape (S E, N, ...)."""
         return rows.unsqueeze(1).expand(-1, self.members, *rows.shape[1:]).flatten(0, 1)
 
-    def losses(self, updates: Sequence[Update], parameters: Sequence[Tensor]) -> Tensor:
+    def losses(self, updates: Sequence[Update], parameters: Parameters) -> Tensor:
         """Mean losses of dynamics (summed over members), reward and termination, under fresh dropout masks.
 
         Args:
@@ -123,12 +123,12 @@ class WorldModel(nn.Module):
         """
         rows, seeds = len(updates[0].batch.action), len(updates)
         batch = joint.batches([update.batch for update in updates])
-        drawn = [[network.draw_masks(rows, update.dropout) for network in self.networks] for update in updates]
-        dynamics, *assessment = [joint.masks(masks) for masks in zip(*drawn, strict=True)]
+        draws = [update.dropout for update in updates]
+        dynamics, *assessment = [joint.masks(network, rows, draws) for network in self.networks]
         own, *others = by_network(self.networks, parameters)
         mixture = self._mixture(batch.z, batch.action, dynamics, own)
         read = batch.z, batch.action, batch.next_z
-        reward, logit = self.assessment(*read, assessment, [part for other in others for part in other])
+        reward, logit = self.assessment(*read, assessment, others)
         likelihood = mdn.log_likelihood(mixture, self._to_members(batch.next_z)).mean(dim=1)  # [S E]
         return torch.stack(
             [

@@ -8,6 +8,7 @@ import pytest
 import torch
 from imagine_bench.agents import joint
 from imagine_bench.agents.controller import Controller, bellman_errors, epsilon, td_target
+from imagine_bench.agents.layers import Parameters
 from imagine_bench.agents.memory import Batch
 from imagine_bench.agents.settings import ControllerSettings
 
@@ -40,7 +41,7 @@ def batch(reward: float = 1.0) -> Batch:
 
 
 def loss(controller: Controller, rows: Batch) -> torch.Tensor:
-    return bellman_errors([controller], joint.batches([rows]), controller.optimiser.parameters)[0, 0]
+    return bellman_errors([controller], joint.batches([rows]), Parameters(controller.optimiser.parameters))[0, 0]
 
 
 def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.agents import mixture as mdn
+from imagine_bench.agents.layers import Parameters
 from imagine_bench.agents.memory import Batch
 from imagine_bench.agents.plain_model import PlainWorldModel
 from imagine_bench.agents.settings import WorldModelSettings
@@ -40,7 +41,7 @@ def chain_batch(count: int, generator: torch.Generator) -> Batch:
 
 def losses(model: WorldModel, batch: Batch, dropout: torch.Generator) -> torch.Tensor:
     """Of dynamics, reward and termination. Shape (3,)."""
-    return model.losses([Update(model, batch, dropout)], model.optimiser.parameters)[:, 0]
+    return model.losses([Update(model, batch, dropout)], Parameters(model.optimiser.parameters))[:, 0]
 
 
 def test_log_cosh_is_itself_and_does_not_overflow() -> None:
