@@ -200,7 +200,6 @@ class RegressionSpec:
         recorder: ``"module:attr"`` of the function that records them, or None.
         scene: Gives the robot that carries out predictions, where there is one.
         reference: Name of the thesis' tables, or None.
-        presets: What each protocol preset changes for this task.
     """
 
     id: str
@@ -218,4 +217,3 @@ class RegressionSpec:
     recorder: str | None = None
     scene: Callable[[], MovingScene] | None = None
     reference: str | None = None
-    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

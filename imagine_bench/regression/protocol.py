@@ -95,7 +95,7 @@ def plan(
     if encoder is not None:
         raise InvalidValueError(f"{task} has no pictures to encode; leave --encoder out.")
     require_known("preset", preset, PRESETS)
-    values = {**PRESETS[preset], **registry.regression(task).presets.get(preset, {}), **changes}
+    values = {**PRESETS[preset], **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     wanted = RegressionProtocol(task=task, preset=preset, **values)
