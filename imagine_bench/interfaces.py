@@ -343,7 +343,7 @@ class SceneReader(Protocol):
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """A picture of the whole scene with the arm. Shape (height, width, 3)."""
+        """An image of the whole scene with the arm. Shape (height, width, 3)."""
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
