@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs the project into its own virtual environment: .ci/setup.sh [VENV]. Every make target calls it first; where
-# nothing changed it ends at once. It repairs an environment that was moved, interrupted or whose Python is gone.
+# Installs the project into its own virtual environment: .ci/setup.sh [VENV [WHEEL]]. Every make target calls it first;
+# where nothing changed it ends at once. It repairs an environment that was moved, interrupted or whose Python is gone.
 #
 # PYTHON names the interpreter, 3.11 to 3.14. Without it python3, python3.14 to python3.11 and one of uv's are tried in
 # turn. TORCH_INDEX names an index of torch's CPU builds, for machines without an NVIDIA GPU that cannot reach PyTorch's.
@@ -9,6 +9,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 readonly venv=${1:-.venv}
+readonly wheel=${2:-}  # what is installed; without it the checkout itself, editable
 readonly lock=.ci/requirements.lock
 readonly versions="3.11 3.12 3.13 3.14"
 readonly torch=2.13.0
@@ -57,7 +58,7 @@ asked_for() {
 
 # Whether the environment was installed to the end and still runs; sets why.
 whole() {
-    [ -f "$venv/.installed" ] || { why="its installation did not finish"; return 1; }
+    [ -f "$venv/.installed" ] || { why="an installation in it did not finish"; return 1; }
     suits "$venv/bin/python" || { why="its Python $why"; return 1; }
     asked_for || return 1
     "$venv/bin/python" -m pip --version >/dev/null 2>&1 || { why="it has no pip"; return 1; }
@@ -119,7 +120,7 @@ install_torch() {
 fill() {
     local before
     before=$(cat "$venv/.installed" 2>/dev/null) || true
-    rm -f "$venv/.installed"
+    rm -f "$venv/.installed" "$venv/.ready"
     if install_all; then
         printf '%s\n' "$here" >"$venv/.installed"
     else
@@ -129,11 +130,13 @@ fill() {
 }
 
 install_all() {
+    local problems
     get_uv
     install --no-deps --require-hashes -r "$lock" || { why="the packages of $lock could not be installed; see above"; return 1; }
     install_torch || { why="torch $torch could not be installed; see above"; return 1; }
-    install --no-deps --no-build-isolation -e . || { why="the project itself could not be installed; see above"; return 1; }
-    ! "$venv/bin/python" -m pip check 2>&1 | grep '^imagine-bench ' >&2 || { why="$lock is out of date; run 'make lock'"; return 1; }
+    install --no-deps --no-build-isolation ${wheel:--e .} || { why="the project itself could not be installed; see above"; return 1; }
+    problems=$("$venv/bin/python" -m pip check 2>&1 | grep '^imagine-bench ') || true
+    [ -z "$problems" ] || { why="$problems; $lock is out of date, run 'make lock'"; return 1; }
 }
 
 # Makes and fills the environment with the first interpreter that can, uv's as the last.
@@ -159,7 +162,7 @@ choose_python() {
 }
 
 gl_problem() {
-    "$venv/bin/python" - 2>&1 <<'PYTHON'
+    "$venv/bin/python" -P - 2>&1 <<'PYTHON'
 import sys
 from imagine_bench.errors import SetupError
 from imagine_bench.tasks.rendering import gl_renderer
@@ -191,7 +194,7 @@ elif whole; then
     if [ "$(cat "$venv/.ready" 2>/dev/null)" = "$key" ]; then exit 0; fi
     [ "$(cat "$venv/.installed")" = "$here" ] || relocate
     say "bringing $venv up to date"
-    fill || fail "$why. 'rm -r $venv' and the same command again makes it anew."
+    fill || fail "$why. (Without $venv the same command makes it anew.)"
 else
     say "making $venv anew: $why"
     choose_python
