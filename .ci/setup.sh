@@ -146,9 +146,10 @@ choose_python() {
         if suits "$name"; then
             case " $failed " in *" $found "*) continue ;; esac  # the same version under another name
             make_venv "$name" && { fill && return; failed="$failed $found"; }
-            say "$name ($found): $why"
+            name="$name ($found)"
         fi
         tried="$tried"$'\n'"  $name: $why"
+        [ "$why" = "not found" ] || say "not $name: $why"
     done
     [ -z "${PYTHON:-}" ] || fail "PYTHON=$PYTHON cannot be used:$tried"
     if ! command -v uv >/dev/null; then
