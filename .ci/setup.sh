@@ -9,7 +9,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 readonly venv=${1:-.venv}
-readonly wheel=${2:-}  # what is installed; without it the checkout itself, editable
+project=(-e .)
+[ -z "${2:-}" ] || project=("$2")
+readonly project
 readonly lock=.ci/requirements.lock
 readonly versions="3.11 3.12 3.13 3.14"
 readonly torch=2.13.0
@@ -134,7 +136,7 @@ install_all() {
     get_uv
     install --no-deps --require-hashes -r "$lock" || { why="the packages of $lock could not be installed; see above"; return 1; }
     install_torch || { why="torch $torch could not be installed; see above"; return 1; }
-    install --no-deps --no-build-isolation ${wheel:--e .} || { why="the project itself could not be installed; see above"; return 1; }
+    install --no-deps --no-build-isolation "${project[@]}" || { why="the project itself could not be installed; see above"; return 1; }
     problems=$("$venv/bin/python" -m pip check 2>&1 | grep '^imagine-bench ') || true
     [ -z "$problems" ] || { why="$problems; $lock is out of date, run 'make lock'"; return 1; }
 }
