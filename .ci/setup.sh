@@ -143,8 +143,9 @@ install_all() {
 
 # Makes and fills the environment with the first interpreter that can, uv's as the last.
 choose_python() {
-    local name failed=""
-    for name in ${PYTHON:-python3 python3.14 python3.13 python3.12 python3.11}; do
+    local name failed="" names=(python3 python3.14 python3.13 python3.12 python3.11)
+    [ -z "${PYTHON:-}" ] || names=("$PYTHON")
+    for name in "${names[@]}"; do
         if suits "$name"; then
             case " $failed " in *" $found "*) continue ;; esac  # the same version under another name
             make_venv "$name" && { fill && return; failed="$failed $found"; }

@@ -73,7 +73,7 @@ class Checkout:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Checkout:
-    return Checkout(tmp_path / "checkout")
+    return Checkout(tmp_path / "a checkout")
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def test_an_interpreter_that_was_named_is_the_only_one(ready: Checkout) -> None:
     assert (code, out.splitlines()[-2:]) == (1, ["setup: PYTHON=python3.10 cannot be used:", "  python3.10: not found"])
     assert (ready.folder / ".venv/bin/python").exists(), "what was there is left"
     assert ready.setup(PYTHON="python3") == (0, ""), "the same version"
-    code, out = ready.setup(PYTHON="python3.11")
+    code, out = ready.setup(PYTHON=str(ready.path / "python3.11"))  # a path with a space
     assert code == 0 and "making .venv anew: PYTHON asks for another Python than its 3.12.1" in out
     assert ready.log()[-1].startswith("python3.11: ")
 
