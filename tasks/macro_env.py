@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -240,20 +240,41 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
         """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        return np.stack([self.human_view(width, height) for _ in self.replay()])
+
+    # --- MuJoCo --------------------------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+        return self._world.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The scene's state; only to be read."""
+        return self._world.data
+
+    def replay(self) -> Iterator[float]:
+        """Set the scene to each captured sample of the latest macro-action in turn; at the end it stands as before.
+
+        Yields:
+            Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
+        """
         world, latest = self._world, self._latest
         if latest is None or not len(latest.time_s):
-            return self.human_view(width, height)[None]
+            yield 0.0
+            return
         standing, people = world.data.qpos.copy(), self._mocap()
-        pictures = []
-        world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
-        for qpos in latest.qpos:
-            world.data.qpos[:] = qpos
+        try:
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
+            for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
+                world.data.qpos[:] = qpos
+                mujoco.mj_kinematics(world.model, world.data)
+                yield time_s
+        finally:
+            world.data.qpos[:] = standing
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = people
             mujoco.mj_kinematics(world.model, world.data)
-            pictures.append(self.human_view(width, height))
-        world.data.qpos[:] = standing
-        world.data.mocap_pos[:], world.data.mocap_quat[:] = people
-        mujoco.mj_kinematics(world.model, world.data)
-        return np.stack(pictures)
 
     # --- details -------------------------------------------------------------------------------------------------
 
