@@ -135,7 +135,7 @@ SPEC = RegressionSpec(
     error_name="distance to the nearest branch (standard deviations of the noise)",
     wrong_above=3.0,
     evaluate=evaluate,
-    sections="imagine_bench.report.toy_regression:sections",
+    sections="imagine_bench.regression.report_toy_regression:sections",
     recorder="imagine_bench.recording.toy_regression:record",
     reference=None,
 )

@@ -22,17 +22,17 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ValueReader
-from imagine_bench.comparison import compare_rollout
-from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.files import make_folder
-from imagine_bench.imagination_quality import courses_from, is_random
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
-from imagine_bench.pictures import png, rgb, rollout_strip
+from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.judge.filmstrips import png, rgb, rollout_strip
+from imagine_bench.judge.imagination_quality import courses_from, is_random
+from imagine_bench.judge.sampled_filmstrips import courses_sheet
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
-from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed
+from imagine_bench.store.files import make_folder
+from imagine_bench.store.results import ComparedRollout
 
 MOTION_HZ = 20.0
 IMAGINED_DEPTH = 6

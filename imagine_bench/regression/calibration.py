@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imagine_bench.calibration import (
+from imagine_bench.judge.calibration import (
     LEVELS,
     auroc,
     coverage,

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import csv_text, write_bytes
 from imagine_bench.regression.protocol import RegressionProtocol
-from imagine_bench.results import require_one_setting
+from imagine_bench.store import run_folder
+from imagine_bench.store.files import csv_text, write_bytes
+from imagine_bench.store.results import require_one_setting
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
 

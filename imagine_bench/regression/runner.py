@@ -11,16 +11,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-from imagine_bench import registry, run_folder
-from imagine_bench.checkpointing import Snapshot, load_newest, save_snapshot
-from imagine_bench.cohort import cpu_time_s
+from imagine_bench import registry
+from imagine_bench.bench.cohort import cpu_time_s
+from imagine_bench.bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.errors import DivergedError
-from imagine_bench.files import lock, make_folder
 from imagine_bench.regression import Assessment, Dataset, Floats, Regressor, RegressorContext
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import Arrays, RegressionRun, Row, finish, load_run, write_rows
-from imagine_bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store import run_folder
+from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
+from imagine_bench.store.files import lock, make_folder
 
 _SLICES = 100
 """Parts that a variant's training is told in."""

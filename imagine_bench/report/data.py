@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.files import csv_text
 from imagine_bench.interfaces import RuleFacts, TaskSpec
-from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import csv_text
+from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
 BASE_AGENT = "dqn"
 """What gains are measured against, as in the thesis."""

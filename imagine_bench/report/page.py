@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.course_pictures import courses_sheet
-from imagine_bench.files import make_folder, write_bytes
-from imagine_bench.pictures import first_cut, png, rollout_strip
-from imagine_bench.report import plots, words
+from imagine_bench.judge.filmstrips import first_cut, png, rollout_strip
+from imagine_bench.judge.sampled_filmstrips import courses_sheet
+from imagine_bench.report import plots
+from imagine_bench.report import text as words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.sections import Picture
 from imagine_bench.report.template import render
-from imagine_bench.report.words import agent_words, percent, score_text
-from imagine_bench.results import BenchResult, ComparedRollout
+from imagine_bench.report.text import agent_words, percent, score_text
+from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.results import BenchResult, ComparedRollout
 
 SHOWN_ROLLOUTS = 3
 """Rollouts shown of each imagining agent: the first ones of its first seed."""

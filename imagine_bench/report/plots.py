@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData
-from imagine_bench.report.words import agent_words
+from imagine_bench.report.text import agent_words
 
 _INK = "#2b2b2f"  # in the SVG this becomes the page's own text colour
 # Okabe and Ito's palette, greys and Tol's muted colours, in the order in which agents are registered.
