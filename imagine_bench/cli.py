@@ -22,13 +22,13 @@ from imagine_bench.store.archive import is_archive
 from imagine_bench.store.bench_folder import newest_bench, newest_recording, read_protocol, require_either
 from imagine_bench.store.encoders import bundled
 from imagine_bench.store.files import require_writable
-from imagine_bench.task_types import KINDS, kind_of
+from imagine_bench.task_types import TASK_TYPES, task_type
 from imagine_bench.tools.doctor import examine
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 _RETRAIN = "imagine_bench.agents.encoders.cli:retrain"
-_TOGETHER = "imagine_bench.store.merge:load_together"
+_TOGETHER = "imagine_bench.store.merge:load_merged"
 _ARCHIVED = "imagine_bench.store.archive:load_archive"
 _ABREAST = "(default: equal shares for local workers; with ray 1)"
 _ADDING_UP = ("--set", "--beside", "--variants")
@@ -60,7 +60,7 @@ class Bench:
     execution: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: clean)")] = None
-    """How much light, colours and poses vary: clean, mild or strong."""
+    """How much light, colors and poses vary: clean, mild or strong."""
     variants: Annotated[tuple[str, ...], _OF_PRESET] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
     networks: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_PRESETS_OWN)] = None
@@ -305,9 +305,9 @@ class List:
         from imagine_bench.bench.studies import STUDIES  # noqa: PLC0415 - no other command but study needs them
 
         for title, names in {
-            **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
-            **{f"{name} learners": kind.learners() for name, kind in KINDS.items()},
-            **{f"{name} presets": registry.load(kind.presets) for name, kind in KINDS.items()},
+            **{f"{name} tasks": kind.tasks for name, kind in TASK_TYPES.items()},
+            **{f"{name} learners": kind.learners() for name, kind in TASK_TYPES.items()},
+            **{f"{name} presets": registry.load(kind.presets) for name, kind in TASK_TYPES.items()},
             "studies": STUDIES,
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
@@ -457,13 +457,13 @@ def _only(task: str | None, given: Path | None) -> tuple[str, ...]:
     require_either(given, task)
     if task is None:
         return ()
-    kind_of(task)  # knows every name
+    task_type(task)  # knows every name
     return (task,)
 
 
 def _show(folder: Path, result: Any = None) -> None:
     """Write a bench's report, or that of another result of its kind, and print its table and where everything lies."""
-    kind = kind_of(read_protocol(folder).task)
+    kind = task_type(read_protocol(folder).task)
     result = result or registry.load(_ARCHIVED if is_archive(folder) else kind.load_so_far)(folder)
     print(registry.load(kind.summary_table)(result))  # first, as it needs no place to write
     page = registry.load(kind.write_report)(result)

@@ -42,7 +42,7 @@ class AgentEntry:
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
         settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
-        trains_itself: Whether it is a :class:`.capabilities.SelfTrainer`, whose run cannot rest before its end.
+        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
         title: For headings, legends and tables; by default the registered name.
         description: One sentence for a reader of the report.
     """
@@ -53,7 +53,7 @@ class AgentEntry:
     encoder_kind: str = "latents"
     settings: str = "imagine_bench.agents.presets"
     privileged: bool = False
-    trains_itself: bool = False
+    external_training_loop: bool = False
     title: str = ""
     description: str = "A registered agent."
 
@@ -99,7 +99,7 @@ AGENTS: dict[str, AgentEntry] = {
     "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
     "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
     "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
-    "imagine": AgentEntry(
+    "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings",
@@ -108,18 +108,18 @@ AGENTS: dict[str, AgentEntry] = {
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
-        trains_itself=True,
+        external_training_loop=True,
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
-        trains_itself=True,
+        external_training_loop=True,
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         settings="imagine_bench.agents.library.settings",
-        trains_itself=True,
+        external_training_loop=True,
     ),
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
     "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.model_only:make_uncertainty"),

@@ -16,7 +16,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
+class TaskType:
     """What a kind of task brings along; all but the tables as ``"module:attr"``.
 
     Attributes:
@@ -48,8 +48,8 @@ class Kind:
     summary_table: str
 
 
-KINDS: dict[str, Kind] = {
-    "control": Kind(
+TASK_TYPES: dict[str, TaskType] = {
+    "control": TaskType(
         tasks=registry.TASKS,
         learners=registry.agents,
         draws=True,
@@ -63,7 +63,7 @@ KINDS: dict[str, Kind] = {
         write_report="imagine_bench.report:write_report",
         summary_table="imagine_bench.report:summary_table",
     ),
-    "regression": Kind(
+    "regression": TaskType(
         tasks=registry.REGRESSIONS,
         learners=lambda: registry.REGRESSORS,
         draws=False,
@@ -80,21 +80,21 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def kind_of(task: str) -> Kind:
+def task_type(task: str) -> TaskType:
     """The kind of a registered task.
 
     Raises:
         UnknownNameError: No such task; the message lists those of every kind.
     """
-    for kind in KINDS.values():
+    for kind in TASK_TYPES.values():
         if task in kind.tasks:
             return kind
-    raise UnknownNameError("task", task, [name for kind in KINDS.values() for name in kind.tasks])
+    raise UnknownNameError("task", task, [name for kind in TASK_TYPES.values() for name in kind.tasks])
 
 
 def require_options(task: str, options: Mapping[str, Any]) -> None:
     """Raise InvalidValueError for an option that protocols of this task's kind do not have."""
-    fields = [field.name for field in dataclasses.fields(registry.load(kind_of(task).protocol))]
+    fields = [field.name for field in dataclasses.fields(registry.load(task_type(task).protocol))]
     for name in options:
         if name not in fields:
             raise InvalidValueError(f"{task} takes no --{name.replace('_', '-')}; leave it out.")

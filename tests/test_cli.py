@@ -20,7 +20,7 @@ from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.task_types import KINDS
+from imagine_bench.task_types import TASK_TYPES
 
 _HERE = Path(__file__).parent / "fakes"
 
@@ -199,7 +199,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     out = capsys.readouterr().out
     words = set(re.split(r"[\s,]+", out))
-    for kind in KINDS.values():
+    for kind in TASK_TYPES.values():
         assert words >= {*kind.tasks, *kind.learners(), *registry.load(kind.presets)}
     assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
     assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}

@@ -239,7 +239,7 @@ def picture_shape(preprocessing: str) -> tuple[int, int, int]:
 
 
 def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
-    """One image of the whole view from preprocessed pictures: (N, C, H, W) to grey (N, H', W') or RGB (N, H, W, 3)."""
+    """One image of the whole view from preprocessed pictures: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
     if preprocessing == "gray_strips":
         return join_strips(pictures)
     return np.ascontiguousarray(np.moveaxis(pictures, 1, -1), dtype=np.float32)

@@ -60,8 +60,8 @@ def sample_sheet(
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
         words = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
         names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
-        colour = _INK if (right == found).all() else _WRONG
-        draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=colour, font=_font(14))
+        color = _INK if (right == found).all() else _WRONG
+        draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=color, font=_font(14))
     return sheet
 
 

@@ -1,4 +1,4 @@
-"""The agent ``imagine``: sees codes, learns a structured model of them, plans in it, and goes where it is in doubt."""
+"""The agent ``factored``: sees codes, learns a structured model of them, plans in it, and goes where it is in doubt."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _TIE = 1e-9
 
 
 class ImagineAgent:
-    """Learns from codes alone; every transition is remembered, and the model is a function of what is remembered.
+    """Learns from codes alone; every transition is replayed, and the model is a function of what is replayed.
 
     Args:
         encoder: Frames to codes of parts.
@@ -52,12 +52,12 @@ class ImagineAgent:
         self._start_anew()
 
     def _start_anew(self) -> None:
-        """An empty model; the first ``learned`` of the remembered transitions are in it."""
+        """An empty model; the first ``learned`` of the replayed transitions are in it."""
         self.model = StructuredModel(self.sizes, self.n_actions, self.settings)
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
         self.tasks: list[int] = []
-        """How much was remembered when each later task began."""
+        """How much was replayed when each later task began."""
 
     @property
     def _ready(self) -> bool:
@@ -132,19 +132,19 @@ class ImagineAgent:
         self.planner.forget()
         self.learned = upto
 
-    def carry_over(self) -> None:
-        """Keep the dynamics, and of what was rewarded no more than hints; see :meth:`.outcomes.Outcomes.carry_over`."""
+    def reset_for_new_task(self) -> None:
+        """Keep the dynamics, and of what was rewarded no more than hints; see :meth:`.outcomes.Outcomes.reset_for_new_task`."""
         self._learn(len(self.memory))
         self._begin_task()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
 
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
-        self.model.carry_over()
+        self.model.reset_for_new_task()
         self.planner.forget()
 
     def question(self, observation: Observation) -> NDArray[np.int64] | None:
-        """What to ask; see :class:`imagine_bench.capabilities.Questioner` and :mod:`.questions`."""
+        """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.questions`."""
         planning = self.settings.planning
         with self.meters.cpu_time("time/model_s"):
             return question(
@@ -156,7 +156,7 @@ class ImagineAgent:
                 without=self.memory.in_vain,
             )
 
-    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
         """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no answer."""
         code, action, following = last_step(self.model, self._modelled(self.code(observation.frame)), actions)
         reward, terminated = (0.0, False) if answer is None else (answer.reward, answer.terminated)
@@ -194,8 +194,8 @@ class ImagineAgent:
             code = self._modelled(steps[-1].code)
         return picture(self.encoder, start, steps)
 
-    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What it did, answers of a teacher not counted; see :class:`imagine_bench.capabilities.Rememberer`."""
+    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """What it did, answers of a teacher not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""
         rows = [row for row in self.memory.since(0) if row.moves]
         codes = np.array([self._observed(row.code) for row in rows], dtype=np.int64)
         sizes = self.encoder.card.code_sizes
@@ -238,7 +238,7 @@ class ImagineAgent:
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
     def state(self) -> AgentState:
-        """A snapshot: what is remembered, how much of it is learned, the generator, measurements."""
+        """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
         values = {
             "learned": self.learned,
             "tasks": list(self.tasks),
@@ -251,7 +251,7 @@ class ImagineAgent:
         return AgentState(arrays=snapshot.prefixed("memory", self.memory.arrays()), values=values)
 
     def restore(self, state: AgentState) -> None:
-        """Take up a snapshot by living through what is remembered once more.
+        """Take up a snapshot by living through what is replayed once more.
 
         Raises:
             ArtefactError: It does not fit this agent; nothing was changed.
@@ -269,7 +269,7 @@ class ImagineAgent:
 
 
 def make(context: AgentContext) -> ImagineAgent:
-    """The ``imagine`` agent.
+    """The ``factored`` agent.
 
     Raises:
         InvalidValueError: The context's encoder gives no codes.
@@ -279,7 +279,7 @@ def make(context: AgentContext) -> ImagineAgent:
     encoder = load_perception(context).encoder
     if not encoder.card.code_sizes:
         raise InvalidValueError(
-            f"Agent 'imagine' reads codes of parts, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
+            f"Agent 'factored' reads codes of parts, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
             "give one made with `imagine-bench encoder --recipe codes`."
         )
     return ImagineAgent(encoder, context.n_actions, settings, context.seeds)

@@ -53,9 +53,9 @@ class StructuredModel:
         if row.pays:
             self.outcomes.add(row)
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         """Keep the dynamics; begin the outcomes anew, with hints."""
-        self.outcomes.carry_over()
+        self.outcomes.reset_for_new_task()
 
     def expected(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""

@@ -150,7 +150,7 @@ class Outcomes:
         candidates = [self._explain(seen, usual) for usual in range(len(self.kinds))]
         self.causes = max(candidates, key=lambda causes: causes.log_posterior)
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         """Forget all that was seen; what were causes is believed, as a hint, until a test of this task refutes it.
 
         A cause of an earlier task that no test refuted is still a hint in the one after the next. What was *not* a

@@ -1,4 +1,4 @@
-"""Every setting of the agent ``imagine``. They are the same for every task, family and preset."""
+"""Every setting of the agent ``factored``. They are the same for every task, family and preset."""
 
 from __future__ import annotations
 

@@ -30,12 +30,12 @@ class ImaginingLearner(Learner):
 
     imagination: Imagination
 
-    def carry_over(self) -> None:
-        """Keep the network of the dynamics; see :class:`imagine_bench.capabilities.Transferable`.
+    def reset_for_new_task(self) -> None:
+        """Keep the network of the dynamics; see :class:`imagine_bench.capabilities.TransferLearner`.
 
         Reward, termination, controller, memories and the schedule of exploration begin anew.
         """
-        self.imagination.carry_over()
+        self.imagination.reset_for_new_task()
         size, settings = self.perception.latent_size, self.settings.controller
         self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
         self.real.clear()
@@ -71,15 +71,15 @@ class ImaginingLearner(Learner):
             self.imagination, encoder, frames, actions, follow=follow, samples=samples, depth=depth, rng=rng
         )
 
-    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """The likeliest results of actions; see :class:`imagine_bench.capabilities.Forecaster`."""
+    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+        """The likeliest results of actions; see :class:`imagine_bench.capabilities.MapPredictor`."""
         z = torch.stack([self.perception.posterior(frame)[0] for frame in frames])  # [N, Z]
         weights = self.imagination.draw_weights(torch.Generator(z.device).manual_seed(int(rng.integers(2**63))))
         likeliest = self.imagination.likeliest(z, torch.as_tensor(actions, device=z.device), weights)
         return self.perception.encoder.read_macrostate(likeliest)
 
-    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What the real memory holds; see :class:`imagine_bench.capabilities.Rememberer`."""
+    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """What the real memory holds; see :class:`imagine_bench.capabilities.ReplayReader`."""
         rows = self.real.arrays()
         return self.perception.encoder.read_macrostate(torch.as_tensor(rows["mu"])), rows["action"].astype(np.int64)
 

@@ -41,7 +41,7 @@ _QUICK: dict[str, Deviation] = {
         1000, "real transitions carry on to 99.8 % at 2,000 (mild, tuning seeds 1001 to 1003; no other value was tried)"
     ),
     "imagination.start_states": Deviation(
-        "remembered",
+        "replayed",
         "rollouts from states of all episodes, not of this one: from the current state 11 points less (factors)",
     ),
     "imagination.breadth": Deviation(

@@ -67,15 +67,15 @@ class ImaginationOnly(ImaginingLearner):
         super().observe(transition, episode=episode)
         self.meters.count("time/rehearsal_s")
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         """As every imagining learner; starts and rehearsal begin anew too."""
-        super().carry_over()
+        super().reset_for_new_task()
         self._starts.clear()
         self._episode = -1
         self.rehearsal.begin(0)
 
-    def rehearse(self) -> bool:
-        """One imagined episode; see :class:`imagine_bench.capabilities.Rehearser`. Real steps call for a new rehearsal.
+    def train_in_model(self) -> bool:
+        """One imagined episode; see :class:`imagine_bench.capabilities.ModelOnlyTrainer`. Real steps call for a new rehearsal.
 
         Raises:
             DivergedError: The controller's loss is no longer finite.

@@ -49,7 +49,7 @@ class Rehearsal:
         self._memory = ImaginedMemory(self._settings.memory.imagined, size, device)
 
     def episode(self, starts: StartMemory, real: RealMemory, meters: Meters) -> None:
-        """Imagine one episode from a remembered start, learning at every step of it.
+        """Imagine one episode from a replayed start, learning at every step of it.
 
         The filter, where there is one, ends it before the first transition that it discards.
 

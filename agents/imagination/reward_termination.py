@@ -23,7 +23,7 @@ INPUTS = ("next_state", "transition")
 _MEMBERS = 1
 
 
-class Assessment(nn.Module):
+class RewardTerminationHead(nn.Module):
     """Reward and termination networks, or one network with both outputs.
 
     Args:

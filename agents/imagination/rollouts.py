@@ -58,7 +58,7 @@ class Imagined:
         reward: Predicted reward. Shape (N,).
         p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).
-        reward_doubt: Standard deviation of the reward over its network's weight samples, in units of reward; None where
+        reward_std: Standard deviation of the reward over its network's weight samples, in units of reward; None where
             the filter does not read it. Shape (N,).
     """
 
@@ -66,7 +66,7 @@ class Imagined:
     reward: Tensor
     p_terminated: Tensor
     samples: Mixture
-    reward_doubt: Tensor | None
+    reward_std: Tensor | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class Imagination:
         self._reduce = reduction(self.settings.reduction)
         self.threshold = self.settings.threshold
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
         known, model = self.model.dynamics.state_dict(), self.model
         self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self._generators["weights"])
@@ -164,7 +164,7 @@ class Imagination:
         next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-_BEYOND, _BEYOND)
         _require_numbers(next_z)
         reward, p_terminated = model.assess(z, action, next_z)
-        doubt = None if weights.reward is None else model.reward_doubt(z, action, next_z, weights.reward)
+        doubt = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, doubt)
 
     def likeliest(self, z: Tensor, action: Tensor, weights: Weights) -> Tensor:
@@ -184,8 +184,8 @@ class Imagination:
         if not self.filtered:
             return keep
         keep &= self.score(decompose(step.samples).epistemic) <= self.threshold
-        if self.settings.reward_threshold is not None and step.reward_doubt is not None:
-            keep &= step.reward_doubt <= self.settings.reward_threshold
+        if self.settings.reward_threshold is not None and step.reward_std is not None:
+            keep &= step.reward_std <= self.settings.reward_threshold
         if self.settings.termination_threshold is not None:
             keep &= torch.minimum(step.p_terminated, 1.0 - step.p_terminated) <= self.settings.termination_threshold
         return keep

@@ -26,7 +26,7 @@ from ..replay import Batch
 from ..settings import WorldModelSettings
 from . import mixture as mdn
 from .mixture import Mixture
-from .reward_termination import Assessment
+from .reward_termination import RewardTerminationHead
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class WorldModel(nn.Module):
             generator=generator,
             hidden_dtype=hidden_dtype(settings.precision, generator.device.type),
         )
-        self.assessment = Assessment(latent_size, n_actions, settings, generator)
+        self.assessment = RewardTerminationHead(latent_size, n_actions, settings, generator)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)
         self.optimiser = FlatAdam(
             self.networks, learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
@@ -189,7 +189,7 @@ class WorldModel(nn.Module):
         return reward.squeeze(0) * self.settings.reward_scale, logit.squeeze(0).sigmoid()
 
     @torch.no_grad()
-    def reward_doubt(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
+    def reward_std(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
         """Standard deviation of the rewards of N transitions over T weight samples, in units of reward: (N,).
 
         Args:

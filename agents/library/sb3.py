@@ -46,7 +46,7 @@ class LibraryAgent:
         self._model: Any = None
 
     def train(self, env: gymnasium.Env[Any, Any], *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
-        """Train in the library's own loop; see :class:`imagine_bench.capabilities.SelfTrainer`."""
+        """Train in the library's own loop; see :class:`imagine_bench.capabilities.ExternalTrainer`."""
         from .training_loop import learn  # noqa: PLC0415 - needs the library
 
         keywords = dataclasses.asdict(self.settings.sb3)

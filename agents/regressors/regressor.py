@@ -17,7 +17,7 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.regression import Assessment, Dataset, Floats, Mixtures, RegressorContext
+from imagine_bench.regression import Dataset, Floats, Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
@@ -100,7 +100,7 @@ class MixtureRegressor:
         losses, self._losses = self._losses, []
         return {"loss/likelihood": float(np.mean(losses))} if losses else {}
 
-    def assess(self, inputs: Floats, rng: np.random.Generator) -> Assessment:
+    def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict and say how sure that is; see :class:`imagine_bench.regression.Regressor`."""
         self._require_inputs(inputs)
         generator = self._generator(int(rng.integers(2**62)))
@@ -171,13 +171,13 @@ class MixtureRegressor:
         samples = self._trained.weight_samples(part, x, masks)
         return rescaled(samples, self._shift[network], self._scale[network])
 
-    def _assess_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Assessment:
+    def _assess_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
         samples = self._weight_samples(network, x)
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
         drawn = drawn_variance(samples, predictive, prediction, self.settings.members)
-        return Assessment(
+        return Prediction(
             prediction=prediction.double().cpu().numpy(),
             drawn=drawn.double().cpu().numpy(),
             surprise=surprise(samples, prediction).double().cpu().numpy(),
@@ -225,17 +225,17 @@ def _numpy(mixture: Mixture) -> Mixtures:
     return Mixtures(**dict(zip(("weights", "means", "sigmas"), (p.double().cpu().numpy() for p in parts), strict=True)))
 
 
-def _joined(parts: list[Assessment], axis: int | None = None) -> Assessment:
+def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
     """Assessments joined along rows, or stacked as networks where no axis is given."""
     join = np.stack if axis is None else np.concatenate
 
     def field(owner: Sequence[object], name: str) -> Floats:
         return join([getattr(part, name) for part in owner], axis=axis or 0)
 
-    names = [f.name for f in dataclasses.fields(Assessment) if f.name != "predictive"]
+    names = [f.name for f in dataclasses.fields(Prediction) if f.name != "predictive"]
     mixtures = [part.predictive for part in parts]
     predictive = Mixtures(**{name: field(mixtures, name) for name in ("weights", "means", "sigmas")})
-    return Assessment(predictive=predictive, **{name: field(parts, name) for name in names})
+    return Prediction(predictive=predictive, **{name: field(parts, name) for name in names})
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

@@ -13,13 +13,13 @@ from imagine_bench import registry
 from imagine_bench.bench.launchers import Failure, Job, Launcher
 from imagine_bench.bench.progress import ProgressBars
 from imagine_bench.bench.protocol import Protocol, digest, protocol
+from imagine_bench.bench.queries import require_able
 from imagine_bench.bench.runs import Observer, Progress, RunSpec
-from imagine_bench.bench.teaching import require_able
 from imagine_bench.errors import InvalidValueError, RunFailedError, SetupError, UnknownNameError
 from imagine_bench.machine import describe_environment, gl_renderer
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench
-from imagine_bench.task_types import kind_of, require_options
+from imagine_bench.task_types import require_options, task_type
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 _NOTE_EVERY_S = 10.0
@@ -45,7 +45,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[Any, Encoders]:
         SetupError: The device does not exist here.
     """
     require_options(task, {name: value for name, value in options.items() if name != "encoder"})
-    planned: tuple[Any, Encoders] = registry.load(kind_of(task).plan)(task, preset, **options)
+    planned: tuple[Any, Encoders] = registry.load(task_type(task).plan)(task, preset, **options)
     return planned
 
 
@@ -81,7 +81,7 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
 
 def _rests_on_others(agent: str) -> bool:
     """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
-    return registry.agent_entry(agent).trains_itself or agent not in registry.AGENTS
+    return registry.agent_entry(agent).external_training_loop or agent not in registry.AGENTS
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
@@ -152,10 +152,10 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
     with store.lock():
         missing = len(store.missing())
         if missing:
-            if kind_of(store.protocol.task).draws:
+            if task_type(store.protocol.task).draws:
                 gl_renderer()  # fails here, in one sentence, rather than in every run
-            _warn(store.begin_sitting(describe_environment()), store.folder)
-            failures = _in_waves(store, paths, launcher)
+            _warn(store.begin_session(describe_environment()), store.folder)
+            failures = _in_stages(store, paths, launcher)
             store.note_time()
             _raise_if_any(failures, missing)
         else:
@@ -164,12 +164,12 @@ def bench(wanted: Any, paths: Encoders, *, root: Path, launcher: Launcher) -> An
     return load_bench(store.folder)
 
 
-def _in_waves(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
-    """Take all runs as far as the protocol's next wave, again and again; one that failed goes no further."""
+def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
+    """Take all runs as far as the protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
     specs = [_job(store, paths, *pair, None).spec for pair in store.missing()]
     with ProgressBars(specs, _done_before(store)) as show:
-        for until in store.protocol.waves:
+        for until in store.protocol.stages:
             failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
             pairs = [pair for pair in store.missing(until) if pair not in failed]
             jobs = [_job(store, paths, *pair, until) for pair in pairs]
@@ -190,7 +190,7 @@ def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int |
     acts = store.protocol.task in registry.TASKS
     entry = registry.agent_entry(agent) if acts else None  # regressors have no encoder and rest nowhere
     needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
-    rests = until if entry is not None and not entry.trains_itself else None
+    rests = until if entry is not None and not entry.external_training_loop else None
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=rests)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 

@@ -85,7 +85,7 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 @dataclass
-class Tally:
+class EvaluationCounts:
     """Counts over test episodes; a checkpoint may carry them half way.
 
     Attributes:

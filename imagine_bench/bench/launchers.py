@@ -23,7 +23,7 @@ from imagine_bench.bench.runs import Observer, Progress, RunSpec
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
 from imagine_bench.machine import usable_cores
 from imagine_bench.store.files import make_folder, writing
-from imagine_bench.task_types import kind_of
+from imagine_bench.task_types import task_type
 
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
@@ -246,7 +246,7 @@ def _work(jobs: tuple[Job, ...], sender: Connection) -> None:
 
 def run_job(job: Job, on_progress: Observer) -> None:
     """Carry out one job in this process."""
-    registry.load(kind_of(job.spec.protocol.task).run)(job.spec, job.folder, on_progress)
+    registry.load(task_type(job.spec.protocol.task).run)(job.spec, job.folder, on_progress)
 
 
 def carry_out(

@@ -23,7 +23,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     Args:
         specs: The runs to come, to their ends even where they rest on the way.
-        done: How much of each run earlier sittings did, by agent and seed, as far as is known before it goes on.
+        done: How much of each run earlier sessions did, by agent and seed, as far as is known before it goes on.
     """
 
     def __init__(self, specs: Sequence[RunSpec], done: Mapping[tuple[str, int], int] | None = None) -> None:
@@ -52,7 +52,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
             self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
             return
         work = self._works[run]
-        if run not in self._seen:  # what an earlier sitting did took no time now and promises nothing
+        if run not in self._seen:  # what an earlier session did took no time now and targets nothing
             self._seen.add(run)
             self._before[run] = progress.done
         self._done[run] = progress.done

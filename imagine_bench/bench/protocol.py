@@ -12,7 +12,7 @@ from typing import Any, Self
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.registry import agent_entry, task, task_entry
-from imagine_bench.seeding import SEEDS, TUNING_SEEDS, tunes
+from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -49,7 +49,7 @@ class ProtocolData:
         return digest(self.as_dict())
 
     @property
-    def waves(self) -> tuple[int | None, ...]:
+    def stages(self) -> tuple[int | None, ...]:
         """The order of work: all runs come to each of these budgets before any goes on; None is the end.
 
         A long bench that is stopped early is then a whole bench of fewer episodes.
@@ -148,7 +148,7 @@ class Protocol(ProtocolData):
         return len(self.after) * self.after_episodes
 
     @property
-    def waves(self) -> tuple[int | None, ...]:
+    def stages(self) -> tuple[int | None, ...]:
         """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
         return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_WAVE), None)
 
@@ -174,7 +174,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sampled_futures": 4,
         "recorded_episodes": 2,
     },
-    "quick": {"agents": (*_ALL_AGENTS, "imagine")},
+    "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
         "agents": _THESIS_AGENTS,
         "seeds": tuple(range(5)),
@@ -183,14 +183,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
     "sample_efficiency": {
-        "agents": ("imagine",),
+        "agents": ("factored",),
         "seeds": tuple(range(5)),
         "budgets": tuple(range(20, 201, 20)),
         "evaluation_episodes": 1000,
         "recorded_episodes": 2,
     },
     "lessons": {
-        "agents": ("imagine",),
+        "agents": ("factored",),
         "seeds": tuple(range(5)),
         "budgets": (10, 20, 30, 40, 60, 80, 100),
         "evaluation_episodes": 100,
@@ -251,7 +251,7 @@ def require_seeds(seeds: tuple[int, ...]) -> None:
     """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
     if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
         raise InvalidValueError(f"seeds {seeds} must be one or more different integers from 0 to {SEEDS - 1}.")
-    if len({tunes(seed) for seed in seeds}) > 1:
+    if len({is_tuning_seed(seed) for seed in seeds}) > 1:
         raise InvalidValueError(
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
             "reported ones; give them to separate benches."

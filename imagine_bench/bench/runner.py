@@ -19,14 +19,21 @@ import gymnasium
 
 from imagine_bench import registry
 from imagine_bench.bench.cohort import cpu_time_s
-from imagine_bench.bench.evaluation import Tally, TrainingStarts, play
+from imagine_bench.bench.evaluation import EvaluationCounts, TrainingStarts, play
+from imagine_bench.bench.queries import LabelOracle, QueryBudget, as_seen, demonstrator, require_able
 from imagine_bench.bench.runs import Counters, Observer, Phase, Progress, RunSpec
-from imagine_bench.bench.teaching import Lesson, Teacher, as_seen, demonstrator, require_able
-from imagine_bench.capabilities import FutureSampler, Imaginer, Questioner, Rehearser, SelfTrainer, Transferable
+from imagine_bench.capabilities import (
+    ExternalTrainer,
+    FutureSampler,
+    Imaginer,
+    ModelOnlyTrainer,
+    QueryingAgent,
+    TransferLearner,
+)
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.judge.futures import imagined_futures
-from imagine_bench.judge.imagination_quality import Question, ask, examples, imagine_courses, open_loop
-from imagine_bench.seeding import SeedTree, episode_seed, exam
+from imagine_bench.judge.imagination_quality import Question, ask, examples, imagine_sampled_rollouts, open_loop
+from imagine_bench.seeding import SeedTree, episode_seed, evaluation_split
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.checkpoints import load_newest, save_snapshot
 from imagine_bench.store.files import lock, make_folder
@@ -87,7 +94,7 @@ class _Run:
             require_able(self.agent, spec.agent, spec.protocol)
         self.counters = Counters()
         run_folder.check_config(folder, self._config())
-        if self.entry.trains_itself:
+        if self.entry.external_training_loop:
             run_folder.forget(folder)  # an earlier attempt cannot be gone on with
         snapshot = load_newest(folder / "checkpoints")
         if snapshot is not None:
@@ -108,7 +115,7 @@ class _Run:
     def go_on(self) -> None:
         """Train and test at every budget that is wanted now; after the last one of all, finish."""
         try:
-            if isinstance(self.agent, SelfTrainer):
+            if isinstance(self.agent, ExternalTrainer):
                 self._watch(self.agent)
             else:
                 self._train_and_test()
@@ -120,14 +127,14 @@ class _Run:
         self._tell("done", at_once=True)
 
     def _train_and_test(self) -> None:
-        if isinstance(self.agent, Transferable):
+        if isinstance(self.agent, TransferLearner):
             self._train_before(self.agent)
         for budget in self.spec.budgets[len(self.counters.rows) :]:
             if self.entry.learns:
                 self._train(budget)
             self._test(budget)
 
-    def _watch(self, agent: SelfTrainer) -> None:
+    def _watch(self, agent: ExternalTrainer) -> None:
         """Let the agent train itself through all budgets, and test it, in an environment apart, at each of them."""
         budgets, start_s = self.spec.protocol.budgets, cpu_time_s()
 
@@ -147,14 +154,14 @@ class _Run:
 
     def _finish(self) -> None:
         """Look at the imagination, record, and mark the run as done."""
-        imagined, courses = self._examples()
+        imagined, sampled_rollouts = self._examples()
         self._record()
         run_folder.finish(
             self.folder,
             checkpoints=self.counters.rows,
             training=self.counters.training(),
             imagined=imagined,
-            courses=courses,
+            sampled_rollouts=sampled_rollouts,
         )
 
     def _train(self, budget: int) -> None:
@@ -165,7 +172,7 @@ class _Run:
             self._tell("training")
             self._save_now_and_then()
 
-    def _train_before(self, agent: Transferable) -> None:
+    def _train_before(self, agent: TransferLearner) -> None:
         """Train on the tasks that come before; after the last episode of each, carry over to the next."""
         protocol, counters = self.spec.protocol, self.counters
         for index, task in enumerate(protocol.after):
@@ -177,7 +184,7 @@ class _Run:
                     start_s = cpu_time_s()
                     self._earlier_episode(env, counters.before % protocol.after_episodes)
                     if counters.before == end:
-                        agent.carry_over()
+                        agent.reset_for_new_task()
                     counters.train_cpu_s += cpu_time_s() - start_s
                     self._tell("training")
                     self._save_now_and_then()
@@ -202,11 +209,11 @@ class _Run:
             length, success = length + 1, bool(info["is_success"])
         counters.add_episode(success, length, questions=0 if lesson is None else lesson.asked)
 
-    def _lesson(self) -> Lesson | None:
+    def _lesson(self) -> QueryBudget | None:
         questions = self.spec.protocol.questions
-        if not questions or not isinstance(self.agent, Questioner):
+        if not questions or not isinstance(self.agent, QueryingAgent):
             return None
-        return Lesson(self.agent, Teacher(self.task.rules), questions)
+        return QueryBudget(self.agent, LabelOracle(self.task.rules), questions)
 
     def _test(self, budget: int) -> None:
         """Test at ``budget``; an agent that does not learn is tested once, and its row stands at every budget."""
@@ -215,29 +222,29 @@ class _Run:
             self._add_row(dataclasses.replace(counters.rows[0], episodes=budget))
             return
         if counters.test is None:
-            self._rehearse()
-            counters.test = Tally(diagnostics=self.agent.diagnostics())
+            self._train_in_model()
+            counters.test = EvaluationCounts(diagnostics=self.agent.diagnostics())
         while counters.test.episodes < self.spec.protocol.evaluation_episodes:
             counters.test.add_episode(
-                self.env, self.agent, privileged=self.entry.privileged, purpose=exam(self.spec.seed)
+                self.env, self.agent, privileged=self.entry.privileged, purpose=evaluation_split(self.spec.seed)
             )
             self._tell("testing")
             self._save_now_and_then()
         self._add_row(self._row(budget, counters.test))
 
-    def _rehearse(self) -> None:
+    def _train_in_model(self) -> None:
         """Let an agent that practises without the world do so; its time counts as training."""
-        if not isinstance(self.agent, Rehearser):
+        if not isinstance(self.agent, ModelOnlyTrainer):
             return
         more = True
         while more:
             start_s = cpu_time_s()
-            more = self.agent.rehearse()
+            more = self.agent.train_in_model()
             self.counters.train_cpu_s += cpu_time_s() - start_s
             self._tell("rehearsing")
             self._save_now_and_then()
 
-    def _row(self, budget: int, test: Tally) -> Checkpoint:
+    def _row(self, budget: int, test: EvaluationCounts) -> Checkpoint:
         start_s = cpu_time_s()
         loop = None
         if isinstance(self.agent, Imaginer) and self._questions:
@@ -270,7 +277,7 @@ class _Run:
             samples=protocol.sampled_futures,
             appearance=protocol.appearance,
             seeds=self.seeds.child("futures", budget),
-            purpose=exam(self.spec.seed),
+            purpose=evaluation_split(self.spec.seed),
         )
 
     def _add_row(self, row: Checkpoint) -> None:
@@ -287,7 +294,7 @@ class _Run:
             starts=protocol.open_loop_starts,
             depth=IMAGINED_DEPTH,
             appearance=protocol.appearance,
-            purpose=exam(self.spec.seed),
+            purpose=evaluation_split(self.spec.seed),
         )
 
     def _examples(self) -> tuple[tuple[ComparedRollout, ...], tuple[ComparedRollout, ...]]:
@@ -295,11 +302,15 @@ class _Run:
         if not isinstance(self.agent, Imaginer):
             return (), ()
         self._tell("imagining", at_once=True)
-        appearance, purpose = self.spec.protocol.appearance, exam(self.spec.seed)
+        appearance, purpose = self.spec.protocol.appearance, evaluation_split(self.spec.seed)
         return (
             examples(self.agent, self.task, appearance=appearance, seeds=self.seeds.child("examples"), purpose=purpose),
-            imagine_courses(
-                self.agent, self.task, appearance=appearance, seeds=self.seeds.child("courses"), purpose=purpose
+            imagine_sampled_rollouts(
+                self.agent,
+                self.task,
+                appearance=appearance,
+                seeds=self.seeds.child("sampled_rollouts"),
+                purpose=purpose,
             ),
         )
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Tally
+from imagine_bench.bench.evaluation import EvaluationCounts
 from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
@@ -124,7 +124,7 @@ class Counters:
     success: list[bool] = field(default_factory=list)
     length: list[int] = field(default_factory=list)
     questions: list[int] = field(default_factory=list)
-    test: Tally | None = None
+    test: EvaluationCounts | None = None
 
     def add_episode(self, success: bool, length: int, questions: int = 0) -> None:
         """Count a training episode of so many macro-actions, and questions asked in it."""
@@ -172,5 +172,5 @@ class Counters:
             success=snapshot.arrays["success"].tolist(),
             length=length,
             questions=snapshot.arrays["questions"].tolist() if "questions" in snapshot.arrays else [0] * len(length),
-            test=None if values["test"] is None else Tally(**values["test"]),
+            test=None if values["test"] is None else EvaluationCounts(**values["test"]),
         )

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from imagine_bench.bench.bench import Encoders, bench, plan
 from imagine_bench.bench.launchers import Launcher
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.seeding import TUNING_SEEDS, SeedTree, tunes
-from imagine_bench.task_types import KINDS, kind_of
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, is_tuning_seed
+from imagine_bench.task_types import TASK_TYPES, task_type
 
 if TYPE_CHECKING:
     from imagine_bench.statistics import Estimate
@@ -84,7 +84,7 @@ class Study:
                 raise InvalidValueError(
                     f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
                 )
-        reported = [seed for seed in self.seeds if not tunes(seed)]
+        reported = [seed for seed in self.seeds if not is_tuning_seed(seed)]
         if reported or not self.seeds:
             raise InvalidValueError(
                 f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
@@ -117,7 +117,7 @@ class Line:
         train_cpu_s: Mean CPU seconds of training a run.
         difference: Against the variant it is compared with, one a budget; None where it is compared with nothing.
         folder: Where its runs lie.
-        environment: Command, commit, versions and machine of its first sitting; JSON-like.
+        environment: Command, commit, versions and machine of its first session; JSON-like.
     """
 
     variant: Variant
@@ -140,8 +140,8 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     Raises:
         ImagineBenchError: As for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
     """
-    if task not in KINDS["control"].tasks:
-        kind_of(task)  # knows every name
+    if task not in TASK_TYPES["control"].tasks:
+        task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run
     results = {

@@ -13,13 +13,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench.store.results import ComparedRollout
 
-_CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is invented
+_CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is hallucinated
 _GAP = 12
 _LABELS = 108  # width of the column that names the rows
 _HEADER, _FOOTER = 62, 92
 _ROW = _CELL + _GAP
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
-RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: colour-blind safe
+RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: color-blind safe
 
 
 def rollout_strip(
@@ -64,7 +64,7 @@ def png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def rgb(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A picture in [0, 1], grey (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
+    """A picture in [0, 1], gray (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
     pixels = (np.clip(picture, 0.0, 1.0) * 255.0).round().astype(np.uint8)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
 

@@ -87,19 +87,27 @@ def compare(rules: Rules, pairs: list[tuple[State, int]], drawn: SampledFutures)
     count = rows // len(pairs) * samples
     macrostates = drawn.macrostates.reshape(depth, len(pairs), count, -1)
     rewards, ended = (values.reshape(depth, len(pairs), count) for values in (drawn.rewards, drawn.ended))
-    names = ("total_variation", "floor", "missing", "invented", "reward_error", "termination_error", "going_on")
+    names = (
+        "total_variation",
+        "floor",
+        "missing",
+        "hallucinated",
+        "reward_error",
+        "termination_error",
+        "survival_probability",
+    )
     table = {name: np.zeros((depth, len(pairs))) for name in names}
     for column, (state, action) in enumerate(pairs):
         belief: Ending = {(state, False): 1.0}
         for step in range(depth):
-            table["going_on"][step, column] = sum(share for (_, over), share in belief.items() if not over)
+            table["survival_probability"][step, column] = sum(share for (_, over), share in belief.items() if not over)
             belief, reward = _advance(rules, belief, action if step == 0 else None)
             exact = _by_state(belief)
             imagined = _shares(macrostates[step, column])
             table["total_variation"][step, column] = total_variation(exact, imagined)
             table["floor"][step, column] = sampling_floor(exact, count)
             table["missing"][step, column] = missing_modes(exact, imagined)
-            table["invented"][step, column] = invented_modes(exact, imagined)
+            table["hallucinated"][step, column] = invented_modes(exact, imagined)
             table["reward_error"][step, column] = abs(float(rewards[step, column].mean()) - reward)
             over = sum(share for (_, is_over), share in belief.items() if is_over)
             table["termination_error"][step, column] = abs(float(ended[step, column].mean()) - over)

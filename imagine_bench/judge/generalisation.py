@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Forecaster, Imaginer, Rememberer
+from imagine_bench.capabilities import Imaginer, MapPredictor, ReplayReader
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome, TaskSpec
 from imagine_bench.judge.calibration import auroc
@@ -188,9 +188,9 @@ def answer(agent: Imaginer, probe: Probing, seeds: SeedTree) -> Answers:
 
 
 def _likeliest_right(agent: Imaginer, probe: Probing, rng: np.random.Generator) -> NDArray[np.bool_] | None:
-    if not isinstance(agent, Forecaster):
+    if not isinstance(agent, MapPredictor):
         return None
-    found = agent.forecast(probe.frames, probe.actions, rng).tolist()
+    found = agent.predict_map(probe.frames, probe.actions, rng).tolist()
     return np.array([
         tuple(macrostate) in {outcome.macrostate for outcome in possible}
         for macrostate, possible in zip(found, probe.possible, strict=True)
@@ -198,9 +198,9 @@ def _likeliest_right(agent: Imaginer, probe: Probing, rng: np.random.Generator) 
 
 
 def _times(agent: Imaginer, probe: Probing) -> NDArray[np.int64] | None:
-    if not isinstance(agent, Rememberer):
+    if not isinstance(agent, ReplayReader):
         return None
-    macrostates, actions = agent.remembered()
+    macrostates, actions = agent.replayed()
     had = Counter(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True))
     asked = zip(map(tuple, probe.macrostates.tolist()), probe.actions.tolist(), strict=True)
     return np.array([had[pair] for pair in asked], dtype=np.int64)
@@ -208,8 +208,8 @@ def _times(agent: Imaginer, probe: Probing) -> NDArray[np.int64] | None:
 
 def consequence(possible: Sequence[Outcome]) -> str | None:
     """The one of :data:`CONSEQUENCES` that the rules say comes of a transition; None where they leave it open."""
-    success, failure, going_on = CONSEQUENCES
-    found = {success if o.success else failure if o.terminated else going_on for o in possible}
+    success, failure, survival_probability = CONSEQUENCES
+    found = {success if o.success else failure if o.terminated else survival_probability for o in possible}
     return found.pop() if len(found) == 1 else None
 
 

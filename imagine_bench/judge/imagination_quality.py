@@ -19,7 +19,7 @@ EXAMPLES = 5
 """Greedy imagined rollouts kept with each run, with their real counterparts."""
 
 COURSES, COURSE_DEPTH = 4, 5
-"""Imagined courses of one beginning kept with each run, and macro-actions of each."""
+"""Imagined sampled_rollouts of one beginning kept with each run, and macro-actions of each."""
 
 State = tuple[int, ...]
 Alive = Callable[[frozenset[State], int], bool]
@@ -162,7 +162,7 @@ def is_random(rules: Rules) -> bool:
     return any(len(rules.outcomes(state, action)) > 1 for state in rules.states for action in range(rules.n_actions))
 
 
-def imagine_courses(
+def imagine_sampled_rollouts(
     agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
 ) -> tuple[ComparedRollout, ...]:
     """Imagine the same beginning several times, the agent's greedy controller choosing; none if nothing is random.
@@ -176,7 +176,7 @@ def imagine_courses(
     """
     if not is_random(spec.rules):
         return ()
-    rng = SeedTree(0).child(purpose, "courses", spec.id).generator()
+    rng = SeedTree(0).child(purpose, "sampled_rollouts", spec.id).generator()
     start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
     frame = spec.render_macrostates(start[None], appearance, rng)[0]
     return courses_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)

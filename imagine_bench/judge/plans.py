@@ -20,7 +20,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Rules
-from imagine_bench.seeding import SeedTree, episode_seed, tunes
+from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
@@ -123,7 +123,7 @@ def carry_out(
     on_plan: Callable[[Frame, ImaginedRollout], None] | None = None,
 ) -> Plan:
     """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
-    frame, info = env.reset(seed=episode_seed("planning", int(tunes(trained.spec.seed)), number))
+    frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
     start = _state(info)
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
     rollout = trained.imaginer.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)

@@ -20,11 +20,11 @@ from imagine_bench.machine import describe_environment
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import RECORDING, plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
-from imagine_bench.seeding import SeedTree, exam
+from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store.bench_folder import load_bench, newest_bench, read_protocol, require_either
 from imagine_bench.store.files import lock, make_folder
 from imagine_bench.store.trained import Trained, best_run, learners, load_trained, require_control, require_runs
-from imagine_bench.task_types import kind_of
+from imagine_bench.task_types import task_type
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -125,7 +125,7 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
 def _generalise(bench: Path, encoder: str | None) -> str:
     protocol = read_protocol(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
-    probe = probing(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
+    probe = probing(spec, appearance=protocol.appearance, purpose=evaluation_split(protocol.seeds[0]))
     asked = []
     for run in counted(runs, "runs", total=len(runs)):
         trained = load_trained(run, encoder=encoder)
@@ -174,7 +174,7 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
 def _follow_policies(bench: Path, encoder: str | None) -> str:
     protocol = read_protocol(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
-    met = situations(spec, appearance=protocol.appearance, purpose=exam(protocol.seeds[0]))
+    met = situations(spec, appearance=protocol.appearance, purpose=evaluation_split(protocol.seeds[0]))
     followed = []
     for run in counted(runs, "runs", total=len(runs)):
         trained = load_trained(run, encoder=encoder)
@@ -200,7 +200,7 @@ def _chosen(given: Path | None, root: Path, task: str | None) -> Path:
     """What was given, or else the newest bench of a task in which agents act, or of all such tasks."""
     require_either(given, task)
     if task is not None:
-        kind_of(task)  # knows every name
+        task_type(task)  # knows every name
         require_control(task, f"Task {task!r}")
     return given or newest_bench(root, tuple(registry.TASKS) if task is None else (task,))
 

@@ -1,4 +1,4 @@
-"""Pictures of several imagined courses of the same beginning (after the thesis' figure 3.4)."""
+"""Pictures of several imagined sampled_rollouts of the same beginning (after the thesis' figure 3.4)."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _CELL, _GAP, _MARGIN = 128, 14, 12  # pixels
 _HEAD, _FOOT, _WORDS = 36, 54, 20
 
 
-def courses_sheet(courses: tuple[ComparedRollout, ...], spec: TaskSpec) -> NDArray[np.uint8]:
-    """Draw imagined courses one below the other, a column a macro-action; the real start is the only real picture.
+def courses_sheet(sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec) -> NDArray[np.uint8]:
+    """Draw imagined sampled_rollouts one below the other, a column a macro-action; the real start is the only real picture.
 
     Below each imagined picture stands what a probe says has changed: in blue where the rules make it possible, in
     orange where not.
 
     Args:
-        courses: Several rollouts from one beginning, at least one.
+        sampled_rollouts: Several rollouts from one beginning, at least one.
         spec: Names macro-actions and macrostates.
 
     Returns:
         The picture. Shape (height, width, 3), uint8.
     """
-    depth = max(len(each.rollout.actions) for each in courses)
+    depth = max(len(each.rollout.actions) for each in sampled_rollouts)
     row_height = _HEAD + _CELL + _FOOT + _GAP
-    size = (2 * _MARGIN + (depth + 1) * (_CELL + _GAP), 2 * _MARGIN + len(courses) * row_height)
+    size = (2 * _MARGIN + (depth + 1) * (_CELL + _GAP), 2 * _MARGIN + len(sampled_rollouts) * row_height)
     canvas = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(canvas)
-    for row, course in enumerate(courses):
+    for row, course in enumerate(sampled_rollouts):
         top = _MARGIN + row * row_height
         if row == 0:
             _cell(canvas, 0, top, course.start_frame)

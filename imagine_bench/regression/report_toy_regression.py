@@ -161,7 +161,7 @@ def _against_truth(result: RegressionResult, agent: str) -> Table:
 def _figure_4_1(result: RegressionResult, agent: str) -> Picture:
     title = registry.regressor_entry(agent).title
     caption = (
-        f"{title}, the first network of each dataset, after figure 4.1 of the thesis. Top: training data (grey) and "
+        f"{title}, the first network of each dataset, after figure 4.1 of the thesis. Top: training data (gray) and "
         "predictions (blue). Below: standard deviation of each kind of uncertainty (blue) and its true value (black)."
     )
     alt = "Predictions and epistemic, modal and aleatoric uncertainty along x for three datasets, with true values."

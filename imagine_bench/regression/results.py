@@ -61,7 +61,7 @@ class RegressionResult:
         runs: One a regressor and seed.
         environment: Command, commit, versions, machine; JSON-like.
         folder: Where the bench's files lie.
-        wall_s: Wall seconds of the bench, over all its sittings.
+        wall_s: Wall seconds of the bench, over all its sessions.
 
     Raises:
         ArtefactError: A run is missing or doubled, or two runs of a regressor had different settings.

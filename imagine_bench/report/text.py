@@ -47,8 +47,8 @@ _AGENTS = {
         "imagination + uncertainty",
         "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
     ),
-    "imagine": AgentWords(
-        "imagine",
+    "factored": AgentWords(
+        "factored",
         "Sees discrete parts, learns which of them an action changes and what is rewarded, imagines every future "
         "within reach, goes where it is in doubt while it trains, and plans in its model when it is tested.",
     ),

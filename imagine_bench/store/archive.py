@@ -1,4 +1,4 @@
-"""A bench as it is kept for good: ``protocol.json``, ``environment.json``, ``sittings.json`` and the report's
+"""A bench as it is kept for good: ``protocol.json``, ``environment.json``, ``sessions.json`` and the report's
 ``results.csv``, without run folders. Every success rate, length and cost is in it; pictures and imaginations are not.
 What was not finished when it was kept is read like any unfinished bench.
 """
@@ -17,7 +17,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.partial import largest_part
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
-from imagine_bench.task_types import KINDS
+from imagine_bench.task_types import TASK_TYPES
 
 _RESULTS = "results.csv"
 _COUNTS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
@@ -38,7 +38,7 @@ def load_archive(folder: Path) -> BenchResult:
         InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
-    if whole.task not in KINDS["control"].tasks:
+    if whole.task not in TASK_TYPES["control"].tasks:
         raise InvalidValueError(
             f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
             "that act have a report. The command in its environment.json makes the bench anew, with one."

@@ -1,6 +1,6 @@
 """Where a bench lies: ``<root>/<task>/<preset>-<protocol hash>/<agent>/seed_<n>/``; other settings lie elsewhere.
 
-``protocol.json`` says what is compared and ``sittings.json`` who worked on it, when, with what; nothing is ever
+``protocol.json`` says what is compared and ``sessions.json`` who worked on it, when, with what; nothing is ever
 overwritten by another protocol, for its hash is in the name.
 """
 
@@ -17,9 +17,9 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.registry import load
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder, read_json, reading, write_json
-from imagine_bench.task_types import kind_of
+from imagine_bench.task_types import task_type
 
-_PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sittings.json"
+_PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sessions.json"
 _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
 
@@ -69,14 +69,14 @@ class BenchStore:
         unfinished = [pair for pair in wanted if not run_folder.is_done(self.run_folder(*pair))]
         return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
-    def begin_sitting(self, environment: dict[str, Any]) -> list[str]:
+    def begin_session(self, environment: dict[str, Any]) -> list[str]:
         """Note that work starts now.
 
         Args:
             environment: What :func:`imagine_bench.machine.describe_environment` says.
 
         Returns:
-            Names of facts that decide the bits and are not as in the first sitting.
+            Names of facts that decide the bits and are not as in the first session.
         """
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
@@ -92,18 +92,18 @@ class BenchStore:
         })  # fmt: skip
         self.note_time()
         if not begun:
-            write_json(path, environment)  # last, so that a bench with an environment has sittings too
+            write_json(path, environment)  # last, so that a bench with an environment has sessions too
         return changed
 
     def changed(self, environment: dict[str, Any]) -> list[str]:
-        """Names of facts that decide the bits and are not as in the first sitting; none before there was one."""
+        """Names of facts that decide the bits and are not as in the first session; none before there was one."""
         path = self.folder / _ENVIRONMENT
         first = read_json(path, "a bench's environment") if path.exists() else environment
         then, now = _facts(first), _facts(environment)
         return [name for name in _IDENTITY if then.get(name) != now.get(name)]
 
     def note_time(self) -> None:
-        """Note how long this sitting has lasted, so that a kill loses little of the count."""
+        """Note how long this session has lasted, so that a kill loses little of the count."""
         self._sittings[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
         write_json(self.folder / _SITTINGS, self._sittings)
 
@@ -121,7 +121,7 @@ def load_bench(folder: Path) -> Any:
     """
     protocol = read_protocol(folder)
     folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
-    kind = kind_of(protocol.task)
+    kind = task_type(protocol.task)
     load_run = load(kind.load_run)
     runs = tuple(load_run(run) for run in folders if run_folder.is_done(run))
     return load(kind.result)(protocol=protocol, runs=runs, **bench_facts(folder))
@@ -133,9 +133,9 @@ def bench_facts(folder: Path) -> dict[str, Any]:
     Raises:
         ArtefactError: A file is missing or damaged; the message names it.
     """
-    sittings = _read_sittings(folder)
-    environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sittings": sittings}
-    return {"environment": environment, "folder": folder, "wall_s": sum(sitting["wall_s"] for sitting in sittings)}
+    sessions = _read_sittings(folder)
+    environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sessions": sessions}
+    return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
 
 
 def require_either(given: Path | None, task: str | None) -> None:
@@ -183,10 +183,10 @@ def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_sittings(folder: Path) -> list[dict[str, Any]]:
-    path, what = folder / _SITTINGS, "a bench's sittings"
-    sittings: list[dict[str, Any]] = read_json(path, what, holds=list)
+    path, what = folder / _SITTINGS, "a bench's sessions"
+    sessions: list[dict[str, Any]] = read_json(path, what, holds=list)
     with reading(path, what):
-        return [{**sitting, "wall_s": float(sitting["wall_s"])} for sitting in sittings]
+        return [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
 
 
 def _run_folder(folder: Path, agent: str, seed: int) -> Path:
@@ -201,4 +201,4 @@ def read_protocol(folder: Path) -> Any:
     """
     data = read_json(folder / _PROTOCOL, "a bench's protocol")
     with reading(folder / _PROTOCOL, "a bench's protocol"):
-        return load(kind_of(data["task"]).protocol).from_dict(data)
+        return load(task_type(data["task"]).protocol).from_dict(data)

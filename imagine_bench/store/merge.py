@@ -21,7 +21,7 @@ _OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
-def load_together(folders: Sequence[Path], root: Path) -> BenchResult:
+def load_merged(folders: Sequence[Path], root: Path) -> BenchResult:
     """Read several benches, finished or not or in the form they are kept in, that differ only in agents or in seeds.
 
     Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that

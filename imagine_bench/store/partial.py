@@ -108,7 +108,7 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
         training_success=result.training_success[:episodes],
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),
-        courses=result.courses if whole else (),
+        sampled_rollouts=result.sampled_rollouts if whole else (),
     )
 
 

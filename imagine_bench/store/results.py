@@ -65,10 +65,10 @@ class Futures:
         total_variation: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
         floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
         missing: Possible outcomes that are not imagined. Shape (D, P).
-        invented: Imagined outcomes that are impossible. Shape (D, P).
+        hallucinated: Imagined outcomes that are impossible. Shape (D, P).
         reward_error: Absolute error of the expected reward of this macro-action. Shape (D, P).
         termination_error: Absolute error of the probability that the episode is over. Shape (D, P).
-        going_on: Exact probability that the episode went on until this macro-action. Shape (D, P).
+        survival_probability: Exact probability that the episode went on until this macro-action. Shape (D, P).
     """
 
     macrostates: NDArray[np.int64]
@@ -77,10 +77,10 @@ class Futures:
     total_variation: NDArray[np.float64]
     floor: NDArray[np.float64]
     missing: NDArray[np.float64]
-    invented: NDArray[np.float64]
+    hallucinated: NDArray[np.float64]
     reward_error: NDArray[np.float64]
     termination_error: NDArray[np.float64]
-    going_on: NDArray[np.float64]
+    survival_probability: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ class RunResult:
         training_success: Whether each training episode succeeded. Shape (episodes,).
         training_length: Macro-actions of each training episode. Shape (episodes,).
         imagined: Example rollouts at the last budget, for agents that imagine.
-        courses: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
+        sampled_rollouts: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
         folder: Where the run's files lie.
         recording: Its Rerun recording, or None.
     """
@@ -170,7 +170,7 @@ class RunResult:
     imagined: tuple[ComparedRollout, ...]
     folder: Path
     recording: Path | None
-    courses: tuple[ComparedRollout, ...] = ()
+    sampled_rollouts: tuple[ComparedRollout, ...] = ()
 
 
 def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
@@ -200,7 +200,7 @@ class BenchResult:
         runs: One an agent and seed.
         environment: Command, commit, versions, machine, GL renderer, threads; JSON-like.
         folder: Where the bench's files lie.
-        wall_s: Wall seconds of the bench, over all its sittings.
+        wall_s: Wall seconds of the bench, over all its sessions.
         whole: The protocol of which this is a part; None if it is all of it.
         missing: What a part lacks, one sentence a run.
 

@@ -1,7 +1,7 @@
 """The files of one run: written once, when it is finished, and read back with every number the report needs.
 
 ``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz``, ``futures.npz``, ``imagined.npz``
-and ``courses.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and
+and ``sampled_rollouts.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and
 last ``DONE``, with the digests of the results.
 """
 
@@ -28,7 +28,7 @@ from imagine_bench.store.results import Checkpoint, ComparedRollout, Futures, Op
 FORMAT = "imagine_bench run 1"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
 _OPEN_LOOP, _IMAGINED, _TRAINING = "open_loop.npz", "imagined.npz", "training.npz"
-_FUTURES, _COURSES = "futures.npz", "courses.npz"
+_FUTURES, _COURSES = "futures.npz", "sampled_rollouts.npz"
 _DIAGNOSTIC = "diagnostics/"
 _INTEGERS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
 _NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
@@ -103,7 +103,7 @@ def finish(
     checkpoints: Sequence[Checkpoint],
     training: Mapping[str, NDArray[Any]],
     imagined: Sequence[ComparedRollout],
-    courses: Sequence[ComparedRollout],
+    sampled_rollouts: Sequence[ComparedRollout],
 ) -> None:
     """Write the results of a run and mark it as done.
 
@@ -112,7 +112,7 @@ def finish(
         checkpoints: One a budget.
         training: ``success`` and ``length`` of each training episode.
         imagined: Example rollouts.
-        courses: Several rollouts from one beginning.
+        sampled_rollouts: Several rollouts from one beginning.
 
     Raises:
         SetupError: Something cannot be written; the run is then not marked.
@@ -123,7 +123,7 @@ def finish(
     write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
     write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
     _write_rollouts(folder / _IMAGINED, imagined)
-    _write_rollouts(folder / _COURSES, courses)
+    _write_rollouts(folder / _COURSES, sampled_rollouts)
     names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED, _COURSES]
     mark_done(folder, names)
 
@@ -173,7 +173,7 @@ def load_run(folder: Path) -> RunResult:
         training_success=training["success"],
         training_length=training["length"],
         imagined=_read_rollouts(folder / _IMAGINED),
-        courses=_read_rollouts(folder / _COURSES),
+        sampled_rollouts=_read_rollouts(folder / _COURSES),
         folder=folder,
         recording=recording if recording.is_file() else None,
     )

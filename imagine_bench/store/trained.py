@@ -11,7 +11,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.bench.protocol import Protocol
 from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import Imaginer, Rehearser
+from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.store import encoders
@@ -80,8 +80,8 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
     agent.restore(snapshot.agent)
-    if isinstance(agent, Rehearser):  # as before every test; there is nothing left to do in a finished run
-        while agent.rehearse():
+    if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
+        while agent.train_in_model():
             pass
     return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
 
@@ -121,7 +121,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
     protocol = read_protocol(bench)
     store = BenchStore(bench, protocol)
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
-    able = [agent for agent, entry in entries.items() if entry.learns and not entry.trains_itself]
+    able = [agent for agent, entry in entries.items() if entry.learns and not entry.external_training_loop]
     folders = [store.run_folder(agent, seed) for agent in able for seed in protocol.seeds]
     found = tuple(folder for folder in folders if _has_learned(folder))
     if not found:

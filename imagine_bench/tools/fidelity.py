@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Promises, TaskSpec
+from imagine_bench.interfaces import PerformanceTargets, TaskSpec
 from imagine_bench.seeding import SeedTree, episode_seed
 
 _ACTIONS_A_WALK = 200
@@ -43,12 +43,12 @@ class Fidelity:
     cpu_s: list[float] = field(default_factory=list)
 
 
-def measure_fidelity(spec: TaskSpec, promises: Promises, actions: int) -> Fidelity:
+def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int) -> Fidelity:
     """Walk at random in contact physics, judged by the objects' poses in the simulation and not by ``info`` alone.
 
     Args:
         spec: The task.
-        promises: Which bodies to look at, and whether walks go on through ends.
+        targets: Which bodies to look at, and whether walks go on through ends.
         actions: Macro-actions of the measurement.
     """
     real, perfect = (
@@ -58,14 +58,14 @@ def measure_fidelity(spec: TaskSpec, promises: Promises, actions: int) -> Fideli
     found, rng = Fidelity(), SeedTree(0).child("speed", "physics", spec.id).generator()
     play = [state for state in spec.rules.states if not spec.rules.is_terminal(state)]
     real.reset(seed=episode_seed("tuning", 0, actions))
-    standing_m = _poses(real, promises)[:, 2]  # every start has all objects on the table
+    standing_m = _poses(real, targets)[:, 2]  # every start has all objects on the table
     fresh = True
     for step in range(actions):
         if fresh or step % _ACTIONS_A_WALK == 0:
             options = {"macrostate": play[int(rng.integers(len(play)))]}
             for env in (perfect, real):
                 _, info = env.reset(seed=episode_seed("tuning", 0, step), options=options)
-        before, state = _poses(real, promises), tuple(int(value) for value in info["macrostate"])
+        before, state = _poses(real, targets), tuple(int(value) for value in info["macrostate"])
         action = int(rng.integers(spec.n_actions))
         *_, wanted = perfect.step(action)
         start = time.process_time()
@@ -74,21 +74,21 @@ def measure_fidelity(spec: TaskSpec, promises: Promises, actions: int) -> Fideli
         right = not info["fault"] and np.array_equal(info["macrostate"], wanted["macrostate"])
         found.actions, found.as_ruled = found.actions + 1, found.as_ruled + right
         if right:
-            after = _poses(real, promises)
+            after = _poses(real, targets)
             acted_on = np.not_equal(state, info["macrostate"])[: len(after)]
-            _compare(found, acted_on, standing_m, before, after, _poses(perfect, promises))
+            _compare(found, acted_on, standing_m, before, after, _poses(perfect, targets))
         else:
             found.faults.append(info.get("fault_reason", f"{wanted['macrostate']} was to be reached"))
-        fresh = not right or (terminated and not promises.goes_on)
+        fresh = not right or (terminated and not targets.goes_on)
     for env in (real, perfect):
         env.close()
     return found
 
 
-def _poses(env: Any, promises: Promises) -> NDArray[np.float64]:
+def _poses(env: Any, targets: PerformanceTargets) -> NDArray[np.float64]:
     """Positions and quaternions of the objects, now. Shape (N, 7)."""
     motion = env.motion()
-    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in promises.objects]])
+    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in targets.objects]])
 
 
 def _compare(

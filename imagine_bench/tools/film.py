@@ -46,8 +46,8 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
     make_folder(out.parent)
     pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
-    colours = pictures[0].quantize(128)
-    frames = [picture.quantize(palette=colours, dither=Image.Dither.NONE) for picture in pictures]
+    colors = pictures[0].quantize(128)
+    frames = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
     whole = io.BytesIO()
     frames[0].save(whole, "GIF", save_all=True, append_images=frames[1:], duration=1000 // _FPS, loop=0, optimize=True)
     write_bytes(out, whole.getvalue())

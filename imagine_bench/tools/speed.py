@@ -1,4 +1,4 @@
-"""``make speed``: every speed and fidelity figure that the suite promises, measured now, beside the promise.
+"""``make speed``: every speed and fidelity figure that the suite targets, measured now, beside the promise.
 
 CPU time is quoted wherever wall time would measure the neighbours on a shared machine.
 """
@@ -19,7 +19,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.interfaces import Promises, SceneReader, TaskSpec
+from imagine_bench.interfaces import PerformanceTargets, SceneReader, TaskSpec
 from imagine_bench.machine import describe_environment, gl_renderer
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import require_writable, write_json
@@ -66,12 +66,12 @@ def measure(turns: int = TURNS) -> Iterator[Figure]:
     yield from _learner()
     yield from _abreast()
     specs = [registry.task(name) for name in registry.TASKS]
-    measured = [(spec, spec.promises) for spec in specs if spec.promises is not None]
+    measured = [(spec, spec.targets) for spec in specs if spec.targets is not None]
     for part in (_kinematic, _encoders):
-        for spec, promises in measured:
-            yield from part(spec, promises)
-    for spec, promises in measured:
-        yield from _physics(spec, promises, turns)
+        for spec, targets in measured:
+            yield from part(spec, targets)
+    for spec, targets in measured:
+        yield from _physics(spec, targets, turns)
 
 
 def speed_report(out: Path, turns: int = TURNS, show: Callable[[str], None] = print) -> bool:
@@ -213,7 +213,7 @@ def _abreast() -> Iterator[Figure]:
         )
 
 
-def _kinematic(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
+def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     env = gymnasium.make(spec.env_id, execution="kinematic")
     env.reset(seed=0)
     rng = SeedTree(0).child("speed", "kinematic").generator()
@@ -231,8 +231,8 @@ def _kinematic(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
     rate = 1_000 / _best_cpu_s(thousand_steps, 9)
     yield Figure(
         what=f"{spec.id}: kinematic macro-actions with frame, through gym.make, per CPU s",
-        required=f">= {promises.kinematic_per_cpu_s:,.0f}", measured=f"{rate:,.0f}",
-        met=rate >= promises.kinematic_per_cpu_s,
+        required=f">= {targets.kinematic_per_cpu_s:,.0f}", measured=f"{rate:,.0f}",
+        met=rate >= targets.kinematic_per_cpu_s,
     )  # fmt: skip
     frame_ms = _best_cpu_s(lambda: [scene.agent_view() for _ in range(1_000)], 9)
     env.close()
@@ -244,9 +244,9 @@ def _kinematic(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
     )
 
 
-def _encoders(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
+def _encoders(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     folder = resources.files("imagine_bench.assets") / "encoders"
-    for appearance, required in promises.encoders.items():
+    for appearance, required in targets.encoders.items():
         card = json.loads((folder / f"{spec.encoder}-{appearance}.json").read_text())
         accuracy, cpu_s = card["probe"]["mlp"], card["cpu_s"]["total"]
         frames = card["recipe"]["held_out_frames"]
@@ -258,20 +258,20 @@ def _encoders(spec: TaskSpec, promises: Promises) -> Iterator[Figure]:
         )  # fmt: skip
 
 
-def _physics(spec: TaskSpec, promises: Promises, turns: int) -> Iterator[Figure]:
-    found = measure_fidelity(spec, promises, turns)
+def _physics(spec: TaskSpec, targets: PerformanceTargets, turns: int) -> Iterator[Figure]:
+    found = measure_fidelity(spec, targets, turns)
     share = found.as_ruled / found.actions
     yield Figure(
         what=f"{spec.id}: macro-actions exactly as the rules say, of {turns:,}",
-        required=f">= {promises.as_ruled:.1%}", measured=f"{share:.2%}", met=share >= promises.as_ruled,
+        required=f">= {targets.as_ruled:.1%}", measured=f"{share:.2%}", met=share >= targets.as_ruled,
     )  # fmt: skip
     yield Figure(
-        what=f"{spec.id}: other objects moved, worst, mm", required=f"< {promises.bystander_mm:g}",
-        measured=f"{found.bystander_mm:.3f}", met=found.bystander_mm < promises.bystander_mm,
+        what=f"{spec.id}: other objects moved, worst, mm", required=f"< {targets.bystander_mm:g}",
+        measured=f"{found.bystander_mm:.3f}", met=found.bystander_mm < targets.bystander_mm,
     )  # fmt: skip
     for what, errors, allowed in (
-        ("position error, p99, mm", found.error_mm, promises.error_mm),
-        ("yaw error, p99, degrees", found.error_deg, promises.error_deg),
+        ("position error, p99, mm", found.error_mm, targets.error_mm),
+        ("yaw error, p99, degrees", found.error_deg, targets.error_deg),
     ):
         if allowed is not None:
             p99 = float(np.percentile(errors, 99))
@@ -281,6 +281,6 @@ def _physics(spec: TaskSpec, promises: Promises, turns: int) -> Iterator[Figure]
     rate, mean_rate = _BLOCK / min(blocks_s), _BLOCK * len(blocks_s) / sum(blocks_s)
     yield Figure(
         what=f"{spec.id}: mink + physics + frame, macro-actions per CPU s, best {_BLOCK} (mean)",
-        required=f">= {promises.physics_per_cpu_s:g}", measured=f"{rate:.0f} ({mean_rate:.0f})",
-        met=rate >= promises.physics_per_cpu_s,
+        required=f">= {targets.physics_per_cpu_s:g}", measured=f"{rate:.0f} ({mean_rate:.0f})",
+        met=rate >= targets.physics_per_cpu_s,
     )  # fmt: skip

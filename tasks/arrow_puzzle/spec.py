@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, Promises, TaskSpec
+from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
 from .rules import (
@@ -39,7 +39,7 @@ _PLAY = (
 )
 
 
-_PROMISES = Promises(
+_PROMISES = PerformanceTargets(
     objects=tuple(f"cube_{cube}" for cube in range(N_CUBES)),
     as_ruled=0.999,
     bystander_mm=1.0,
@@ -60,7 +60,14 @@ def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.
 
 
 def _spec(
-    name: str, title: str, env_id: str, goal: Goal, wanted: str, *, reference: str | None, promises: Promises | None
+    name: str,
+    title: str,
+    env_id: str,
+    goal: Goal,
+    wanted: str,
+    *,
+    reference: str | None,
+    targets: PerformanceTargets | None,
 ) -> TaskSpec:
     rules = ArrowPuzzleRules(goal)
     return TaskSpec(
@@ -80,7 +87,7 @@ def _spec(
         facts=functools.partial(facts, rules, HORIZON),
         render_macrostates=render_macrostates,
         reference=reference,
-        promises=promises,
+        targets=targets,
     )
 
 
@@ -91,7 +98,7 @@ SPEC = _spec(
     toward_human,
     "The arrow of the cube pointed at must come to point toward the human",
     reference="arrow_puzzle",
-    promises=_PROMISES,
+    targets=_PROMISES,
 )
 HARD_SPEC = _spec(
     "arrow_puzzle_hard",
@@ -100,7 +107,7 @@ HARD_SPEC = _spec(
     toward_human_alone,
     "The arrow of the cube pointed at must come to point toward the human, no arrow toward the agent",
     reference="arrow_puzzle_hard",
-    promises=None,
+    targets=None,
 )
 TOWARD_SPEC = _spec(
     "arrow_puzzle_toward",
@@ -109,7 +116,7 @@ TOWARD_SPEC = _spec(
     toward_agent,
     "The arrow of the cube pointed at must come to point toward the agent",
     reference=None,
-    promises=None,
+    targets=None,
 )
 CLOCKWISE_SPEC = _spec(
     "arrow_puzzle_clockwise",
@@ -118,7 +125,7 @@ CLOCKWISE_SPEC = _spec(
     left_and_clear_clockwise,
     "The arrow of the cube pointed at must come to point left, with no arrow a quarter turn clockwise of it",
     reference=None,
-    promises=None,
+    targets=None,
 )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, Promises, TaskSpec
+from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
 from .rules import N_OBJECTS, PickPlaceRules
@@ -72,7 +72,7 @@ SPEC = TaskSpec(
     render_macrostates=render_macrostates,
     reference="pick_place",
     settings="chapter_3",
-    promises=Promises(
+    targets=PerformanceTargets(
         objects=_OBJECTS,
         as_ruled=0.995,
         bystander_mm=3.0,
@@ -82,7 +82,7 @@ SPEC = TaskSpec(
         encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
     ),
     presets=_PRESETS,
-    mastery=0.98,
+    success_threshold=0.98,
 )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import SCORES, Assess, Dataset, Floats, RegressionSpec
+from imagine_bench.regression import SCORES, Dataset, Floats, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def missed(points_m: Floats, joints_rad: Floats) -> Floats:
     return np.linalg.norm(arm().execute(joints_rad) - points_m, axis=-1)
 
 
-def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
     """The decisions of table 4.1 and the maps of figures 4.2 and 4.3.
 
     Returns:
@@ -150,19 +150,19 @@ def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[
         (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
     """
     count = DECISIONS * CANDIDATES
-    parts = {"map": _map(variant, assess, len(seeds))}
+    parts = {"map": _map(variant, predict, len(seeds))}
     points = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
-    parts["decision"] = {**_decide(points, assess, "decisions"), "mink_error": _mink_errors(points, seeds)}
+    parts["decision"] = {**_decide(points, predict, "decisions"), "mink_error": _mink_errors(points, seeds)}
     points = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
-    parts["disc"] = _decide(points, assess, "disc")
+    parts["disc"] = _decide(points, predict, "disc")
     measured = {f"{part}/{name}": values for part, found in parts.items() for name, values in found.items()}
     return {**measured, "babbling": training(variant, seeds[0].child("data").generator()).inputs}
 
 
-def _decide(points_m: Floats, assess: Assess, purpose: str) -> dict[str, NDArray[Any]]:
+def _decide(points_m: Floats, predict: Predict, purpose: str) -> dict[str, NDArray[Any]]:
     """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
     shape = (len(points_m), DECISIONS, CANDIDATES)
-    said = assess(points_m, purpose)
+    said = predict(points_m, purpose)
     reached = np.stack([arm().execute(joints_rad) for joints_rad in said.prediction])  # [E, DECISIONS CANDIDATES, 2]
     wrong = np.linalg.norm(reached - points_m, axis=-1)
     result = {"points": points_m.reshape(*shape, 2), "error": wrong.reshape(shape)}
@@ -178,11 +178,11 @@ def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
     return np.stack([missed(*pair) for pair in zip(first, solved, strict=True)])
 
 
-def _map(variant: str, assess: Assess, networks: int) -> dict[str, NDArray[Any]]:
+def _map(variant: str, predict: Predict, networks: int) -> dict[str, NDArray[Any]]:
     side = np.linspace(-MARGIN_M, MARGIN_M, GRID)
     points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     outside_m = distance_to_workspace(points)
-    said = assess(np.broadcast_to(points, (networks, *points.shape)), "map")
+    said = predict(np.broadcast_to(points, (networks, *points.shape)), "map")
     wrong, inside = np.full((networks, len(points)), np.nan), outside_m == 0
     for row, prediction in enumerate(said.prediction):
         wrong[row, inside] = errors(variant, points[inside], prediction[inside])

@@ -18,7 +18,7 @@ from imagine_bench.agents.imagination.rollouts import Counts
 from imagine_bench.agents.learner import Learner
 from imagine_bench.agents.replay import RealMemory
 
-from imagine_bench.capabilities import Forecaster, Imaginer, Rememberer, ValueReader
+from imagine_bench.capabilities import Imaginer, MapPredictor, ReplayReader, ValueReader
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.seeding import SeedTree
@@ -214,10 +214,10 @@ def test_what_is_held_likeliest_is_what_one_component_without_noise_imagines(
     overrides = {"model.components": 1, "imagination.temperature": 0.0, "model.dropout": 0.01}
     agent = MAKERS[kind](context(monkeypatch, overrides))
     live(agent, range(4), np.random.default_rng(0))
-    assert isinstance(agent, Forecaster) and isinstance(agent, Imaginer)
+    assert isinstance(agent, MapPredictor) and isinstance(agent, Imaginer)
     states, actions = np.arange(6).repeat(ACTIONS), np.tile(np.arange(ACTIONS), 6)
     before, frames = agent.state(), np.stack([frame(int(state)) for state in states])
-    found, again = (agent.forecast(frames, actions, np.random.default_rng(3)) for _ in range(2))
+    found, again = (agent.predict_map(frames, actions, np.random.default_rng(3)) for _ in range(2))
     assert same(before, agent.state()) and np.array_equal(found, again) and found.shape == (18, 1)
     steps = [
         agent.imagine(frames[i], actions=actions[i : i + 1], depth=1, rng=np.random.default_rng(3)) for i in range(18)
@@ -229,11 +229,11 @@ def test_what_is_held_likeliest_is_what_one_component_without_noise_imagines(
 @imaginers
 def test_what_it_did_is_remembered_as_far_as_its_memory_reaches(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = MAKERS[kind](context(monkeypatch, {"memory.real": 5}))
-    assert isinstance(agent, Rememberer)
+    assert isinstance(agent, ReplayReader)
     done = [(state % 6, state % ACTIONS) for state in range(7)]
     for state, action in done:
         agent.observe(transition(state, action, 0.0, 1), episode=0)
-    states, actions = agent.remembered()
+    states, actions = agent.replayed()
     assert sorted(zip(states[:, 0].tolist(), actions.tolist(), strict=True)) == sorted(done[2:])
 
 

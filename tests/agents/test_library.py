@@ -16,7 +16,7 @@ from imagine_bench.bench import runner
 from imagine_bench.bench.bench import plan
 from imagine_bench.bench.evaluation import TrainingStarts
 from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import SelfTrainer
+from imagine_bench.capabilities import ExternalTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.seeding import episode_seed
@@ -78,7 +78,7 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
         patch.setattr(runner.run_folder, "finish", killed)
         do(tmp_path / "run")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner.Tally, "add_episode", killed)
+        patch.setattr(runner.EvaluationCounts, "add_episode", killed)
         do(tmp_path / "run")
     assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
     assert same_but_for_time(whole, do(tmp_path / "run"))
@@ -90,9 +90,9 @@ def test_the_registry_knows_which_agents_train_themselves() -> None:
     for name, entry in registry.AGENTS.items():
         if entry.settings == "imagine_bench.agents.library.settings":
             agent = registry.make_agent(name, spec(name).context())
-            assert isinstance(agent, SelfTrainer) and entry.trains_itself
+            assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
         else:
-            assert not entry.trains_itself
+            assert not entry.external_training_loop
 
 
 def test_its_episodes_start_where_every_agent_of_that_seed_starts() -> None:

@@ -19,7 +19,7 @@ from imagine_bench.agents.imagination import model_only as imagination_only
 from test_imagine import same
 from test_learner import same as same_learner
 
-from imagine_bench.capabilities import Answer, Questioner, Transferable
+from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
 from imagine_bench.interfaces import Observation
 
 GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
@@ -49,11 +49,11 @@ def dynamics_of(learner: ImagineAgent) -> list[np.ndarray]:
 
 def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
     learner, rng = agent(), np.random.default_rng(0)
-    assert isinstance(learner, Transferable)
+    assert isinstance(learner, TransferLearner)
     live(learner, range(30), rng)
     assert learner.diagnostics()["real_transitions"] == len(learner.memory)
     live(learner, range(30, 31), rng)
-    learner.carry_over()
+    learner.reset_for_new_task()
     known = Dynamics(learner.sizes, ACTIONS, learner.settings.dynamics)
     for row in learner.memory.since(0):
         known.add(np.array(row.code), row.action, np.array(row.following))
@@ -70,7 +70,7 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
 def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
     learner = agent(outcomes__carried=carried)
     live(learner, range(40), np.random.default_rng(0))
-    learner.carry_over()
+    learner.reset_for_new_task()
     lamp = Observation(frame=frame((0, 2, 1)))
     watch(learner, (0, 2, 0), 1)  # (2, 2, 0), the bad end: both kinds of end are met again, one by hint alone
     watch(learner, (0, 1, 1), 3)  # back to (0, 0, 1)
@@ -93,7 +93,7 @@ def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPa
     learned = agent(3)
     live(learned, range(40), np.random.default_rng(3))
     assert success(learned) == 1.0
-    learned.carry_over()
+    learned.reset_for_new_task()
     fresh = agent(3)
     codes = [code for code in (*_STARTS(), *GOALS) if code not in GOALS.values()]
     monkeypatch.setattr(fake_codes, "step", other_step)
@@ -113,7 +113,7 @@ def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_
     learner, resumed = agent(), agent(99)
     first, second = np.random.default_rng(0), np.random.default_rng(0)
     live(learner, range(10), first)
-    learner.carry_over()
+    learner.reset_for_new_task()
     ask(learner, 2)
     live(learner, range(3), first)
     second.bit_generator.state = first.bit_generator.state
@@ -123,8 +123,8 @@ def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_
     assert same(saved, kept)
     resumed.restore(saved)
     assert live(resumed, range(3, 12), second) == onward
-    learner.carry_over()
-    resumed.carry_over()
+    learner.reset_for_new_task()
+    resumed.reset_for_new_task()
     assert live(learner, range(4), first) == live(resumed, range(4), second)
     assert same(learner.state(), resumed.state())
 
@@ -143,13 +143,13 @@ def ask(learner: ImagineAgent, questions: int, code: tuple[int, ...] = (0, 1, 1)
         here = code
         for action in actions:
             here, reward, ended = _STEP(here, int(action))
-        learner.learn_answer(Observation(frame=frame(code)), actions, Answer(reward, ended))
+        learner.learn_label(Observation(frame=frame(code)), actions, Answer(reward, ended))
     return asked
 
 
 def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics() -> None:
     learner = agent()
-    assert isinstance(learner, Questioner)
+    assert isinstance(learner, QueryingAgent)
     assert learner.question(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
     learner._learn(len(learner.memory))  # what was no surprise too
@@ -189,7 +189,7 @@ def test_what_has_no_answer_is_not_asked_again() -> None:
         assert actions is not None
         code, action, _ = last_step(learner.model, (0, 1, 1), actions)
         asked.append((code, action))
-        learner.learn_answer(seen, actions, None)
+        learner.learn_label(seen, actions, None)
     assert len(set(asked)) == 5
     assert learner.memory.told() == 0
     assert learner.memory.in_vain == set(asked)
@@ -230,7 +230,7 @@ def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatc
     learner = imagination_agents.make_uncertainty(context(monkeypatch, moving))
     live_on_latents(learner, range(4), np.random.default_rng(0))
     assert learner.imagination.threshold < 99.0
-    learner.carry_over()
+    learner.reset_for_new_task()
     assert learner.imagination.threshold == 99.0
 
 
@@ -242,8 +242,8 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch
     kept = [weight.clone() for weight in model.dynamics.parameters()]
     forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.assessment, learner.controller)]
     resumed.restore(learner.state())
-    learner.carry_over()
-    resumed.carry_over()
+    learner.reset_for_new_task()
+    resumed.reset_for_new_task()
     model = learner.imagination.model
     assert all(bool((a == b).all()) for a, b in zip(kept, model.dynamics.parameters(), strict=True))
     for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):

@@ -25,8 +25,8 @@ def test_every_preset_survives_json_with_its_hash(task, preset):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_what_counts_as_learned_lies_between_chance_and_the_optimum(name):
-    facts, mastery = task(name).facts(), task(name).mastery
-    assert facts.chance_level < 0.5 < mastery <= facts.optimum
+    facts, success_threshold = task(name).facts(), task(name).success_threshold
+    assert facts.chance_level < 0.5 < success_threshold <= facts.optimum
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)

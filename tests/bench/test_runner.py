@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
 from imagine_bench.bench import runner
-from imagine_bench.bench.evaluation import Tally
+from imagine_bench.bench.evaluation import EvaluationCounts
 from imagine_bench.bench.protocol import Protocol, protocol
 from imagine_bench.bench.runs import Progress, RunSpec
 from imagine_bench.errors import ArtefactError, DivergedError
@@ -64,13 +64,13 @@ def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
 ) -> None:
     asked = []
-    for name in ("examples", "imagine_courses", "ask"):
+    for name in ("examples", "imagine_sampled_rollouts", "ask"):
         real = getattr(runner, name)
         monkeypatch.setattr(
             runner, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
         )
     do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
-    assert set(asked) == {("examples", purpose), ("imagine_courses", purpose), ("ask", purpose)}
+    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("ask", purpose)}
 
 
 def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:
@@ -162,7 +162,7 @@ def test_every_agent_and_seed_meets_the_same_test_starts() -> None:
 
     env.reset = reset  # type: ignore[method-assign]
     for seed in (0, 1):
-        tally = Tally()
+        tally = EvaluationCounts()
         for _ in range(4):
             tally.add_episode(env, bench_fakes.TableAgent(context(seed)), privileged=False)
     env.close()

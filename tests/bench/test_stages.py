@@ -1,4 +1,4 @@
-"""Long benches go wave by wave, and what is there of an unfinished one can be read."""
+"""Long benches go stage by stage, and what is there of an unfinished one can be read."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_all_runs_come_to_a_wave_before_any_goes_on(tmp_path: Path) -> None:
 
 
 def test_waves_change_no_bit(tmp_path: Path) -> None:
-    in_waves = bench(tmp_path / "waves", Inline(), agents=("table",), seeds=(0,)).runs[0]
+    in_waves = bench(tmp_path / "stages", Inline(), agents=("table",), seeds=(0,)).runs[0]
     at_once = do(tmp_path / "once", agents=("table",), budgets=(2, 4, 6, 9))
     assert len(in_waves.checkpoints) == 4 and same_but_for_time(in_waves, at_once)
     ours, theirs = final_arrays(in_waves.folder), final_arrays(at_once.folder)
@@ -73,8 +73,8 @@ def test_waves_change_no_bit(tmp_path: Path) -> None:
 
 def test_short_benches_have_one_wave(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    assert protocol("arrow_puzzle", "quick").waves == (None,)
-    assert protocol("arrow_puzzle", "thesis").waves == (2000, 3000, 4000, 5000, None)
+    assert protocol("arrow_puzzle", "quick").stages == (None,)
+    assert protocol("arrow_puzzle", "thesis").stages == (2000, 3000, 4000, 5000, None)
 
 
 def test_a_failed_run_goes_no_further_and_the_others_do(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from imagine_bench import registry
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 
 SHADE = 16
-"""Grey levels of 256: a ball that was turned a little is shaded differently all over."""
+"""Gray levels of 256: a ball that was turned a little is shaded differently all over."""
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
 
 

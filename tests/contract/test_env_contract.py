@@ -1,4 +1,4 @@
-"""What every registered environment promises, in both executions."""
+"""What every registered environment targets, in both executions."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from imagine_bench.store.results import RunResult
 LEARNERS = [
     name
     for name, entry in registry.AGENTS.items()
-    if entry.learns and not entry.trains_itself and entry.make.startswith("imagine_bench.agents.")
+    if entry.learns and not entry.external_training_loop and entry.make.startswith("imagine_bench.agents.")
 ]
 """All of the suite but those that a library trains, which begin anew; fakes of other tests are registered too."""
 
@@ -85,7 +85,7 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
             do(tmp_path / "run", agent, 0.0)
     resumed = do(tmp_path / "run", agent, 0.0)
     assert measured(whole) == measured(resumed)
-    assert agent == "imagine" or "loss/bellman" in whole.checkpoints[-1].diagnostics
+    assert agent == "factored" or "loss/bellman" in whole.checkpoints[-1].diagnostics
     assert own_values(tmp_path / "whole") == own_values(tmp_path / "run")
     before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
     assert set(before) == set(after)

@@ -38,7 +38,7 @@ def _local(centre_xy: NDArray[np.float32], turn_rad: NDArray[np.float32]) -> tup
 
 
 def draw(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Grey cubes with dark arrows below a bright hand; direction 0 is up, each next one a quarter turn clockwise."""
+    """Gray cubes with dark arrows below a bright hand; direction 0 is up, each next one a quarter turn clockwise."""
     n, jitter = len(macrostates), JITTER[appearance]
     image = np.full((n, 64, 64), 0.4, dtype=np.float32)
     for cube in range(3):

@@ -32,7 +32,7 @@ class FakeAgent:
 
 
 class FakeImaginer(FakeAgent):
-    """Imagines depth ``d`` as the real frame in grey, one step darker each, uncertain by ``d``, cut at depth 4."""
+    """Imagines depth ``d`` as the real frame in gray, one step darker each, uncertain by ``d``, cut at depth 4."""
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         return np.arange(N_ACTIONS, dtype=np.float32)

@@ -138,11 +138,11 @@ def test_a_perfect_sampler_shows_the_floor_and_no_fault() -> None:
     assert found.total_variation.max() < 0.08  # floor 0.03 where three outcomes are possible
     ask = pair(found, 0, 0)
     assert found.floor[:2, ask] == pytest.approx([futures.sampling_floor(dict(enumerate(ANSWERS)), 400), 0.0])
-    assert found.missing.sum() == found.invented.sum() == 0
+    assert found.missing.sum() == found.hallucinated.sum() == 0
     assert found.reward_error.max() < 1e-6
     assert found.termination_error.max() < 1e-6
-    assert found.going_on[:, ask].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
-    assert found.going_on[:, pair(found, 0, 1)].tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+    assert found.survival_probability[:, ask].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
+    assert found.survival_probability[:, pair(found, 0, 1)].tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_a_collapsed_sampler_misses_modes_and_says_how_many() -> None:
@@ -155,7 +155,7 @@ def test_a_collapsed_sampler_misses_modes_and_says_how_many() -> None:
     assert found.total_variation[0, ask] == pytest.approx(0.5)
     assert found.missing[0, ask] == 2
     assert found.missing[1, ask] == 0, "all of them end alike"
-    assert found.invented.sum() == 0
+    assert found.hallucinated.sum() == 0
 
 
 def test_an_inventive_sampler_is_caught_with_its_rewards_and_ends() -> None:
@@ -165,7 +165,7 @@ def test_an_inventive_sampler_is_caught_with_its_rewards_and_ends() -> None:
     found = measure(TableSampler(invent), samples=8)
     take = pair(found, 1, 1)
     assert found.total_variation[0, take] == 1.0
-    assert (found.missing[0, take], found.invented[0, take]) == (1, 1)
+    assert (found.missing[0, take], found.hallucinated[0, take]) == (1, 1)
     assert found.reward_error[0, take] == pytest.approx(6.0)
     assert found.termination_error[:, take].tolist() == [1.0] * futures.DEPTH
 
@@ -208,9 +208,9 @@ def test_a_mixture_learns_all_outcomes_and_a_single_gaussian_visibly_does_not() 
     ask = pair(mixture, 0, 0)
     assert mixture.total_variation.mean(axis=1).max() < 0.1
     assert mixture.total_variation[0, ask] < 0.15
-    assert mixture.missing.sum() == mixture.invented.sum() == 0
+    assert mixture.missing.sum() == mixture.hallucinated.sum() == 0
     assert gaussian.total_variation[0, ask] > 0.3
-    assert gaussian.missing[0, ask] + gaussian.invented[0, ask] >= 1
+    assert gaussian.missing[0, ask] + gaussian.hallucinated[0, ask] >= 1
     certain = pair(gaussian, 2, 1)
     assert gaussian.total_variation[0, certain] < 0.1, "it fails where several outcomes are possible, not everywhere"
 

@@ -93,12 +93,12 @@ class Expert(Cheat):
         super().__init__(probe, wrong)
         self.times = times
 
-    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         assert np.array_equal(frames, self.probe.frames) and np.array_equal(actions, self.probe.actions)
         truths = np.array([truth.macrostate for (truth,) in self.probe.possible])
         return np.where(self.times[:, None] > 0, truths, self.probe.macrostates)
 
-    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         return self.probe.macrostates.repeat(self.times, axis=0), self.probe.actions.repeat(self.times)
 
 

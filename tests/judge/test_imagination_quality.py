@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.interfaces import Outcome, TaskSpec
 from imagine_bench.judge.imagination_quality import EXAMPLES, Question, ask, examples, open_loop
-from imagine_bench.seeding import TUNING_SEEDS, SeedTree, exam
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,8 @@ def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
 def test_examples_of_a_run_that_tunes_begin_elsewhere(spec: TaskSpec) -> None:
     agent = bench_fakes.RulesImaginer(context())
     reported, tuning = (
-        examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=exam(seed)) for seed in (0, TUNING_SEEDS)
+        examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=evaluation_split(seed))
+        for seed in (0, TUNING_SEEDS)
     )
     assert [e.start_macrostate.tolist() for e in reported] != [e.start_macrostate.tolist() for e in tuning]
 

@@ -258,7 +258,7 @@ def test_folders_without_agents_are_named(
 def test_who_rehearses_before_tests_does_so_before_questions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
     left = [True, True, False]
-    monkeypatch.setattr(TableAgent, "rehearse", lambda agent: left.pop(0), raising=False)
+    monkeypatch.setattr(TableAgent, "train_in_model", lambda agent: left.pop(0), raising=False)
     load_trained(result.runs[0].folder)
     assert left == []
 
@@ -268,9 +268,9 @@ def test_one_encoder_file_is_enough_where_agents_see_through_two_kinds(tmp_path:
     shutil.copy(encoders.resolve(HARD, "clean"), own)
     codes = encoders.resolve(HARD, "clean", kind="codes")
     names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
-    wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "imagine"), **names)
+    wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "factored"), **names)
     config = {"protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
-    for agent, complaint in (("dqn", "has no checkpoint"), ("imagine", "has no checkpoint")):
+    for agent, complaint in (("dqn", "has no checkpoint"), ("factored", "has no checkpoint")):
         (tmp_path / "config.json").write_text(json.dumps({**config, "agent": agent}))
         with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
             load_trained(tmp_path, encoder=str(own))

@@ -1,4 +1,4 @@
-"""Several imagined courses of one beginning: who gets them, what reality they stand beside, and how they are drawn."""
+"""Several imagined sampled_rollouts of one beginning: who gets them, what reality they stand beside, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.judge import filmstrips as pictures
 from imagine_bench.judge import sampled_filmstrips as course_pictures
 from imagine_bench.judge.comparison import compare_rollout
-from imagine_bench.judge.imagination_quality import COURSES, examples, imagine_courses, is_random
+from imagine_bench.judge.imagination_quality import COURSES, examples, imagine_sampled_rollouts, is_random
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.results import ComparedRollout
 
@@ -67,12 +67,12 @@ def test_only_a_task_with_chance_has_courses(spec: TaskSpec) -> None:
     puzzle = registry.task("arrow_puzzle")
     assert is_random(spec.rules)
     assert not is_random(puzzle.rules)
-    assert imagine_courses(FakeImaginer(), puzzle, appearance="clean", seeds=SeedTree(0)) == ()
-    courses = imagine_courses(Dreamer((0, ASKS_RIGHT)), spec, appearance="clean", seeds=SeedTree(0))
-    assert len(courses) == COURSES
-    for one in courses:
-        assert np.array_equal(one.start_frame, courses[0].start_frame)
-        assert np.array_equal(one.start_macrostate, courses[0].start_macrostate)
+    assert imagine_sampled_rollouts(FakeImaginer(), puzzle, appearance="clean", seeds=SeedTree(0)) == ()
+    sampled_rollouts = imagine_sampled_rollouts(Dreamer((0, ASKS_RIGHT)), spec, appearance="clean", seeds=SeedTree(0))
+    assert len(sampled_rollouts) == COURSES
+    for one in sampled_rollouts:
+        assert np.array_equal(one.start_frame, sampled_rollouts[0].start_frame)
+        assert np.array_equal(one.start_macrostate, sampled_rollouts[0].start_macrostate)
 
 
 def test_a_task_with_few_starts_has_examples_too(spec: TaskSpec) -> None:

@@ -137,8 +137,8 @@ class _HandsOver(FakeImaginer):
 def test_where_chance_plays_several_courses_are_shown_and_elsewhere_not(imagined: Path, tmp_path: Path) -> None:
     options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
     path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
-    assert contents(path)["/imagined/courses"] >= {"sim_time", "env_step", "episode"}
-    assert "/imagined/courses" not in contents(imagined)
+    assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
+    assert "/imagined/sampled_rollouts" not in contents(imagined)
 
 
 def test_application_and_blueprint(imagined: Path) -> None:

@@ -21,7 +21,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
 from imagine_bench.judge.quality import generalisation_report
-from imagine_bench.regression import SCORES, Assessment, Dataset, Mixtures, RegressorContext, runner
+from imagine_bench.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext, runner
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression.calibration import calibrate
@@ -31,7 +31,7 @@ from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.trained import load_trained
-from imagine_bench.task_types import KINDS
+from imagine_bench.task_types import TASK_TYPES
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 
@@ -57,9 +57,9 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
 
 
 def test_every_kind_has_learners_and_all_names_load() -> None:
-    names = [name for kind in KINDS.values() for name in kind.tasks]
+    names = [name for kind in TASK_TYPES.values() for name in kind.tasks]
     assert len(names) == len(set(names))
-    for kind in KINDS.values():
+    for kind in TASK_TYPES.values():
         assert kind.tasks and kind.learners() and registry.load(kind.presets)
         for target in (
             kind.protocol, kind.plan, kind.run, kind.load_run, kind.load_so_far, kind.result, kind.write_report,
@@ -99,7 +99,7 @@ def test_variances_and_surprise_are_those_of_all_weight_samples_pooled(agent: st
     regressor = registry.make_regressor(agent, context)
     regressor.train(2)
     inputs = rng.normal(size=(2, 20, 1))
-    said, pooled = regressor.assess(inputs, rng), regressor.pooled(inputs)
+    said, pooled = regressor.predict(inputs, rng), regressor.pooled(inputs)
     weights = pooled.weights[..., None]
     mean = (weights * pooled.means).sum(axis=-2, keepdims=True)
     variance = (weights * (pooled.sigmas**2 + (pooled.means - mean) ** 2)).sum(axis=-2)
@@ -122,12 +122,12 @@ def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
 class Knowing:
     """Says one thing everywhere, and knows how wrong that is: its epistemic variance, and the negative of its modal."""
 
-    def assess(self, inputs: np.ndarray, rng: np.random.Generator) -> Assessment:
+    def predict(self, inputs: np.ndarray, rng: np.random.Generator) -> Prediction:
         prediction = np.zeros((*inputs.shape[:2], 1))
         toy = registry.regression("toy_regression")
         wrong = np.stack([toy.errors("base", *pair) for pair in zip(inputs, prediction, strict=True)])[..., None]
         constant = np.zeros(wrong.shape)
-        return Assessment(
+        return Prediction(
             prediction=prediction, mean=prediction, epistemic=wrong, aleatoric=constant, modal=-wrong,
             stationarity=constant[..., 0], drawn=constant[..., 0], surprise=-wrong[..., 0],
             predictive=self.pooled(inputs),
@@ -365,7 +365,7 @@ def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
         registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds))
     sound = registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds[:1]))
     with pytest.raises(InvalidValueError, match=r"N at least 1, not \(1, 0, 1\)"):
-        sound.assess(np.zeros((1, 0, 1)), np.random.default_rng(0))
+        sound.predict(np.zeros((1, 0, 1)), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
@@ -383,7 +383,7 @@ def test_regressors_learn_two_branches_and_refuse_a_foreign_snapshot(agent: str)
     regressor = registry.make_regressor(agent, context)
     regressor.train(80)
     test = branches(200)
-    said = regressor.assess(test.inputs[None], rng)
+    said = regressor.predict(test.inputs[None], rng)
     predictive = Mixtures(**{name: getattr(said.predictive, name)[0] for name in ("weights", "means", "sigmas")})
     assert log_score(predictive, test.targets).mean() < 0.2
     truth = (1 + 0.5 * test.inputs[:, 0]) ** 2  # half the distance between the branches, squared
@@ -414,8 +414,8 @@ def test_numbers_show_what_there_is(value: float, digits: int, text: str) -> Non
 
 
 def test_lists_of_sittings_are_rows_not_python() -> None:
-    facts = {"seeds": [0, 1], "sittings": [{"wall_s": 1.0, "changed": {}}, {"wall_s": 2.0, "changed": {"commit": "a"}}]}
+    facts = {"seeds": [0, 1], "sessions": [{"wall_s": 1.0, "changed": {}}, {"wall_s": 2.0, "changed": {"commit": "a"}}]}
     assert flat("", facts) == [
-        ("seeds", "0; 1"), ("sittings.1.wall_s", "1.0"),
-        ("sittings.2.wall_s", "2.0"), ("sittings.2.changed.commit", "a"),
+        ("seeds", "0; 1"), ("sessions.1.wall_s", "1.0"),
+        ("sessions.2.wall_s", "2.0"), ("sessions.2.changed.commit", "a"),
     ]  # fmt: skip

@@ -254,7 +254,7 @@ def test_how_it_was_made_is_complete(result: BenchResult, folder: Path) -> None:
         assert fact in text
 
 
-def test_plots_take_the_pages_colour_and_do_not_share_ids(folder: Path) -> None:
+def test_plots_take_the_pages_color_and_do_not_share_ids(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
     assert text.count("<svg") == 4  # success, gain, acceptance, open loop
     assert "currentColor" in text
@@ -352,11 +352,11 @@ def test_the_one_test_of_an_agent_that_does_not_learn_is_counted_once(result: Be
 
 def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult) -> None:
     both = dataclasses.replace(
-        result.protocol, agents=("random", "dqn", "imagine"), encoder="a@0123456789ab", codes="b@0123456789ab"
+        result.protocol, agents=("random", "dqn", "factored"), encoder="a@0123456789ab", codes="b@0123456789ab"
     )
     views = encoder_views(SimpleNamespace(protocol=both))  # type: ignore[arg-type]
     assert [(view.identity, view.agents) for view in views] == [
-        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("imagine",)),
+        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("factored",)),
     ]  # fmt: skip
 
 
@@ -396,7 +396,7 @@ def test_strip_marks_cut_error_and_end() -> None:
     assert (cut == pictures._CUT).all(axis=2).sum() > 500  # the line
     assert not (whole == pictures._CUT).all(axis=2).any()
     for color in (pictures.RIGHT, pictures.WRONG):
-        assert (whole == color).all(axis=2).sum() > 500  # frames in both colours
+        assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
     narrow = pictures.rollout_strip(compared_rollout(np.random.default_rng(0)), names, columns=2)
     assert narrow.shape[1] < whole.shape[1]
 
@@ -413,18 +413,20 @@ def test_episodes_to_mastery_ask_for_what_the_task_calls_mastered(
     result: BenchResult, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = collect(result).spec
-    assert f"Real episodes to {100 * spec.mastery:g}&nbsp;%" in (folder / "index.html").read_text(encoding="utf-8")
+    assert f"Real episodes to {100 * spec.success_threshold:g}&nbsp;%" in (folder / "index.html").read_text(
+        encoding="utf-8"
+    )
     agent = result.protocol.agents[-1]
     lowest = min(row.success_rate for run in result.of(agent) for row in run.checkpoints)
     assert 0.0 < lowest < 1.0
     first, seeds = result.protocol.budgets[0], len(result.protocol.seeds)
-    for mastery, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
-        demanding = dataclasses.replace(spec, mastery=mastery)
+    for success_threshold, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
+        demanding = dataclasses.replace(spec, success_threshold=success_threshold)
         monkeypatch.setattr("imagine_bench.report.data.registry.task", lambda _, spec=demanding: spec)
         assert collect(result).reached[agent] == reached
 
 
-def test_no_two_registered_agents_share_a_colour() -> None:
+def test_no_two_registered_agents_share_a_color() -> None:
     own = [name for name, entry in registry.AGENTS.items() if entry.make.startswith("imagine_bench.")]  # no test's
     colors = [plots.color(agent) for agent in own]
     assert len(own) > 8 and len(set(colors)) == len(colors)

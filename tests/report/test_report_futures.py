@@ -1,4 +1,4 @@
-"""What the report says of sampled futures and imagined courses: the result's numbers, and only where there are any."""
+"""What the report says of sampled futures and imagined sampled_rollouts: the result's numbers, and only where there are any."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def futures(spec: TaskSpec, rng: np.random.Generator) -> Futures:
     states = np.array(spec.rules.states[: PAIRS // spec.n_actions])
     missing = np.zeros((DEPTH, PAIRS))
     missing[1, 3] = 1.0
-    going_on = np.ones((DEPTH, PAIRS))
-    going_on[1:, ::2] = 0.0
+    survival_probability = np.ones((DEPTH, PAIRS))
+    survival_probability[1:, ::2] = 0.0
     return Futures(
         macrostates=states.repeat(spec.n_actions, axis=0),
         actions=np.tile(np.arange(spec.n_actions), len(states)),
@@ -35,10 +35,10 @@ def futures(spec: TaskSpec, rng: np.random.Generator) -> Futures:
         total_variation=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
         floor=np.where(np.arange(PAIRS) == 2, 0.01, 0.0) * np.ones((DEPTH, 1)),
         missing=missing,
-        invented=np.zeros((DEPTH, PAIRS)),
+        hallucinated=np.zeros((DEPTH, PAIRS)),
         reward_error=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
         termination_error=rng.uniform(0.0, 0.1, (DEPTH, PAIRS)),
-        going_on=going_on,
+        survival_probability=survival_probability,
     )
 
 
@@ -51,7 +51,7 @@ def with_chance(run: RunResult, spec: TaskSpec) -> RunResult:
     inside = dataclasses.replace(course.rollout, macrostates=states, actions=np.array([1, 1]))
     course = dataclasses.replace(course, rollout=inside, start_macrostate=np.array([0, 0, 0, 1]))
     rows = tuple(dataclasses.replace(row, futures=futures(spec, rng)) for row in run.checkpoints)
-    return dataclasses.replace(run, checkpoints=rows, imagined=(course,), courses=(course,) * 3)
+    return dataclasses.replace(run, checkpoints=rows, imagined=(course,), sampled_rollouts=(course,) * 3)
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_the_summary_is_the_mean_over_pairs_and_seeds(result: BenchResult) -> No
     tables = np.stack([each.total_variation for each in last if each is not None])  # [seeds, D, P]
     assert summary.total_variation == pytest.approx(tables.mean(axis=(0, 2)))
     assert summary.by_chance == pytest.approx(tables[:, :, 2].mean(axis=0))
-    assert summary.going_on[0] == pytest.approx(summary.total_variation[0])
-    assert summary.going_on[1:] == pytest.approx(tables[:, 1:, 1::2].mean(axis=(0, 2)))
+    assert summary.survival_probability[0] == pytest.approx(summary.total_variation[0])
+    assert summary.survival_probability[1:] == pytest.approx(tables[:, 1:, 1::2].mean(axis=(0, 2)))
     assert summary.missing.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0]
     assert (summary.pairs, summary.samples) == (PAIRS, 400)
     assert list(summary.by_budget) == [500, 1000]

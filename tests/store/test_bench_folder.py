@@ -31,7 +31,7 @@ def opened(root: Path, **changes: object) -> BenchStore:
 
 def test_a_finished_bench_is_read_back(tmp_path: Path) -> None:
     store = opened(tmp_path, seeds=(0, 2))
-    assert store.begin_sitting(_ENVIRONMENT) == []
+    assert store.begin_session(_ENVIRONMENT) == []
     assert store.missing() == [("table", 0), ("table", 2)]
     runs = [do(store.run_folder("table", seed), seed=seed, seeds=(0, 2)) for seed in (0, 2)]
     assert store.missing() == []
@@ -44,7 +44,7 @@ def test_a_finished_bench_is_read_back(tmp_path: Path) -> None:
 
 def test_a_missing_run_is_an_error_that_says_how_to_go_on(tmp_path: Path) -> None:
     store = opened(tmp_path, seeds=(0, 2))
-    store.begin_sitting(_ENVIRONMENT)
+    store.begin_session(_ENVIRONMENT)
     do(store.run_folder("table", 0), seeds=(0, 2))
     with pytest.raises(ArtefactError, match=r"missing: \[\('table', 2\)\]\. Run the same bench command again"):
         load_bench(store.folder)
@@ -89,20 +89,20 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     path.write_text(json.dumps(other))
     with pytest.raises(ArtefactError, match=r"protocol\.json is of another protocol .* left untouched"):
         store.open()
-    path.write_text('{"task": "arrow_puzzle", "colour": "red"}')
-    with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol: .*colour"):
+    path.write_text('{"task": "arrow_puzzle", "color": "red"}')
+    with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol: .*color"):
         load_bench(store.folder)
-    assert "colour" in path.read_text()
+    assert "color" in path.read_text()
 
 
 def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
-    opened(tmp_path).begin_sitting(_ENVIRONMENT)
-    changed = opened(tmp_path).begin_sitting({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
+    opened(tmp_path).begin_session(_ENVIRONMENT)
+    changed = opened(tmp_path).begin_session({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
     assert changed == ["versions"]
-    sittings = json.loads((opened(tmp_path).folder / "sittings.json").read_text())
-    assert [sitting["changed"] for sitting in sittings] == [{}, {"versions": {"torch": "2"}}]
+    sessions = json.loads((opened(tmp_path).folder / "sessions.json").read_text())
+    assert [session["changed"] for session in sessions] == [{}, {"versions": {"torch": "2"}}]
     elsewhere = {**_ENVIRONMENT, "machine": {"cpu": "another", "cores": 2}}
-    assert opened(tmp_path).begin_sitting(elsewhere) == ["cpu"]
+    assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]
 
 
 def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
@@ -119,29 +119,29 @@ def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
         folder = opened(tmp_path / str(survived))
         monkeypatch.setattr("imagine_bench.store.bench_folder.write_json", killed)
         with pytest.raises(KeyboardInterrupt):
-            folder.begin_sitting(_ENVIRONMENT)
+            folder.begin_session(_ENVIRONMENT)
         monkeypatch.undo()
         again = opened(tmp_path / str(survived))
-        assert again.begin_sitting(_ENVIRONMENT) == []
-        assert {path.name for path in again.folder.iterdir()} >= {"environment.json", "sittings.json"}
+        assert again.begin_session(_ENVIRONMENT) == []
+        assert {path.name for path in again.folder.iterdir()} >= {"environment.json", "sessions.json"}
 
 
 @pytest.mark.parametrize("content", ["[{}]", "[1]", '[{"wall_s": null}]'])
 def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
     store = opened(tmp_path)
-    store.begin_sitting(_ENVIRONMENT)
-    (store.folder / "sittings.json").write_text(content)
-    with pytest.raises(ArtefactError, match=r"sittings\.json"):
-        store.begin_sitting(_ENVIRONMENT)
+    store.begin_session(_ENVIRONMENT)
+    (store.folder / "sessions.json").write_text(content)
+    with pytest.raises(ArtefactError, match=r"sessions\.json"):
+        store.begin_session(_ENVIRONMENT)
 
 
-@pytest.mark.parametrize(("name", "content"), [("sittings.json", "null"), ("environment.json", "[]")])
+@pytest.mark.parametrize(("name", "content"), [("sessions.json", "null"), ("environment.json", "[]")])
 def test_a_damaged_sitting_is_named(tmp_path: Path, name: str, content: str) -> None:
     store = opened(tmp_path)
-    store.begin_sitting(_ENVIRONMENT)
+    store.begin_session(_ENVIRONMENT)
     (store.folder / name).write_text(content)
     with pytest.raises(ArtefactError, match=rf"{name} is not a bench's .*: it holds a .* left untouched"):
-        store.begin_sitting(_ENVIRONMENT)
+        store.begin_session(_ENVIRONMENT)
 
 
 def test_no_bench_and_no_recording(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.store.archive import load_archive
 from imagine_bench.store.bench_folder import load_bench
-from imagine_bench.store.merge import load_together
+from imagine_bench.store.merge import load_merged
 from imagine_bench.store.partial import cut
 from imagine_bench.store.results import BenchResult
 
@@ -36,7 +36,7 @@ def kept_from(folder: Path, kept: Path) -> Path:
     """What is kept of a bench for good."""
     assert main(["report", str(folder)]) == 0
     kept.mkdir()
-    for name in ("protocol.json", "environment.json", "sittings.json", "report/results.csv"):
+    for name in ("protocol.json", "environment.json", "sessions.json", "report/results.csv"):
         (kept / Path(name).name).write_bytes((folder / name).read_bytes())
     return kept
 
@@ -44,7 +44,7 @@ def kept_from(folder: Path, kept: Path) -> Path:
 def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
-    joined = load_together([first, second], tmp_path)
+    joined = load_merged([first, second], tmp_path)
     assert (joined.protocol.agents, joined.protocol.seeds, joined.protocol.budgets) == (
         ("oracle", "random"),
         (1,),
@@ -89,14 +89,14 @@ def test_what_cannot_be_compared_is_refused(
     first = do(tmp_path, "oracle")
     other = do(tmp_path / "other", *agents, **changes)
     with pytest.raises(InvalidValueError, match=words):
-        load_together([first, other], tmp_path)
+        load_merged([first, other], tmp_path)
 
 
 def test_seeds_of_two_benches_are_those_of_one(tmp_path: Path) -> None:
     whole = load_bench(do(tmp_path / "whole", "oracle", "random", seeds=(0, 1, 2)))
     late = do(tmp_path / "there", "oracle", "random", seeds=(2,))
     early = do(tmp_path / "here", "oracle", "random", seeds=(0, 1))
-    joined = load_together([late, early], tmp_path)
+    joined = load_merged([late, early], tmp_path)
     assert joined.protocol == whole.protocol
     for agent in ("oracle", "random"):
         assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
@@ -104,14 +104,14 @@ def test_seeds_of_two_benches_are_those_of_one(tmp_path: Path) -> None:
 
 def test_the_order_of_agents_is_nothing(tmp_path: Path) -> None:
     here, there = do(tmp_path, "oracle", "random", seeds=(0,)), do(tmp_path, "random", "oracle", seeds=(1,))
-    joined = load_together([here, there], tmp_path)
+    joined = load_merged([here, there], tmp_path)
     assert (joined.protocol.agents, joined.protocol.seeds) == (("oracle", "random"), (0, 1))
 
 
 def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     here, there = do(tmp_path, "oracle", seeds=(0, 1)), do(tmp_path, "oracle", seeds=(2,))
     shutil.rmtree(here / "oracle" / "seed_1")
-    joined = load_together([here, there], tmp_path)
+    joined = load_merged([here, there], tmp_path)
     assert joined.protocol.seeds == (0, 2)
     assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
     assert "One of these benches is not finished: shown are 2 seeds up to 9 real" in summary_table(joined)
@@ -135,7 +135,7 @@ def test_seeds_of_other_settings_are_refused(tmp_path: Path, digest: str) -> Non
     here = do(tmp_path, "random", seeds=(0,), settings_digest="one")
     there = do(tmp_path, "random", seeds=(1,), settings_digest=digest)
     with pytest.raises(InvalidValueError, match=rf"of different settings \(.*{digest or 'unknown'}"):
-        load_together([here, there], tmp_path)
+        load_merged([here, there], tmp_path)
 
 
 def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,7 +151,7 @@ def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.Ca
 def test_kept_results_say_what_their_run_folders_said(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
     kept = kept_from(second, tmp_path / "kept")
-    with_runs, without = (load_together([first, other], tmp_path / "joined") for other in (second, kept))
+    with_runs, without = (load_merged([first, other], tmp_path / "joined") for other in (second, kept))
     assert with_runs.protocol == without.protocol and with_runs.folder == without.folder
     for mine, theirs in zip(with_runs.of("random"), without.of("random"), strict=True):
         assert mine.checkpoints == theirs.checkpoints
@@ -185,4 +185,4 @@ def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
     (second / "results.csv").write_text("agent,seed,episodes\nrandom,0,many\n")
     with pytest.raises(ArtefactError, match=r"results\.csv is not the table of a bench of agents"):
-        load_together([first, second], tmp_path)
+        load_merged([first, second], tmp_path)

@@ -318,11 +318,11 @@ def test_unasked_render_arguments_are_refused():
 
 
 def check_fidelity(actions):
-    found = measure_fidelity(SPEC, SPEC.promises, actions)
+    found = measure_fidelity(SPEC, SPEC.targets, actions)
     assert found.actions == actions
-    assert found.as_ruled / actions >= SPEC.promises.as_ruled, found.faults
-    assert found.bystander_mm < SPEC.promises.bystander_mm
-    assert np.percentile(found.error_mm, 99) < SPEC.promises.error_mm
+    assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
+    assert found.bystander_mm < SPEC.targets.bystander_mm
+    assert np.percentile(found.error_mm, 99) < SPEC.targets.error_mm
     assert len(found.error_mm) > actions / 10
 
 
@@ -338,20 +338,20 @@ def test_a_thousand_random_macro_actions_end_as_the_rules_say():
 # --- what the camera sees ----------------------------------------------------------------------------------------
 
 
-def pixels(frame, colour):
-    """Pixels whose channels differ as those of a colour do: ``"red"``, ``"green"`` or ``"blue"``."""
-    channel = ("red", "green", "blue").index(colour)
+def pixels(frame, color):
+    """Pixels whose channels differ as those of a color do: ``"red"``, ``"green"`` or ``"blue"``."""
+    channel = ("red", "green", "blue").index(color)
     others = [each for each in range(3) if each != channel]
     return frame[..., channel].astype(int) - frame[..., others].max(axis=-1) > 80
 
 
 def test_the_frame_shows_each_object_where_it_is():
     """In the row, left to right; at the bottom when it is held, then missing in the row; on the palm in the end."""
-    colours = ("blue", "red", "green")
+    colors = ("blue", "red", "green")
     frames = dict(zip(RULES.states, SPEC.render_macrostates(np.array(RULES.states), "clean", rng()), strict=True))
     for state, frame in frames.items():
-        for index, colour in enumerate(colours):
-            rows, columns = np.nonzero(pixels(frame, colour))
+        for index, color in enumerate(colors):
+            rows, columns = np.nonzero(pixels(frame, color))
             if state[index] == 0:
                 assert 28 < rows.mean() < 40
                 assert abs(columns.mean() - (16, 32, 48)[index]) < 4

@@ -8,7 +8,7 @@ from imagine_bench.tasks.robot_ik import spec as ik
 from imagine_bench.tasks.robot_ik.planar_arm import MOVE_S
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import Assessment
+from imagine_bench.regression import Prediction
 from imagine_bench.seeding import SeedTree
 
 
@@ -126,14 +126,14 @@ def test_sample_counts_out_of_range_name_the_range(variant: str) -> None:
 def test_decisions_are_carried_out_by_the_arm() -> None:
     """Of networks that say what they like: the arm rests where equation 4.29 puts the joints, and misses by that."""
 
-    def assess(points: np.ndarray, purpose: str) -> Assessment:
+    def predict(points: np.ndarray, purpose: str) -> Prediction:
         shape, rng = points.shape[:2], np.random.default_rng(len(purpose))
         said = {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
         scores = {name: rng.random(shape) for name in ("stationarity", "drawn", "surprise")}
         told = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
-        return Assessment(prediction=told, **said, **scores, predictive=None)  # type: ignore[arg-type]
+        return Prediction(prediction=told, **said, **scores, predictive=None)  # type: ignore[arg-type]
 
-    found = ik.evaluate("1000", assess, (SeedTree(0), SeedTree(1)))
+    found = ik.evaluate("1000", predict, (SeedTree(0), SeedTree(1)))
     for part in ("decision", "disc"):
         reached, points = found[f"{part}/reached"], found[f"{part}/points"]
         assert reached.shape == points.shape == (2, ik.DECISIONS, ik.CANDIDATES, 2)

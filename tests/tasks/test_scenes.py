@@ -264,17 +264,17 @@ def test_looks_vary_within_what_their_level_allows_and_cover_it():
     for level in LEVELS.values():
         world, generator = ArrowWorld(level), rng()
         model, camera = world.model, world.model.camera(c.AGENT_CAMERA).id
-        colours, place_m, light = model.mat_rgba.copy(), model.cam_pos[camera].copy(), model.light_diffuse.copy()
+        colors, place_m, light = model.mat_rgba.copy(), model.cam_pos[camera].copy(), model.light_diffuse.copy()
         quat = model.cam_quat[camera].copy()
         tint, shift_m, turn_rad, brightness = 0.0, 0.0, 0.0, 0.0
         for _ in range(200):
             world.vary(generator)
-            tint = max(tint, np.abs(model.mat_rgba / np.where(colours > 0, colours, 1.0) - (colours > 0)).max())
+            tint = max(tint, np.abs(model.mat_rgba / np.where(colors > 0, colors, 1.0) - (colors > 0)).max())
             shift_m = max(shift_m, np.abs(model.cam_pos[camera] - place_m).max())
             turn_rad = max(turn_rad, 2.0 * math.acos(min(1.0, abs(model.cam_quat[camera] @ quat))))
             brightness = max(brightness, np.abs(model.light_diffuse - light).max() / light.max())
         for found, most in (
-            (tint, level.colour_fraction),
+            (tint, level.color_fraction),
             (shift_m, level.camera_offset_m),
             (turn_rad, math.sqrt(3.0) * level.camera_angle_rad),
             (brightness, level.light_fraction),

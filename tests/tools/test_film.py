@@ -15,8 +15,8 @@ from imagine_bench.tools.film import HEIGHT_PX, WIDTH_PX, film
 def test_a_film_moves_from_the_start_to_the_goal_and_is_never_overwritten(tmp_path: Path) -> None:
     out = film("arrow_puzzle", tmp_path / "new" / "turn.gif", seed=0)
     with Image.open(out) as gif:
-        grey = [np.asarray(picture.convert("L"), dtype=np.float32) for picture in ImageSequence.Iterator(gif)]
-    pictures = np.stack(grey)
+        gray = [np.asarray(picture.convert("L"), dtype=np.float32) for picture in ImageSequence.Iterator(gif)]
+    pictures = np.stack(gray)
     assert len(pictures) > 20 and pictures.shape[1] == HEIGHT_PX and pictures.shape[2] > WIDTH_PX
     scene, eye = pictures[:, :, :WIDTH_PX], pictures[:, :, WIDTH_PX:]
     assert np.abs(np.diff(scene, axis=0)).max(axis=(1, 2)).max() > 50, "the arm is seen moving"

@@ -14,12 +14,12 @@ def test_figures_are_measured_and_kept(tmp_path):
     assert len(lines) == len(figures) + 1 and kept["environment"]["versions"]["mujoco"]
     assert all_met == all(figure["met"] for figure in figures.values())
     assert any(name.startswith("a model update") for name in figures)
-    measured = [spec for spec in map(registry.task, registry.TASKS) if spec.promises is not None]
+    measured = [spec for spec in map(registry.task, registry.TASKS) if spec.targets is not None]
     assert {spec.id for spec in measured} >= {"arrow_puzzle", "pick_place"}
     for spec in measured:
         wanted = ("macro-actions exactly", "other objects", "position error", "yaw error", "bundled")
         exact = [name for name in figures if name.startswith(tuple(f"{spec.id}: {words}" for words in wanted))]
-        errors = [allowed for allowed in (spec.promises.error_mm, spec.promises.error_deg) if allowed is not None]
-        assert len(exact) == 2 + len(errors) + len(spec.promises.encoders)
+        errors = [allowed for allowed in (spec.targets.error_mm, spec.targets.error_deg) if allowed is not None]
+        assert len(exact) == 2 + len(errors) + len(spec.targets.encoders)
         for name in exact:
             assert figures[name]["met"], figures[name]

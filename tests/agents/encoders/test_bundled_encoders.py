@@ -21,8 +21,8 @@ from imagine_bench.seeding import SeedTree
 PROMISED = [
     (name, appearance, required)
     for name, spec in ((name, registry.task(name)) for name in registry.TASKS)
-    if spec.promises is not None
-    for appearance, required in spec.promises.encoders.items()
+    if spec.targets is not None
+    for appearance, required in spec.targets.encoders.items()
 ]
 """Share of fresh frames whose whole macrostate must be read right."""
 

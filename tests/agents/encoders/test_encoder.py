@@ -370,11 +370,11 @@ def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:
     assert (tmp_path / "e.json").read_text() == "mine" and not (tmp_path / "e.safetensors").exists()
 
 
-def test_view_joins_strips_and_keeps_colours() -> None:
+def test_view_joins_strips_and_keeps_colors() -> None:
     frames, _ = draw_frames(arrow_spec(), "mild", 2, np.random.default_rng(0))
     assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
-    colours = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
-    assert np.array_equal(view(colours, "small_rgb")[1, 5, 7], colours[1, :, 5, 7])
+    colors = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
+    assert np.array_equal(view(colors, "small_rgb")[1, 5, 7], colors[1, :, 5, 7])
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
@@ -388,8 +388,8 @@ def test_retrain_leaves_artefact_card_and_picture_and_never_overwrites(tmp_path:
     assert card.command == "imagine-bench encoder --task drawn_arrows --appearance mild --recipe tiny --seed 1"
     assert card.cpu_s["total"] == pytest.approx(sum(card.cpu_s[k] for k in ("frames", "training", "probe")), abs=0.2)
     with Image.open(path.with_suffix(".png")) as sheet:
-        colours = np.asarray(sheet)
-    assert colours.std() > 20 and colours.shape[1] > 1000
+        colors = np.asarray(sheet)
+    assert colors.std() > 20 and colors.shape[1] > 1000
     written = {file: file.read_bytes() for file in path.parent.iterdir()}
     assert len(written) == 3
     with pytest.raises(ArtefactError, match="exists already and is never overwritten"):

@@ -18,7 +18,7 @@ from imagine_bench.agents.factored.planner import Planner
 from imagine_bench.agents.factored.settings import DynamicsSettings, ImagineSettings, OutcomeSettings, resolve
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, Imaginer, Rememberer, ValueReader
+from imagine_bench.capabilities import Answer, Imaginer, ReplayReader, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 
@@ -217,7 +217,7 @@ def test_acting_greedily_is_constant_and_changes_nothing(exploration: str) -> No
     assert same(before, learner.state())
 
 
-@pytest.mark.parametrize("factored", [True, False])
+@pytest.mark.parametrize("imagine", [True, False])
 def test_a_resumed_agent_equals_an_uninterrupted_one_to_the_bit(factored: bool) -> None:
     learner, resumed = agent(dynamics__factored=factored), agent(99, dynamics__factored=factored)
     first, second = np.random.default_rng(0), np.random.default_rng(0)
@@ -278,16 +278,16 @@ def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothi
         learner.imagine(frame((0, 1, 0)), actions=np.array([9]), depth=1, rng=np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("factored", [True, False])
+@pytest.mark.parametrize("imagine", [True, False])
 def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored: bool) -> None:
     learner = agent(dynamics__factored=factored)
-    assert isinstance(learner, Rememberer)
-    assert [len(part) for part in learner.remembered()] == [0, 0]
+    assert isinstance(learner, ReplayReader)
+    assert [len(part) for part in learner.replayed()] == [0, 0]
     done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
     for code, action in done:
         learner.observe(fake_codes.transition(code, action), episode=0)
-    learner.learn_answer(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
-    macrostates, actions = learner.remembered()
+    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
+    macrostates, actions = learner.replayed()
     assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
 
 

@@ -23,7 +23,7 @@ from imagine_bench.agents.settings import ControllerSettings, Settings
 from test_imagination import CountingModel, remembering
 from test_imagination import make as counting
 
-from imagine_bench.capabilities import Rehearser
+from imagine_bench.capabilities import ModelOnlyTrainer
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import SeedTree
@@ -37,9 +37,9 @@ def make(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> ImaginationOnly:
     return imagination_only.make(context(monkeypatch, overrides))
 
 
-def rehearse(agent: ImaginationOnly, at_most: int = 10_000) -> int:
+def train_in_model(agent: ImaginationOnly, at_most: int = 10_000) -> int:
     """Rehearse until nothing is left, or so often; how many episodes it were."""
-    return next((done for done in range(at_most) if not agent.rehearse()), at_most)
+    return next((done for done in range(at_most) if not agent.train_in_model()), at_most)
 
 
 def learn_the_task(agent: Any, episodes: int) -> None:
@@ -63,7 +63,7 @@ def test_a_controller_that_never_met_the_world_beats_chance_after_rehearsing(mon
     agent = make(monkeypatch, **sizes, **model, **{"imagination.rehearsal_episodes": 400, "memory.imagined": 400})
     learn_the_task(agent, 250)
     unrehearsed = solved(agent)
-    assert rehearse(agent) == 400
+    assert train_in_model(agent) == 400
     assert solved(agent) >= 5 / 6 > unrehearsed  # chance 1 / 3; five of six by luck: 1 in 56
 
 
@@ -73,7 +73,7 @@ def test_what_is_tested_is_untouched_by_real_transitions(monkeypatch: pytest.Mon
     before = agent.tested.optimiser.arrays()["value"]
     live(agent, range(4, 12), np.random.default_rng(1))
     assert np.array_equal(agent.tested.optimiser.arrays()["value"], before)
-    assert rehearse(agent) == 8
+    assert train_in_model(agent) == 8
     assert not np.array_equal(agent.tested.optimiser.arrays()["value"], before)
 
 
@@ -82,22 +82,22 @@ def test_the_explorer_acts_and_learns_like_the_dqn_whether_rehearsed_or_not(monk
     first, second = np.random.default_rng(0), np.random.default_rng(0)
     for episodes in (range(6), range(6, 14)):
         assert live(plain, episodes, first) == live(agent, episodes, second)
-        rehearse(agent)
+        train_in_model(agent)
     assert np.array_equal(plain.state().arrays["controller/value"], agent.state().arrays["controller/value"])
 
 
 def test_a_rehearsal_is_asked_for_by_new_experience_only(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make(monkeypatch)
-    assert isinstance(agent, Rehearser)
-    assert not isinstance(imagination_agents.make(context(monkeypatch)), Rehearser)
-    assert not agent.rehearse(), "nothing was learned yet"
+    assert isinstance(agent, ModelOnlyTrainer)
+    assert not isinstance(imagination_agents.make(context(monkeypatch)), ModelOnlyTrainer)
+    assert not agent.train_in_model(), "nothing was learned yet"
     live(agent, range(3), np.random.default_rng(0))
-    assert rehearse(agent) == 8
+    assert train_in_model(agent) == 8
     before = agent.state()
-    assert not agent.rehearse()
+    assert not agent.train_in_model()
     assert np.array_equal(before.arrays["rehearsal/generator"], agent.state().arrays["rehearsal/generator"])
     live(agent, range(3, 4), np.random.default_rng(0))
-    assert rehearse(agent) == 8
+    assert train_in_model(agent) == 8
 
 
 def test_rehearsing_twice_from_the_same_experience_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,9 +107,9 @@ def test_rehearsing_twice_from_the_same_experience_gives_the_same_bits(monkeypat
         rng = np.random.default_rng(0)
         live(agent, range(5), rng)
         if agent is often:
-            rehearse(agent)
+            train_in_model(agent)
         live(agent, range(5, 9), rng)
-        rehearse(agent)
+        train_in_model(agent)
     first, second = often.state().arrays, once.state().arrays
     assert all(np.array_equal(first[name], second[name]) for name in first if name.startswith("rehearsal/"))
 
@@ -120,12 +120,12 @@ def test_an_interrupted_rehearsal_goes_on_to_the_same_bits(monkeypatch: pytest.M
     overrides = {"controller.target_rate": rate}
     agent = make(monkeypatch, **overrides)
     live(agent, range(5), np.random.default_rng(0))
-    assert rehearse(agent, 3) == 3
+    assert train_in_model(agent, 3) == 3
     saved = copy.deepcopy(agent.state())
-    assert rehearse(agent) == 5
+    assert train_in_model(agent) == 5
     resumed = make(monkeypatch, **overrides)
     resumed.restore(saved)
-    assert rehearse(resumed) == 5
+    assert train_in_model(resumed) == 5
     one, other = agent.state().arrays, resumed.state().arrays
     assert one.keys() == other.keys()
     assert all(np.array_equal(one[name], other[name]) for name in one)
@@ -137,7 +137,7 @@ def test_imagined_episodes_begin_where_real_ones_did(monkeypatch: pytest.MonkeyP
         agent.observe(transition(episode, 0, 0.0, 4), episode=episode)
         agent.observe(transition(4, 0, 0.0, 5), episode=episode)
     assert np.array_equal(agent.state().arrays["starts/mu"], CODES[:3].numpy())
-    rehearse(agent)
+    train_in_model(agent)
     begun = agent.state().arrays["rehearsal/memory/z"]
     distance = np.linalg.norm(begun[:, None] - CODES[:3].numpy()[None], axis=-1).min(axis=1)
     assert len(begun) == 8
@@ -151,7 +151,7 @@ def test_the_filter_ends_an_imagined_episode_and_stores_nothing_that_it_discards
     strict = imagination_only.make_uncertainty(context(monkeypatch, overrides))
     live(strict, range(4), np.random.default_rng(0))
     strict.diagnostics()
-    assert rehearse(strict) == 6
+    assert train_in_model(strict) == 6
     assert len(strict.state().arrays["rehearsal/memory/z"]) == 0
     assert strict.diagnostics()["imagination/acceptance_rate"] == 0.0
 
@@ -201,7 +201,7 @@ def test_a_moving_threshold_moves_for_rehearsals_too() -> None:
 def test_rehearsals_are_what_it_says_it_imagined(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make(monkeypatch)
     live(agent, range(4), np.random.default_rng(0))
-    rehearse(agent)
+    train_in_model(agent)
     read = agent.diagnostics()
     assert read["imagined_transitions"] == len(agent.state().arrays["rehearsal/memory/z"]) > 8
     assert read["time/rehearsal_s"] > 0.0 and "time/imagination_s" not in read

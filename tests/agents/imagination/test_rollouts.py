@@ -39,7 +39,7 @@ class CountingModel:
     def draw_reward_weights(self, count: int, dropout: torch.Generator) -> tuple[torch.Tensor, ...]:
         return ()
 
-    def reward_doubt(
+    def reward_std(
         self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor, weights: tuple[torch.Tensor, ...]
     ) -> torch.Tensor:
         return 2.0 * (next_z[:, 1] == self.spurious_at)
@@ -281,7 +281,7 @@ def remembering(count: int) -> RealMemory:
 
 
 def test_rollouts_start_from_the_current_state_or_from_remembered_ones() -> None:
-    for start, seen in (("current", {(0.0, 0.0)}), ("remembered", {(float(index), 5.0) for index in range(4)})):
+    for start, seen in (("current", {(0.0, 0.0)}), ("replayed", {(float(index), 5.0) for index in range(4)})):
         imagination, controller = make(filtered=False, model=CountingModel(), breadth=60, depth=1, start_states=start)
         imagination.rollouts(controller, torch.zeros(2), remembering(4), 0.5)
         assert {tuple(row) for row in imagination.memory.arrays()["z"].tolist()} == seen

@@ -137,7 +137,7 @@ def test_the_doubt_about_a_reward_is_the_spread_of_a_loop_over_weight_samples(ch
             rewards.append(10.0 * reward[0])
     expected = torch.stack(rewards).std(dim=0, correction=0)  # [4]
     assert expected.min() > 0.0, "weight samples must disagree"
-    torch.testing.assert_close(model.reward_doubt(z, action, next_z, weights), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(model.reward_std(z, action, next_z, weights), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_rewards_are_doubted_where_none_was_seen() -> None:
@@ -150,7 +150,7 @@ def test_rewards_are_doubted_where_none_was_seen() -> None:
     assert weights is not None
     known, action = CODES[:3], torch.zeros(3, dtype=torch.int64)
     elsewhere = 3.0 * CODES[4] - 2.0 * CODES[:3]  # past the rewarded state, where nothing was seen
-    doubts = [model.reward_doubt(known, action, places, weights) for places in (known, elsewhere)]
+    doubts = [model.reward_std(known, action, places, weights) for places in (known, elsewhere)]
     assert doubts[1].min() > 2.0 * doubts[0].max()
 
 

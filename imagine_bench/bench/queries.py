@@ -14,7 +14,7 @@ from imagine_bench import registry
 from imagine_bench.bench.evaluation import Info
 from imagine_bench.bench.protocol import Protocol
 from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import Answer, Questioner, SelfTrainer, Transferable
+from imagine_bench.capabilities import Answer, ExternalTrainer, QueryingAgent, TransferLearner
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 
@@ -25,16 +25,16 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     Raises:
         InvalidValueError: It cannot carry anything over to the next task, cannot watch, or cannot ask.
     """
-    if protocol.demonstrations and isinstance(agent, SelfTrainer):
+    if protocol.demonstrations and isinstance(agent, ExternalTrainer):
         raise InvalidValueError(
             f"Agent {name!r} trains in a loop of its own and cannot watch; leave --demonstrations out, or that agent."
         )
-    if protocol.after and not isinstance(agent, Transferable):
+    if protocol.after and not isinstance(agent, TransferLearner):
         raise InvalidValueError(
             f"Agent {name!r} has no model of the world to carry over from {', '.join(protocol.after)}; leave --after "
             "out, or give agents that have one, such as imagine or imagination."
         )
-    if protocol.questions and not isinstance(agent, Questioner):
+    if protocol.questions and not isinstance(agent, QueryingAgent):
         raise InvalidValueError(
             f"Agent {name!r} cannot ask a teacher; leave --questions out, or give an agent that can, such as imagine."
         )
@@ -54,7 +54,7 @@ def as_seen(transition: Transition) -> Transition:
     )
 
 
-class Teacher:
+class LabelOracle:
     """Answers what actions would bring, from the rules and the true macrostate, where the rules leave no doubt.
 
     Args:
@@ -89,7 +89,7 @@ class Teacher:
         return answers.pop() if len(answers) == 1 else None
 
 
-class Lesson:
+class QueryBudget:
     """The questions of one episode: a learner's, as many as are allowed, before each of its macro-actions.
 
     Args:
@@ -98,7 +98,7 @@ class Lesson:
         questions: How many are allowed.
     """
 
-    def __init__(self, learner: Questioner, teacher: Teacher, questions: int) -> None:
+    def __init__(self, learner: QueryingAgent, teacher: LabelOracle, questions: int) -> None:
         self._learner, self._teacher, self._left = learner, teacher, questions
         self.asked = 0
 
@@ -109,5 +109,5 @@ class Lesson:
             if actions is None:
                 return
             macrostate = tuple(int(value) for value in info["macrostate"])
-            self._learner.learn_answer(observation, actions, self._teacher.answer(macrostate, actions))
+            self._learner.learn_label(observation, actions, self._teacher.answer(macrostate, actions))
             self._left, self.asked = self._left - 1, self.asked + 1

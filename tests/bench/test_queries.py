@@ -17,9 +17,9 @@ from test_runner import final_arrays, small
 from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.protocol import Protocol, protocol
+from imagine_bench.bench.queries import LabelOracle
 from imagine_bench.bench.runs import RunSpec
-from imagine_bench.bench.teaching import Teacher
-from imagine_bench.capabilities import Answer, Questioner, Transferable
+from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
@@ -27,7 +27,7 @@ from imagine_bench.registry import AgentEntry
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
 from imagine_bench.store.run_folder import read_arrays
-from imagine_bench.task_types import kind_of
+from imagine_bench.task_types import task_type
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -54,7 +54,7 @@ class Pupil(TableAgent):
         self.shown.append((episode, transition))
         super().observe(transition, episode=episode)
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         self.carried.append(len({episode for episode, _ in self.shown}))
         self.shown.clear()
 
@@ -62,7 +62,7 @@ class Pupil(TableAgent):
         self.seen.append(observation)
         return self.asking.integers(self.n_actions, size=3)
 
-    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
         self.answers.append((actions, answer))
 
     def state(self) -> AgentState:
@@ -131,7 +131,7 @@ def test_demonstrations_are_shortest_plans(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("task", registry.TASKS)
 def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
     rules = registry.task(task).rules
-    teacher, answered, refused = Teacher(rules), 0, 0
+    teacher, answered, refused = LabelOracle(rules), 0, 0
     for state in rules.states:
         for first in range(rules.n_actions):
             single = {(each.reward, each.terminated) for each in rules.outcomes(state, first)}
@@ -151,7 +151,7 @@ def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
 
 
 def test_a_question_is_about_its_last_action_and_goes_through_ends() -> None:
-    teacher = Teacher(ArrowPuzzleRules())
+    teacher = LabelOracle(ArrowPuzzleRules())
     assert teacher.answer((3, 1, 2, 0), np.array([0])) == Answer(50.0, True)
     assert teacher.answer((3, 1, 2, 0), np.array([0, 1])) == Answer(-1.0, False), "there and back through a goal"
     for actions in ([], [6], [0, -1]):
@@ -204,12 +204,12 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
 
 
 def test_who_can_carry_over_or_ask_is_known() -> None:
-    for agent, carries, asks in (("imagine", True, True), ("imagination", True, False), ("dqn", False, False)):
+    for agent, carries, asks in (("factored", True, True), ("imagination", True, False), ("dqn", False, False)):
         kind = registry.agent_entry(agent).encoder_kind
         encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
         spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=encoder)
         made = registry.make_agent(agent, spec.context())
-        assert (isinstance(made, Transferable), isinstance(made, Questioner)) == (carries, asks)
+        assert (isinstance(made, TransferLearner), isinstance(made, QueryingAgent)) == (carries, asks)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*/protocol.json")), ids=lambda path: path.parent.name)
 def test_kept_protocols_keep_their_hash(path: Path) -> None:
     kept = json.loads(path.read_text())
-    assert registry.load(kind_of(kept["task"]).protocol).from_dict(kept).as_dict() == kept
+    assert registry.load(task_type(kept["task"]).protocol).from_dict(kept).as_dict() == kept
 
 
 def test_younger_fields_are_in_a_protocol_only_where_they_say_something() -> None:
@@ -261,7 +261,7 @@ class _KilledError(Exception):
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
-        ("imagine", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "questions": 2}),
+        ("factored", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "questions": 2}),
         ("imagination", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2}),
     ],
 )
