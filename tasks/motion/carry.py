@@ -12,7 +12,7 @@ import numpy as np
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import THINGS, Thing, standing_m
-from . import orientation as attitude
+from . import orientation
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, UnreachableTargetError
@@ -156,8 +156,8 @@ class CarryExecutor:
         w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
         return _Pose(
             position_m=data.qpos[start : start + 3].copy(),
-            yaw_rad=attitude.yaw_rad(w, x, y, z),
-            tilt_rad=attitude.tilt_rad(x, y),
+            yaw_rad=orientation.yaw_rad(w, x, y, z),
+            tilt_rad=orientation.tilt_rad(x, y),
         )
 
     def _solve(self, place_m: Floats, yaw_rad: float, warm_start: _Reach | None) -> _Reach:

@@ -11,7 +11,7 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 
 from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
-from . import orientation as attitude
+from . import orientation
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, UnreachableTargetError
@@ -134,8 +134,8 @@ class TurnExecutor:
         w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
         return _Stand(
             xy_m=data.qpos[start : start + 2].copy(),
-            yaw_rad=attitude.yaw_rad(w, x, y, z),
-            tilt_rad=attitude.tilt_rad(x, y),
+            yaw_rad=orientation.yaw_rad(w, x, y, z),
+            tilt_rad=orientation.tilt_rad(x, y),
         )
 
     def _solve(self, place_xy_m: Floats, warm_start: _Grip | None) -> _Grip:

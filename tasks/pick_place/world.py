@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..macro_env import Reading
-from ..motion import orientation as attitude
+from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult, at_rest
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance, Looks
@@ -35,7 +35,7 @@ MAX_OFF_GRIP_M = 0.015
 """An object further from the tool centre point is not held."""
 MAX_LIFT_OFF_M = 0.006
 """An object on the table or in the palm whose origin is higher or lower by so much lies on something else."""
-MAX_BYSTANDER_SHIFT_M = 0.005
+MAX_OTHER_SHIFT_M = 0.005
 _IN_THE_AIR_M = 0.15
 """What is held at the observation pose is at least so far above the table."""
 _HANDS_FORWARD_X_M = 0.90
@@ -185,7 +185,7 @@ class PickWorld:
             self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
             self._update()
         moving = {index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])}
-        return replace(result, fault=result.fault or self._bystander_problem(moving, poses))
+        return replace(result, fault=result.fault or self._pushed(moving, poses))
 
     def _act(
         self, executor: CarryExecutor, action: int, objects: tuple[int, ...], capture_motion_hz: float
@@ -236,10 +236,10 @@ class PickWorld:
             return WITHDRAWN
         return min(range(N_OBJECTS), key=lambda index: abs(standing_m(index)[1] - fingertip_y_m))
 
-    def _bystander_problem(self, moving: set[int], before: Floats) -> str | None:
+    def _pushed(self, moving: set[int], before: Floats) -> str | None:
         shift_m = np.linalg.norm(self._poses()[:, :3] - before[:, :3], axis=1)
         for index in set(range(N_OBJECTS)) - moving:
-            if shift_m[index] > MAX_BYSTANDER_SHIFT_M:
+            if shift_m[index] > MAX_OTHER_SHIFT_M:
                 return f"the {THINGS[index].name} was pushed {1e3 * shift_m[index]:.0f} mm by the way"
         return None
 
@@ -264,10 +264,10 @@ def _place_of(index: int, pose: list[float], tcp_m: list[float], palm_m: list[fl
 
 
 def _lean(name: str, pose: list[float]) -> str | None:
-    tipped_rad = attitude.tilt_rad(*pose[4:6])
+    tipped_rad = orientation.tilt_rad(*pose[4:6])
     return f"the {name} is tipped by {math.degrees(tipped_rad):.0f} degrees" if tipped_rad > MAX_TILT_RAD else None
 
 
 def _skew(name: str, pose: list[float]) -> str | None:
-    turned_rad = abs(attitude.yaw_rad(*pose[3:]))
+    turned_rad = abs(orientation.yaw_rad(*pose[3:]))
     return f"the {name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None

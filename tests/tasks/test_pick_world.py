@@ -321,7 +321,7 @@ def check_fidelity(actions):
     found = measure_fidelity(SPEC, SPEC.targets, actions)
     assert found.actions == actions
     assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
-    assert found.bystander_mm < SPEC.targets.bystander_mm
+    assert found.other_objects_mm < SPEC.targets.other_objects_mm
     assert np.percentile(found.error_mm, 99) < SPEC.targets.error_mm
     assert len(found.error_mm) > actions / 10
 
