@@ -137,7 +137,7 @@ def test_each_offence_would_be_seen(room: str, line: str, offence: str) -> None:
     ("room", "line"),
     [
         ("agents", "import torch\nx = torch.randn(3, generator=g)\nfrom .layers import MLP"),
-        ("tasks", "import mujoco\nfrom imagine_bench.rules import facts\nfrom ..studio import frames_of"),
+        ("tasks", "import mujoco\nfrom imagine_bench.rules import facts\nfrom ..frames import frames_of"),
         ("imagine_bench", "from imagine_bench import registry\nrng = np.random.default_rng(7)"),
     ],
 )

@@ -29,5 +29,5 @@ def _compiled() -> mujoco.MjModel:
 
 
 def compile_arrow_scene() -> mujoco.MjModel:
-    """A model of the scene of one's own: appearance may write its colours, lights and cameras."""
+    """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
     return copy.copy(_compiled())

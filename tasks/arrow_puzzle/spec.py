@@ -58,9 +58,9 @@ def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.
 def _described(goal: Goal) -> str:
     alone = "" if goal.absent is None else f" with no arrow {_DIRECTIONS[goal.absent]},"
     return (
-        "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a time. "
-        f"The arrow of the cube pointed at must come to point {_DIRECTIONS[goal.pointed]},{alone} and no two arrows may "
-        "ever point the same way."
+        "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a "
+        f"time. The arrow of the cube pointed at must come to point {_DIRECTIONS[goal.pointed]},{alone} and no two "
+        "arrows may ever point the same way."
     )
 
 

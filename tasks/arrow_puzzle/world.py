@@ -15,7 +15,7 @@ from ..macro_env import Reading
 from ..motion import orientation
 from ..motion.executor import MacroResult, at_rest
 from ..scenes import constants as c
-from ..scenes.appearance import Appearance, Looks
+from ..scenes.appearance import Appearance, AppearanceSampler
 from .rules import N_CUBES, TURNS
 from .scene import compile_arrow_scene
 
@@ -47,7 +47,7 @@ class ArrowWorld:
         self.model = compile_arrow_scene()
         self.data = mujoco.MjData(self.model)
         self._level = level
-        self._looks = Looks(self.model, level, camera=c.AGENT_CAMERA, materials=_MATERIALS)
+        self._appearance = AppearanceSampler(self.model, level, camera=c.AGENT_CAMERA, materials=_MATERIALS)
         starts = [int(self.model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(N_CUBES)]
         self._cube_qpos = (np.array(starts)[:, None] + np.arange(7)).ravel()
         self._hand = int(self.model.body("hand").mocapid[0])
@@ -77,10 +77,10 @@ class ArrowWorld:
         self._update()
 
     def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's light, colours, camera and hand as the appearance says."""
+        """Draw this frame's light, colors, camera and hand as the appearance says."""
         if not self._level.varies_every_frame:
             return
-        self._looks.vary(rng)
+        self._appearance.vary(rng)
         *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
         self._point([self._level.hand_offset_m * each for each in wobble], self._level.hand_yaw_rad * turn)
         self._update()

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from ..scenes.objects import THINGS, Thing, standing_m
+from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
 from . import orientation
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
@@ -65,24 +65,24 @@ class CarryExecutor:
         self.executor = MacroExecutor(model)
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
-        self._qpos = [int(model.joint(f"{thing.name}_joint").qposadr[0]) for thing in THINGS]
+        self._qpos = [int(model.joint(f"{spec.name}_joint").qposadr[0]) for spec in OBJECTS]
         self._rest_tcp_m, _ = self._arm.tcp_in_base(np.array(OBSERVATION_QPOS_RAD))
         self._tcp_site = model.site(TCP_SITE).id
-        self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(THINGS))]
+        self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(OBJECTS))]
 
     def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Lift object ``index`` from where it stands and bring it to the observation pose."""
-        thing, pose = THINGS[index], self._measure(data, index)
-        if thing.upright and pose.tilt_rad > _MAX_TILT_RAD:
-            return self._refuse(data, None, f"the {thing.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
-        yaw_rad = _nearest_to_zero(pose.yaw_rad) if thing.upright else 0.0
+        spec, pose = OBJECTS[index], self._measure(data, index)
+        if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
+            return self._refuse(data, None, f"the {spec.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
+        yaw_rad = _nearest_to_zero(pose.yaw_rad) if spec.upright else 0.0
         try:
             reach = self._solve(pose.position_m, yaw_rad, self._slots[index])
         except UnreachableTargetError as error:
-            return self._refuse(data, None, f"the {thing.name} is out of reach: {error}")
-        grip_m = thing.squeeze_m
+            return self._refuse(data, None, f"the {spec.name} is out of reach: {error}")
+        grip_m = spec.squeeze_m
         result, qpos = self._run(data, _waypoints(reach, REST_OPENING_M, grip_m), reach, None, capture_motion_hz)
-        return self._with_fault(result, qpos, self._missed(thing, qpos[-1]))
+        return self._with_fault(result, qpos, self._missed(spec, qpos[-1]))
 
     def place(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Put the held object ``index`` back on its nominal place, the right way round."""
@@ -92,14 +92,14 @@ class CarryExecutor:
         self, data: mujoco.MjData, *, index: int, palm_m: Floats, capture_motion_hz: float = 0.0
     ) -> MacroResult:
         """Lay the held object ``index`` into the palm whose middle is at ``palm_m``. Shape (3,)."""
-        target_m = palm_m + _up(THINGS[index].grip_height_m + _PALM_DROP_M)
+        target_m = palm_m + _up(OBJECTS[index].grip_height_m + _PALM_DROP_M)
         return self._put(data, index, target_m, None, capture_motion_hz)
 
     def visit(
         self, data: mujoco.MjData, *, place_m: Floats, held: int | None, capture_motion_hz: float = 0.0
     ) -> MacroResult:
         """Reach out to above ``place_m`` (3,) and come back, holding object ``held`` or nothing."""
-        grip_m = None if held is None else THINGS[held].squeeze_m
+        grip_m = None if held is None else OBJECTS[held].squeeze_m
         try:
             reach = self._solve(place_m, 0.0, self._slots[1])
         except UnreachableTargetError as error:
@@ -110,7 +110,7 @@ class CarryExecutor:
             *_home(opening_m),
         ]
         result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
-        return self._with_fault(result, qpos, None if held is None else self._missed(THINGS[held], qpos[-1]))
+        return self._with_fault(result, qpos, None if held is None else self._missed(OBJECTS[held], qpos[-1]))
 
     def rest(self, data: mujoco.MjData, held: int | None) -> None:
         """Bring ``data`` to the canonical start; object ``held`` goes with the gripper where the arm is corrected."""
@@ -118,7 +118,7 @@ class CarryExecutor:
             self.executor.rest(data)
             return
         before_m, before_quat = self._tcp(data)
-        self.executor.rest(data, squeeze_m=THINGS[held].squeeze_m)
+        self.executor.rest(data, squeeze_m=OBJECTS[held].squeeze_m)
         after_m, after_quat = self._tcp(data)
         row = self._qpos[held]
         turn, inverse = np.empty(4), np.empty(4)
@@ -135,18 +135,18 @@ class CarryExecutor:
         self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
     ) -> MacroResult:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
-        thing, pose = THINGS[index], self._measure(data, index)
+        spec, pose = OBJECTS[index], self._measure(data, index)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
-        turn_rad = 0.0 if yaw_rad is None or not thing.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
+        turn_rad = 0.0 if yaw_rad is None or not spec.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         held_m = pose.position_m - self._rest_tcp_m
         turned_m = np.array([cos * held_m[0] - sin * held_m[1], sin * held_m[0] + cos * held_m[1], held_m[2]])
         try:
             reach = self._solve(target_m - turned_m, turn_rad, self._slots[index])
         except UnreachableTargetError as error:
-            return self._refuse(data, index, f"the {thing.name} cannot be put there: {error}")
+            return self._refuse(data, index, f"the {spec.name} cannot be put there: {error}")
         result, qpos = self._run(
-            data, _waypoints(reach, thing.squeeze_m, REST_OPENING_M), reach, index, capture_motion_hz
+            data, _waypoints(reach, spec.squeeze_m, REST_OPENING_M), reach, index, capture_motion_hz
         )
         return self._with_fault(result, qpos, None)
 
@@ -181,7 +181,7 @@ class CarryExecutor:
         capture_motion_hz: float,
     ) -> tuple[MacroResult, Floats]:
         """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
-        grip_m = None if held is None else THINGS[held].squeeze_m
+        grip_m = None if held is None else OBJECTS[held].squeeze_m
         trajectory = plan(
             self._arm,
             start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
@@ -201,10 +201,10 @@ class CarryExecutor:
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
         return replace(result, fault=lost or astray)
 
-    def _missed(self, thing: Thing, qpos: Floats) -> str | None:
+    def _missed(self, spec: ObjectSpec, qpos: Floats) -> str | None:
         """Whether the fingers closed past what they should hold, in positions of the scene (nq,)."""
-        closed = self.executor.opening_m(qpos).max() < thing.grip_opening_m - _LOST_M
-        return f"the fingers closed and do not hold the {thing.name}" if closed else None
+        closed = self.executor.opening_m(qpos).max() < spec.grip_opening_m - _LOST_M
+        return f"the fingers closed and do not hold the {spec.name}" if closed else None
 
     def _refuse(self, data: mujoco.MjData, held: int | None, reason: str) -> MacroResult:
         """The arm stays where it is."""

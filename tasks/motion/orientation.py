@@ -1,4 +1,4 @@
-"""How a thing is turned and tipped, read from its unit quaternion (w, x, y, z) in the world frame."""
+"""How an object is turned and tipped, read from its unit quaternion (w, x, y, z) in the world frame."""
 
 from __future__ import annotations
 

@@ -63,5 +63,5 @@ def _compiled() -> mujoco.MjModel:
 
 
 def compile_pick_scene() -> mujoco.MjModel:
-    """A model of the scene of one's own: appearance may write its colours, lights and cameras."""
+    """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
     return copy.copy(_compiled())

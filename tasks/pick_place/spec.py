@@ -26,7 +26,7 @@ _PLACES = ("left", "middle", "right")
 
 
 def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode; see :func:`.studio.frames_of`."""
+    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
     from ..frames import frames_of  # noqa: PLC0415
     from .world import PickWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
 

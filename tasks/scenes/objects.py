@@ -1,6 +1,6 @@
 """Three things to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
 
-Every body's origin is the middle of its grip. What is drawn is one mesh a colour; what touches is a few primitives, and
+Every body's origin is the middle of its grip. What is drawn is one mesh a color; what touches is a few primitives, and
 feet or wheels are spheres, which stand quietly on a table and in a palm.
 """
 
@@ -29,7 +29,7 @@ _MASS_KG, _SQUEEZE_M = 0.10, 0.004
 
 
 @dataclass(frozen=True, kw_only=True)
-class Thing:
+class ObjectSpec:
     """One object as planning and reading see it.
 
     Attributes:
@@ -55,10 +55,12 @@ def _round_opening_m(radius_m: float) -> float:
     return math.sqrt((radius_m + TIP_RADIUS_M) ** 2 - TIP_OFFSET_M**2) - TIP_RADIUS_M
 
 
-BALL = Thing(name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False)
-CAR = Thing(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
-CUP = Thing(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
-THINGS = (BALL, CAR, CUP)
+BALL = ObjectSpec(
+    name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False
+)
+CAR = ObjectSpec(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
+CUP = ObjectSpec(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
+OBJECTS = (BALL, CAR, CUP)
 """Left to right in the agent's frame."""
 
 _RGBA = {
@@ -75,7 +77,7 @@ _TOUCH = {"group": c.COLLISION_GROUP, "friction": (0.8, 0.005, 0.0001), "condim"
 
 def standing_m(index: int) -> tuple[float, float, float]:
     """Nominal position of object ``index`` on the table."""
-    return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + THINGS[index].grip_height_m)
+    return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + OBJECTS[index].grip_height_m)
 
 
 def _car_body() -> Mesh:
@@ -118,7 +120,7 @@ def add_objects(spec: mujoco.MjSpec) -> None:
     """Add bodies ``ball``, ``car`` and ``cup`` on their places, with free joints ``<name>_joint``."""
     for name, rgba in _RGBA.items():
         spec.add_material(name=name, rgba=rgba, specular=0.2, shininess=0.3)
-    ball, car, cup = (_body(spec, index) for index in range(len(THINGS)))
+    ball, car, cup = (_body(spec, index) for index in range(len(OBJECTS)))
     kind = mujoco.mjtGeom
     ball.add_geom(
         name="ball_skin", type=kind.mjGEOM_SPHERE, size=(_BALL_RADIUS_M, 0, 0), mass=_MASS_KG, material="ball",
@@ -142,8 +144,8 @@ def add_objects(spec: mujoco.MjSpec) -> None:
 
 
 def _body(spec: mujoco.MjSpec, index: int) -> mujoco.MjsBody:
-    body = spec.worldbody.add_body(name=THINGS[index].name, pos=standing_m(index))
-    body.add_freejoint(name=f"{THINGS[index].name}_joint")
+    body = spec.worldbody.add_body(name=OBJECTS[index].name, pos=standing_m(index))
+    body.add_freejoint(name=f"{OBJECTS[index].name}_joint")
     return body
 
 

@@ -16,7 +16,7 @@ from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
-from imagine_bench.tasks.scenes.objects import THINGS, standing_m
+from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.tools.fidelity import measure_fidelity
@@ -59,7 +59,7 @@ def test_objects_stand_still_on_the_table(world):
         frozenset(world.model.geom(int(geom)).name.split("_")[0] for geom in contact.geom)
         for contact in world.data.contact[: world.data.ncon]
     }
-    assert touching == {frozenset(("table", thing.name)) for thing in THINGS}
+    assert touching == {frozenset(("table", spec.name)) for spec in OBJECTS}
     for _ in range(300):
         mujoco.mj_step(world.model, world.data)
     assert np.abs(world._poses()[:, :3] - before[:, :3]).max() < 5e-4
@@ -154,7 +154,7 @@ def test_gripper_and_object_pass_the_pointing_hand(world, index):
     people = world.data.mocap_pos.copy()
     motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
     model, hand = world.model, world.model.geom("hand_skin").id
-    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", THINGS[index].name))]
+    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", OBJECTS[index].name))]
     closest_m, data = 1.0, mujoco.MjData(model)
     data.mocap_pos[:] = people
     for qpos in motion:
@@ -182,7 +182,7 @@ def test_only_friction_lifts(spoil, index):
     spoil(world.model)
     world.place((0, 0, 0, index), rng())
     result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate, 0.0)
-    assert result.fault == f"the fingers closed and do not hold the {THINGS[index].name}"
+    assert result.fault == f"the fingers closed and do not hold the {OBJECTS[index].name}"
     assert world.read().macrostate[index] == 0
     assert world.read().macrostate[3] == WITHDRAWN
 
@@ -282,13 +282,13 @@ def test_a_macro_action_is_a_pure_function_of_positions_and_arguments(state, act
 
 
 def test_the_handed_over_object_rests_in_the_palm(world):
-    for index, thing in enumerate(THINGS):
+    for index, spec in enumerate(OBJECTS):
         state = tuple(1 if each == index else 0 for each in range(3))
         world.place((*state, OPEN_PALM), rng())
         world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM), 0.0)
         before = world._poses()[index, :3]
         assert math.dist(before[:2], PALM_M[:2]) < 0.015
-        assert before[2] - PALM_M[2] == pytest.approx(thing.grip_height_m, abs=2e-3)
+        assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)
         for _ in range(300):
             mujoco.mj_step(world.model, world.data)
         assert np.abs(world._poses()[index, :3] - before).max() < 2e-3
@@ -372,10 +372,10 @@ def test_every_macrostate_looks_different():
 def test_the_arm_is_out_of_the_agent_s_frame_while_it_holds_something(world):
     world.place((0, 1, 0, 0), rng())
     views = [View(camera=c.AGENT_CAMERA, groups=groups) for groups in ((0,), (0, 2))]
-    eyes = [Renderer(world.model, view) for view in views]
-    hidden, shown = (eye.frame(world.data) for eye in eyes)
-    for eye in eyes:
-        eye.close()
+    cameras = [Renderer(world.model, view) for view in views]
+    hidden, shown = (camera.frame(world.data) for camera in cameras)
+    for camera in cameras:
+        camera.close()
     assert np.array_equal(hidden[:40], shown[:40])  # only the fingers beside what they hold would be seen
 
 
