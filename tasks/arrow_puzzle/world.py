@@ -69,9 +69,8 @@ class ArrowWorld:
         for (x_m, y_m), direction, (right, up, turn) in zip(
             c.SLOTS_XY_M, macrostate, rng.uniform(-1.0, 1.0, (N_CUBES, 3)).tolist(), strict=False
         ):
-            half_yaw_rad = (-_QUARTER_RAD * direction + offset_rad * turn) / 2
             poses += (x_m + offset_m * right, y_m + offset_m * up, c.CUBE_REST_Z_M)
-            poses += (math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad))
+            poses += orientation.about_vertical(-_QUARTER_RAD * direction + offset_rad * turn)
         self.data.qpos[self._cube_qpos] = poses
         self._point()
         self._update()
@@ -92,7 +91,7 @@ class ArrowWorld:
         self.data.mocap_pos[self._hand] = (
             slot_x_m + tip_x_m + dx_m, slot_y_m + tip_y_m + dy_m, c.CUBE_REST_Z_M + tip_z_m + dz_m,
         )  # fmt: skip
-        self.data.mocap_quat[self._hand] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+        self.data.mocap_quat[self._hand] = orientation.about_vertical(yaw_rad)
 
     def _update(self) -> None:
         """Bring geoms, cameras and lights up to date with positions."""
@@ -104,10 +103,8 @@ class ArrowWorld:
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
         cube = TURNS[action].cube
-        yaw_rad = -_QUARTER_RAD * intended[cube]
-        self.data.qpos[self._cube_qpos[7 * cube : 7 * cube + 7]] = (
-            *c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M, math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2),
-        )  # fmt: skip
+        quat = orientation.about_vertical(-_QUARTER_RAD * intended[cube])
+        self.data.qpos[self._cube_qpos[7 * cube : 7 * cube + 7]] = (*c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M, *quat)
         self._update()
 
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:

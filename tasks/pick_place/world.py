@@ -110,12 +110,12 @@ class PickWorld:
             self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
             base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
-        half_yaw_rad = level.object_yaw_rad * turn * share_x / 2
         self.data.qpos[self._object_qpos[index]] = (
             base_m[0] + share_x * level.object_offset_m * across,
             base_m[1] + share_y * level.object_offset_m * along,
-            base_m[2], math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad),
-        )  # fmt: skip
+            base_m[2],
+            *orientation.about_vertical(level.object_yaw_rad * turn * share_x),
+        )
 
     def _fingers(self, opening_m: float, command_m: float) -> None:
         self.data.qpos[self._finger_qpos] = opening_m
@@ -143,7 +143,7 @@ class PickWorld:
             poses[self._hand] = fingertip_m(gesture)
         for mocap, (x_m, y_m, z_m) in poses.items():
             self.data.mocap_pos[mocap] = (x_m + offset_m[0], y_m + offset_m[1], z_m + offset_m[2])
-            self.data.mocap_quat[mocap] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+            self.data.mocap_quat[mocap] = orientation.about_vertical(yaw_rad)
 
     def _update(self) -> None:
         """Bring geoms, sites, cameras and lights up to date with positions."""
