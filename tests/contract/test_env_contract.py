@@ -119,7 +119,7 @@ def test_the_horizon_truncates_and_does_not_terminate(task):
 
 
 @pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_names", "macrostate_values"])
-def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, monkeypatch):
+def test_a_task_unlike_its_registry_line_or_its_rules_is_named(field, monkeypatch):
     spec = registry.task("arrow_puzzle")
     wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
     changed = dataclasses.replace(spec, **{field: wrong})
@@ -131,7 +131,7 @@ def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, 
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_macrostate_can_be_the_start_and_the_rules_go_on_from_it(task):
+def test_every_macrostate_can_be_the_start_of_an_episode(task):
     spec, env = registry.task(task), make(task, **KINEMATIC).unwrapped
     generator = np.random.default_rng(0)
     for state in spec.rules.states:
@@ -212,7 +212,7 @@ def test_rendering_draws_no_random_number():
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
-def test_a_cube_that_does_not_follow_is_a_fault_and_rewards_come_from_what_was_read():
+def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
     env = make().unwrapped
     model = env._world.model
@@ -298,7 +298,7 @@ def test_reset_options_that_are_no_mapping_are_refused(kinematic, options):
         kinematic.reset(options=options)
 
 
-def test_where_not_every_combination_is_a_macrostate_the_list_is_named():
+def test_the_error_names_the_list_of_possible_macrostates():
     env = gymnasium.make("imagine_bench/PickPlace-v0", **KINEMATIC)
     with pytest.raises(InvalidValueError, match=r"one of the 19 of .*task\('pick_place'\)\.rules\.states, such as"):
         env.reset(options={"macrostate": (0, 1, 2, 0)})

@@ -52,7 +52,7 @@ def test_frames_are_new_upright_contiguous_arrays(world):
     camera.close()
 
 
-def test_closing_one_renderer_leaves_the_others_frames_as_they_were(world):
+def test_closing_one_renderer_leaves_the_others_frames_alone(world):
     first, second = agent_camera(world.model), agent_camera(world.model)
     image = Renderer(world.model, View(camera="human", width=96, height=72))
     before, whole = second.frame(world.data), image.frame(world.data)
@@ -124,7 +124,7 @@ def test_a_renderer_inherited_through_a_fork_draws_in_the_child(world):
     camera.close()
 
 
-def test_drawing_leaves_the_model_as_it_was_and_shows_its_changes(world):
+def test_drawing_shows_a_model_s_changes_and_makes_none(world):
     def quality():
         vis = world.model.vis
         return vis.quality.shadowsize, vis.quality.offsamples, vis.quality.numslices, vis.global_.offwidth

@@ -129,7 +129,7 @@ def test_only_the_fingertips_touch(model):
     assert set(model.geom_group) == {ARM_GROUP}
 
 
-def test_wrist_camera_sees_the_human_above_and_right_at_the_right(model):
+def test_wrist_camera_sees_the_human_above_and_right_as_right(model):
     data = mujoco.MjData(model)
     data.qpos[:7] = OBSERVATION_QPOS_RAD
     mujoco.mj_forward(model, data)

@@ -132,7 +132,7 @@ def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, p
 
 
 @pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION)
-def test_every_motion_does_what_the_rules_say_within_the_robot_s_limits(world, state, action, intended):
+def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action, intended):
     assert intended in [outcome.macrostate for outcome in RULES.outcomes(state, action)]
     world.place(state, rng())
     before = world._poses()
@@ -212,7 +212,7 @@ def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
     assert info["macrostate"][3] == WITHDRAWN
 
 
-def test_a_pushed_bystander_is_a_fault(world, monkeypatch):
+def test_pushing_another_object_is_a_fault(world, monkeypatch):
     world.place((0, 0, 0, 0), rng())
     world.execute(0, (1, 0, 0, 1), 0.0)
     place = world._executor.place
@@ -263,7 +263,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
 
 
 @pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:8:2])
-def test_a_macro_action_is_a_pure_function_of_positions_and_arguments(state, action, intended):
+def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
     """In another world, after other actions and with velocities left over: the same bits, an object held included."""
     one, other = PickWorld(FIXED), PickWorld(FIXED)
     one.place(state, rng())
@@ -295,7 +295,7 @@ def test_the_handed_over_object_rests_in_the_palm(world):
 
 
 @pytest.mark.parametrize("seed", [83393, 3046])
-def test_the_palm_stays_where_it_varied_to_under_what_was_laid_into_it(seed: int) -> None:
+def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
     env = gymnasium.make("imagine_bench/PickPlace-v0", appearance="strong")
     env.reset(seed=seed, options={"macrostate": (0, 1, 0, OPEN_PALM)})
@@ -369,7 +369,7 @@ def test_every_macrostate_looks_different():
             assert (np.abs(frames[one] - frames[other]).max(axis=-1) > 40).sum() > 40
 
 
-def test_the_arm_is_out_of_the_agent_s_frame_while_it_holds_something(world):
+def test_an_arm_that_holds_something_is_out_of_the_agent_s_frame(world):
     world.place((0, 1, 0, 0), rng())
     views = [View(camera=c.AGENT_CAMERA, groups=groups) for groups in ((0,), (0, 2))]
     cameras = [Renderer(world.model, view) for view in views]
@@ -382,7 +382,7 @@ def test_the_arm_is_out_of_the_agent_s_frame_while_it_holds_something(world):
 # --- recordings --------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_shows_the_human_answer_when_the_motion_is_over():
+def test_a_recording_shows_the_human_s_answer_after_the_motion():
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.capture_motion_hz = 20.0
     env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})

@@ -102,7 +102,7 @@ def _shortest_by_search(rules, start):
 
 
 @ALL
-def test_plan_lengths_agree_with_breadth_first_search_and_the_optimal_actions_follow_them(rules):
+def test_optimal_plans_are_as_short_as_breadth_first_search_says(rules):
     lengths = Counter()
     for start in rules.start_states:
         shortest = _shortest_by_search(rules, start)

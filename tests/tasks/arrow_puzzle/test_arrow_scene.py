@@ -218,7 +218,7 @@ def _skin(frame):
     return (red - blue > 45) & (red - green > 20)
 
 
-def test_the_hand_is_at_the_top_and_its_finger_in_the_strip_of_its_cube(world, camera):
+def test_the_hand_is_at_the_top_its_finger_in_its_cube_s_strip(world, camera):
     for pointed in range(3):
         world.place((0, 1, 2, pointed), rng())
         rows, columns = np.nonzero(_skin(camera.frame(world.data)))
@@ -242,7 +242,7 @@ def test_levels_are_ordered_and_named():
         appearance("mid")
 
 
-def test_clean_frames_differ_by_cubes_only_and_other_levels_by_more(camera):
+def test_clean_frames_differ_by_cubes_alone_other_levels_by_more(camera):
     changed = {}
     for level in LEVELS:
         world, generator = ArrowWorld(appearance(level)), rng()
