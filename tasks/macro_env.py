@@ -62,7 +62,7 @@ class World(Protocol):
         """Start anew from ``macrostate``; nothing of the time before remains."""
 
     def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's looks."""
+        """Draw this frame's appearance."""
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: put the scene where a perfect ``action`` leads."""

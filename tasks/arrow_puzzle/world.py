@@ -36,7 +36,7 @@ class ArrowWorld:
     """One scene of the arrow puzzle.
 
     Args:
-        level: How much the looks vary.
+        level: How much the appearance varies.
 
     Attributes:
         model: Compiled scene, this world's own.

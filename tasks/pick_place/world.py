@@ -50,7 +50,7 @@ class PickWorld:
     """One scene of pick-and-place.
 
     Args:
-        level: How much the looks vary.
+        level: How much the appearance varies.
 
     Attributes:
         model: Compiled scene, this world's own.

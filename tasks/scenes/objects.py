@@ -1,4 +1,4 @@
-"""Three things to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
+"""Three objects to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
 
 Every body's origin is the middle of its grip. What is drawn is one mesh a color; what touches is a few primitives, and
 feet or wheels are spheres, which stand quietly on a table and in a palm.
