@@ -217,7 +217,7 @@ def test_acting_greedily_is_constant_and_changes_nothing(exploration: str) -> No
     assert same(before, learner.state())
 
 
-@pytest.mark.parametrize("imagine", [True, False])
+@pytest.mark.parametrize("factored", [True, False])
 def test_a_resumed_agent_equals_an_uninterrupted_one_to_the_bit(factored: bool) -> None:
     learner, resumed = agent(dynamics__factored=factored), agent(99, dynamics__factored=factored)
     first, second = np.random.default_rng(0), np.random.default_rng(0)
@@ -278,7 +278,7 @@ def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothi
         learner.imagine(frame((0, 1, 0)), actions=np.array([9]), depth=1, rng=np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("imagine", [True, False])
+@pytest.mark.parametrize("factored", [True, False])
 def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored: bool) -> None:
     learner = agent(dynamics__factored=factored)
     assert isinstance(learner, ReplayReader)
