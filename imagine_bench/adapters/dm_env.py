@@ -88,7 +88,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._env, self._seed, self._motion_hz = env, seed, motion_hz
         scene: Any = env.unwrapped
         self._scene: Any = scene if hasattr(scene, "replay") else None
-        if motion_hz < 0 or (motion_hz > 0 and self._scene is None):
+        if not motion_hz >= 0 or (motion_hz > 0 and self._scene is None):
             raise InvalidValueError(f"No motion at {motion_hz} Hz; give 0, or more for a task of imagine_bench.")
         if motion_hz > 0:
             scene.capture_motion_hz = motion_hz

@@ -69,15 +69,23 @@ def test_equals_gymnasium_step_for_step(task, execution):
     theirs.close()
 
 
+class _From(gymnasium.Wrapper):
+    """Every episode starts in one macrostate."""
+
+    def __init__(self, env, macrostate):
+        super().__init__(env)
+        self._options = {"macrostate": macrostate}
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options=self._options)
+
+
 def test_truncation_keeps_the_discount_of_1():
     rules = registry.task("arrow_puzzle").rules
-    start = next(
-        state for state in rules.start_states if not rules.is_terminal(rules.turned(state, 0))
-    )  # turned back and forth, it ends by the time limit alone
-    env = as_dm_env(gymnasium.make(ARROWS, execution="kinematic"))
-    with mock.patch.object(env._env.unwrapped, "_start", return_value=start):
-        env.reset()
-    steps = [env.step(number % 2) for number in range(10)]
+    start = next(state for state in rules.start_states if not rules.is_terminal(rules.turned(state, 0)))
+    env = as_dm_env(_From(gymnasium.make(ARROWS, execution="kinematic"), start))
+    env.reset()
+    steps = [env.step(number % 2) for number in range(10)]  # back and forth: the time limit alone ends it
     assert [step.last() for step in steps] == [False] * 9 + [True]
     assert {step.discount for step in steps} == {1.0}
     assert env.step(0).first()
@@ -93,9 +101,9 @@ def test_specs_say_what_is_given():
 
 
 def test_physics_shows_the_scene_and_cannot_change_it():
-    env = as_dm_env(ARROWS, seed=0)
+    task = gymnasium.make(ARROWS)
+    env, scene = as_dm_env(task, seed=0), task.unwrapped
     env.reset()
-    scene = env._env.unwrapped
     for action in (1, 2):
         before_s = env.physics.data.time
         env.step(action)
@@ -155,10 +163,11 @@ def test_viewer_runs_and_the_scene_moves():
 
 
 def test_dm_controls_renderer_lives_beside_ours():
-    env = as_dm_env(ARROWS, seed=0, execution="kinematic")
+    task = gymnasium.make(ARROWS, execution="kinematic")
+    env = as_dm_env(task, seed=0)
     before = env.reset().observation
     assert env.physics.render(64, 64, camera_id="wrist").std() > 10
-    np.testing.assert_array_equal(env._env.unwrapped.agent_view(), before)
+    np.testing.assert_array_equal(task.unwrapped.agent_view(), before)
     env.close()
 
 
@@ -178,6 +187,7 @@ def test_open_renderers_end_quietly():
     ("arguments", "message"),
     [
         ({"env": ARROWS, "motion_hz": -1.0}, "No motion at -1.0 Hz"),
+        ({"env": ARROWS, "motion_hz": float("nan")}, "No motion at nan Hz"),
         ({"env": gymnasium.make("CartPole-v1"), "motion_hz": 10.0}, "No motion at 10.0 Hz"),
         ({"env": gymnasium.make("CartPole-v1"), "render_mode": None}, "give them with an id"),
         ({"env": "Pendulum-v1"}, "No adapter for the spaces"),
