@@ -1,4 +1,4 @@
-"""How much a scene's appearance varies: frozen levels, and writing one sample of them into a model without recompiling."""
+"""How much a scene's appearance varies: frozen levels, and writing one sample into a model without recompiling."""
 
 from __future__ import annotations
 
