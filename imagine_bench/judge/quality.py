@@ -17,14 +17,14 @@ from imagine_bench.judge.generalisation import Probing, answer, probing, summari
 from imagine_bench.judge.plans import make_plans, require_threshold
 from imagine_bench.judge.policy import choices, follow, situations
 from imagine_bench.machine import describe_environment
+from imagine_bench.protocols.task_types import task_type
 from imagine_bench.report.generalisation import Asked, generalisation_table, write_generalisation
 from imagine_bench.report.plans import RECORDING, plan_table, write_plans
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.seeding import SeedTree, evaluation_split
-from imagine_bench.store.bench_folder import load_bench, newest_bench, read_protocol, require_either
+from imagine_bench.store.bench_folder import load_bench, newest_bench, read_control, read_protocol, require_either
 from imagine_bench.store.files import lock, make_folder
 from imagine_bench.store.trained import Trained, best_run, learners, load_trained, require_control, require_runs
-from imagine_bench.task_types import task_type
 
 _STRIPS = 6
 """Plans in the picture, of as many lengths as there are."""
@@ -123,7 +123,7 @@ def generalisation_report(folder: Path | None, *, root: Path, task: str | None, 
 
 
 def _generalise(bench: Path, encoder: str | None) -> str:
-    protocol = read_protocol(bench)
+    protocol = read_control(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
     probe = probing(spec, appearance=protocol.appearance, purpose=evaluation_split(protocol.seeds[0]))
     asked = []
@@ -172,7 +172,7 @@ def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder:
 
 
 def _follow_policies(bench: Path, encoder: str | None) -> str:
-    protocol = read_protocol(bench)
+    protocol = read_control(bench)
     spec, runs = registry.task(protocol.task), learners(bench)
     met = situations(spec, appearance=protocol.appearance, purpose=evaluation_split(protocol.seeds[0]))
     followed = []

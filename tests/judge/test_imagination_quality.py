@@ -7,7 +7,7 @@ import dataclasses
 import bench_fakes
 import numpy as np
 import pytest
-from test_runner import context
+from small_runs import context
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout

@@ -18,12 +18,12 @@ from rerun.chunk import RrdReader
 from test_recording import rerun
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.judge.plans import Plan, carry_out, fewest_actions, make_env, make_plans
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.plans import plan_table, summarise, write_plans
 from imagine_bench.store.checkpoints import load_newest

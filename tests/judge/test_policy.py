@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from test_waves import Inline, bench
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, TaskSpec
 from imagine_bench.judge.plans import fewest_actions
 from imagine_bench.judge.policy import FRAMES, Ends, Situations, choices, follow, optimal_length, situations
 from imagine_bench.judge.quality import generalisation_report
+from imagine_bench.protocols.control import protocol
 from imagine_bench.report.policy import Followed, policy_table, write_policy
 from imagine_bench.rules import greedy
 from imagine_bench.store import encoders
