@@ -6,7 +6,7 @@ from imagine_bench.bench.run_state import Run
 from imagine_bench.bench.runner import AtBudget, AtEnd
 from imagine_bench.capabilities import FutureSampler, Imaginer
 from imagine_bench.judge.futures import imagined_futures
-from imagine_bench.judge.imagination_quality import Question, ask, examples, imagine_sampled_rollouts, open_loop
+from imagine_bench.judge.imagination_quality import OpenLoopStart, ask, examples, imagine_sampled_rollouts, open_loop
 from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
 
@@ -30,7 +30,7 @@ class OpenLoopObserver(_Observer):
     """Compares open-loop imagination with the rules at every budget."""
 
     def __init__(self) -> None:
-        self._questions: tuple[Question, ...] | None = None
+        self._questions: tuple[OpenLoopStart, ...] | None = None
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``open_loop`` of an agent that imagines."""

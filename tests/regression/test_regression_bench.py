@@ -19,7 +19,6 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
-from imagine_bench.judge.quality import generalisation_report
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.protocols.task_types import task_types
 from imagine_bench.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext, runner
@@ -28,6 +27,7 @@ from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
+from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
