@@ -42,11 +42,11 @@ class AgentEntry:
         learns: Whether training changes it; others are only evaluated.
         needs_encoder: Whether it sees what an encoder gives.
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
+        settings: Module of its settings, with ``names()`` and ``resolve(hyperparameters, overrides, group)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
-        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
-        title: For headings, legends and tables; by default the registered name.
-        description: One sentence for a reader of the report.
+        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
+        title: For headings, legends and tables; by default the registered name in plain words.
+        description: One sentence for a reader who knows none of this.
     """
 
     make: str
@@ -85,37 +85,81 @@ TASKS: dict[str, TaskEntry] = {
 }
 
 AGENTS: dict[str, AgentEntry] = {
-    "random": AgentEntry(make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False),
-    "oracle": AgentEntry(
-        make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
+    "random": AgentEntry(
+        make="imagine_bench.agents.baselines:make_random",
+        learns=False,
+        needs_encoder=False,
+        title="random",
+        description="Picks every macro-action by chance: the floor.",
     ),
-    "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
-    "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
-    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
+    "oracle": AgentEntry(
+        make="imagine_bench.agents.baselines:make_oracle",
+        learns=False,
+        needs_encoder=False,
+        privileged=True,
+        title="oracle",
+        description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
+    ),
+    "dqn": AgentEntry(
+        make="imagine_bench.agents.dqn:make",
+        title="DQN",
+        description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
+    ),
+    "imagination": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make",
+        title="imagination",
+        description="DQN that also learns a model of its world and trains on transitions it imagines with it, all of "
+        "them.",
+    ),
+    "imagination_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make_uncertainty",
+        title="imagination + uncertainty",
+        description="The same, but an imagined transition is thrown away, with the rest of its rollout, where the "
+        "model is unsure.",
+    ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings",
+        title="factored",
+        description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
+        "every future within reach, explores what is uncertain while it trains, and plans in its model when it is "
+        "tested.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 DQN (pixels)",
+        description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 QR-DQN (pixels)",
+        description="The same library's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 DQN (latents)",
+        description="The same library's DQN on the latents that the suite's own DQN sees.",
     ),
-    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
-    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.model_only:make_uncertainty"),
+    "imagination_only": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make",
+        title="imagination only",
+        description="Explores like DQN and learns a model of its world on the side; a fresh controller that never "
+        "meets the world is trained in that model alone, and is what is tested.",
+    ),
+    "imagination_only_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make_uncertainty",
+        title="imagination only + uncertainty",
+        description="The same, but an imagined episode ends where the model is unsure.",
+    ),
 }
 
 
@@ -169,6 +213,20 @@ REGRESSORS: dict[str, RegressorEntry] = {
         description="Several networks that began and trained differently; where they disagree, they do not know.",
     ),
 }
+
+
+TASK_TYPES = {
+    "control": "imagine_bench.bench.control:CONTROL",
+    "regression": "imagine_bench.regression.task_type:REGRESSION",
+}
+"""The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
+
+OBSERVERS = tuple(
+    f"imagine_bench.cli.observers:{name}"
+    for name in ("OpenLoopObserver", "FuturesObserver", "ExamplesObserver", "RecordingObserver")
+)
+"""What looks at every control run, in this order, each the ``"module:attr"`` of a
+:class:`.bench.runner.RunObserver` without arguments."""
 
 
 def load(target: str) -> Any:
@@ -246,19 +304,19 @@ def setting_names(agent: str) -> frozenset[str]:
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a protocol's overrides that this agent has settings for; the others are some other agent's."""
+    """Those of a protocol's overrides that this agent has settings for; the others are another agent's."""
     names = setting_names(agent) if overrides else frozenset()
     return {name: value for name, value in overrides.items() if name in names}
 
 
-def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> Any:
+def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
     """An agent's settings, a dataclass, with those of the overrides that it has.
 
     Raises:
-        UnknownNameError: No such preset or family.
+        UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
+    return load(f"{agent_entry(agent).settings}:resolve")(hyperparameters, own_settings(agent, overrides), group)
 
 
 def task(name: str) -> TaskSpec:
@@ -293,7 +351,7 @@ def _numbers_of_values(rules: Rules) -> tuple[int, ...]:
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:
-    """A new agent of a registered kind."""
+    """A new agent by its registered name."""
     make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
     return make(context)
 
@@ -318,6 +376,6 @@ def regressor_entry(name: str) -> RegressorEntry:
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
-    """A new regressor of a registered kind."""
+    """A new regressor by its registered name."""
     make: Callable[[RegressorContext], Regressor] = load(regressor_entry(name).make)
     return make(context)

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, ImaginedRollout, planned_actions
+from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -143,7 +143,7 @@ class ImagineAgent:
         self.model.reset_for_new_task()
         self.planner.forget()
 
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
         """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.questions`."""
         planning = self.settings.planning
         with self.meters.cpu_time("time/model_s"):
@@ -156,12 +156,12 @@ class ImagineAgent:
                 without=self.memory.in_vain,
             )
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
-        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no answer."""
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no label."""
         code, action, following = last_step(self.model, self._modelled(self.code(observation.frame)), actions)
-        reward, terminated = (0.0, False) if answer is None else (answer.reward, answer.terminated)
+        reward, terminated = (0.0, False) if label is None else (label.reward, label.terminated)
         self.memory.add(
-            CodeTransition(code, action, following, reward, terminated, moves=False, pays=answer is not None)
+            CodeTransition(code, action, following, reward, terminated, moves=False, pays=label is not None)
         )
         with self.meters.cpu_time("time/model_s"):
             self._learn(len(self.memory))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from imagine_bench.bench.study import BASE, Study, Variant
+from imagine_bench.studies.study import BASE, Study, Variant
 
 _DQN, _FILTERED = "dqn", "imagination_uncertainty"
 _MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25}

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.bench.bench import Encoders, bench, plan
+from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers import Launcher
 from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.task_types import Encoders, task_type
+from imagine_bench.registry import TASKS
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, is_tuning_seed
-from imagine_bench.task_types import TASK_TYPES, task_type
+from imagine_bench.store.results import BenchResult
 
 if TYPE_CHECKING:
     from imagine_bench.statistics import Estimate
@@ -140,13 +143,15 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     Raises:
         ImagineBenchError: As for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
     """
-    if task not in TASK_TYPES["control"].tasks:
+    if task not in TASKS:
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run
-    results = {
-        variant.name: bench(protocol, encoder, root=root, launcher=launcher) for variant, protocol, encoder in planned
-    }
+    results: dict[str, BenchResult] = {}
+    for variant, protocol, paths in planned:
+        result = bench(protocol, paths, root=root, launcher=launcher)
+        assert isinstance(result, BenchResult), "of a control task"
+        results[variant.name] = result
     success = {variant.name: results[variant.name].success_rates(variant.agent) for variant in study.variants}
     return tuple(
         Line(
@@ -161,7 +166,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     )
 
 
-def _plan(study: Study, task: str, variant: Variant) -> tuple[Any, Encoders]:
+def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
     return plan(
         task,
         "quick",

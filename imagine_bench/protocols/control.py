@@ -1,116 +1,66 @@
-"""A protocol is data: what is compared, on what, how long, how often. Its hash stands in every result."""
+"""The protocol of a bench of agents that act, and its presets: what is compared, on what, how long, how often."""
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import itertools
-import json
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.protocols.data import ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
-from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
 _AFTER_EPISODES = 100
-_FIRST_WAVE = 2000
+_FIRST_STAGE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
-
-
-def digest(values: Any) -> str:
-    """Twelve hex digits that change when anything in JSON-like values does."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
-
-
-class ProtocolData:
-    """What protocols of every kind can do, being dataclasses of JSON-like values."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy; without a digest of settings where there is none, as in protocols from before."""
-        values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[call-overload]
-        return {name: value for name, value in values.items() if name != "settings_digest" or value}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        """The inverse of :meth:`as_dict`."""
-        tuples = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-        tuples["overrides"] = tuple((name, value) for name, value in tuples.get("overrides", ()))
-        return cls(**tuples)
-
-    @property
-    def hash(self) -> str:
-        """Twelve hex digits that change when anything in the protocol does."""
-        return digest(self.as_dict())
-
-    @property
-    def stages(self) -> tuple[int | None, ...]:
-        """The order of work: all runs come to each of these budgets before any goes on; None is the end.
-
-        A long bench that is stopped early is then a whole bench of fewer episodes.
-        """
-        return (None,)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(ProtocolData):
-    """One comparison, completely specified.
+    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others.
 
     Attributes:
-        task: Registered task.
-        preset: Name of this protocol and of the agents' settings preset.
-        settings: Family of settings that the preset belongs to, as the task names it.
-        agents: Registered agents, in the order of the report.
-        seeds: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing
-            settings and are tested on starts that no reported run meets; the two kinds never mix.
+        settings: Config group of the agents' settings, as the task names it.
+        hyperparameters: Name of the hyper-parameter set in that group that every learner takes.
         budgets: Real training episodes at which the agent is evaluated, ascending.
         evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
         execution: ``"physics"`` or ``"kinematic"``.
         appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
-        overrides: Agent settings that replace the preset's, as sorted (dotted name, value) pairs.
-        settings_digest: :func:`digest` of every setting of every learner: a preset may be another one tomorrow, and
-            what was run with it is then another bench. Empty in a protocol that :func:`.bench.plan` did not make.
         open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
         sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
             distribution at each budget; 0 asks for none.
         recorded_episodes: Real episodes in each recording; 0 records none.
         encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
         codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
-        device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
         after: Tasks of the same world that learners are trained on before, in this order; what they know of the
             world is carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
         after_episodes: Real training episodes on each of them.
         demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
             observe; they are real episodes as any, and budgets count them.
-        questions: Most questions that learners may ask a teacher in a training episode.
+        queries: Most oracle queries of a learner in a training episode.
     """
 
-    task: str
-    preset: str
     settings: str = "chapter_5"
+    hyperparameters: str = "quick"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
     budgets: tuple[int, ...] = (100, 250, 500, 1000)
     evaluation_episodes: int = 200
     execution: str = "physics"
     appearance: str = "clean"
-    overrides: tuple[tuple[str, Any], ...] = ()
-    settings_digest: str = ""
     open_loop_starts: int = 100
     sampled_futures: int = 16
     recorded_episodes: int = 5
     encoder: str | None = None
     codes: str | None = None
-    device: str = "cpu"
     after: tuple[str, ...] = ()
     after_episodes: int = _AFTER_EPISODES
     demonstrations: int = 0
-    questions: int = 0
+    queries: int = 0
 
     def __post_init__(self) -> None:
         task_entry(self.task)
@@ -121,8 +71,7 @@ class Protocol(ProtocolData):
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)
         require_seeds(self.seeds)
-        if not self.agents or len(set(self.agents)) != len(self.agents):
-            raise InvalidValueError(f"agents {self.agents} must be at least one name, none of them twice.")
+        require_different("agents", self.agents)
         if self.evaluation_episodes < 1:
             raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
         require_same_world(self.task, self.after)
@@ -132,7 +81,7 @@ class Protocol(ProtocolData):
             raise InvalidValueError(
                 f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
             )
-        for name in ("demonstrations", "questions", "open_loop_starts", "sampled_futures", "recorded_episodes"):
+        for name in ("demonstrations", "queries", "open_loop_starts", "sampled_futures", "recorded_episodes"):
             if getattr(self, name) < 0:
                 raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least 0.")
 
@@ -150,15 +99,7 @@ class Protocol(ProtocolData):
     @property
     def stages(self) -> tuple[int | None, ...]:
         """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
-        return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_WAVE), None)
-
-    def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy; without the younger fields where they are at rest, as in protocols from before."""
-        resting = {
-            *(name for name in ("codes", "after", "demonstrations", "questions") if not getattr(self, name)),
-            *(() if self.after else ("after_episodes",)),
-        }
-        return {name: value for name, value in super().as_dict().items() if name not in resting}
+        return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_STAGE), None)
 
     def encoder_of(self, kind: str) -> str | None:
         """Identity of the encoder for the agents that take this kind."""
@@ -167,6 +108,7 @@ class Protocol(ProtocolData):
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
+        "hyperparameters": "smoke",
         "seeds": (0,),
         "budgets": (10, 20),
         "evaluation_episodes": 20,
@@ -176,12 +118,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
+        "hyperparameters": "thesis",
         "agents": _THESIS_AGENTS,
         "seeds": tuple(range(5)),
         "budgets": _THESIS_BUDGETS,
         "evaluation_episodes": 1000,
     },
-    "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
+    "full": {
+        "hyperparameters": "full",
+        "agents": _ALL_AGENTS,
+        "seeds": tuple(range(20)),
+        "budgets": _THESIS_BUDGETS,
+        "evaluation_episodes": 1000,
+    },
     "sample_efficiency": {
         "agents": ("factored",),
         "seeds": tuple(range(5)),
@@ -189,7 +138,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "evaluation_episodes": 1000,
         "recorded_episodes": 2,
     },
-    "lessons": {
+    "queries": {
         "agents": ("factored",),
         "seeds": tuple(range(5)),
         "budgets": (10, 20, 30, 40, 60, 80, 100),
@@ -202,7 +151,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
-thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``lessons`` does so
+thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``queries`` does so
 in little time, to compare many ways of being taught."""
 
 
@@ -221,15 +170,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     return Protocol(task=task_name, preset=preset, **values)
 
 
-def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
-    """Raise InvalidValueError unless values are different integers, ascending, of at least ``at_least``."""
-    ascending = all(a < b for a, b in itertools.pairwise(values))
-    if not values or not ascending or values[0] < at_least:
-        raise InvalidValueError(
-            f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
-        )
-
-
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     """Raise InvalidValueError for an earlier task that is not of the world of task ``name``, or UnknownNameError.
 
@@ -245,14 +185,3 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
                     f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
                     "arrow_puzzle_hard."
                 )
-
-
-def require_seeds(seeds: tuple[int, ...]) -> None:
-    """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
-    if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
-        raise InvalidValueError(f"seeds {seeds} must be one or more different integers from 0 to {SEEDS - 1}.")
-    if len({is_tuning_seed(seed) for seed in seeds}) > 1:
-        raise InvalidValueError(
-            f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
-            "reported ones; give them to separate benches."
-        )
