@@ -22,7 +22,7 @@ from .images import Imagined, one_hot, picture
 from .model import StructuredModel, as_codes
 from .planner import Planner
 from .queries import last_step, question
-from .settings import ImagineSettings, resolve
+from .settings import HYPERPARAMETERS, ImagineSettings
 
 _SURE = 0.9
 """A transition held less probable than this is a surprise, as is any that would still attract curiosity."""
@@ -274,7 +274,7 @@ def make(context: AgentContext) -> ImagineAgent:
     Raises:
         InvalidValueError: The context's encoder gives no codes.
     """
-    settings = resolve(context.preset, context.overrides, context.settings)
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     prepare_torch(context.device)
     encoder = load_perception(context).encoder
     if not encoder.card.code_sizes:
