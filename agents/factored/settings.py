@@ -1,4 +1,4 @@
-"""Every setting of the agent ``factored``. They are the same for every task, family and preset."""
+"""Every setting of the agent ``factored``. They are the same for every task and preset."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ EXPLORATIONS = ("curiosity", "optimism", "random")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicsSettings:
-    """What an action does to each part; see :mod:`.dynamics`.
+    """What an action does to each factor; see :mod:`.dynamics`.
 
     Attributes:
-        factored: Whether each part has a model of its own; otherwise the whole code is one part (an ablation).
-        parents: Most parts that one part's next value may depend on, itself included.
-        persistence: Prior probability that an action leaves a part alone.
-        parent_factor: Factor on the prior for each parent more.
+        factored: Whether each factor has a model of its own; otherwise the whole code is one factor (an ablation).
+        parents: Most factors that one factor's next value may depend on, itself included.
+        persistence: Prior probability that an action leaves a factor alone.
+        parent_decay: Multiplies the prior for each further parent.
         concentration: Pseudo-count of each value in a Dirichlet prior (Heckerman et al. 1995).
-        slip: Probability with which a part that is left alone is read otherwise all the same.
+        slip: Probability with which a factor that is left alone is misread.
     """
 
     factored: bool = True
     parents: int = 3
     persistence: float = 0.5
-    parent_factor: float = 0.2
+    parent_decay: float = 0.2
     concentration: float = 0.03
     slip: float = 0.005
 
@@ -42,40 +42,40 @@ class OutcomeSettings:
     Attributes:
         order: Most values in a conjunction that may be a cause; the whole code may always be one.
         prior: Prior probability that one value, or a pair, is a cause.
-        order_factor: Factor on it for each value more than two.
+        order_decay: Multiplies it for each value beyond two.
         pseudo_tests: How many tests of one conjunction the prior is worth.
-        pseudo_conjunctions: How many conjunctions of a kind the prior is worth.
+        pseudo_conjunctions: How many conjunctions of one order the prior is worth.
         leak: Probability of an outcome without a cause.
         masked_weight: Weight of a test in which some other cause decided.
         sweeps: Steps of expectation maximisation.
-        carried: How much a cause of an earlier task is believed to be one of the next, untested; 0 forgets it.
+        transfer_weight: Prior probability that a cause of an earlier task is one of the next; 0 forgets it.
     """
 
     order: int = 3
     prior: float = 0.1
-    order_factor: float = 0.3
+    order_decay: float = 0.3
     pseudo_tests: float = 0.2
     pseudo_conjunctions: float = 3.0
     leak: float = 1e-3
     masked_weight: float = 0.1
     sweeps: int = 25
-    carried: float = 0.5
+    transfer_weight: float = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningSettings:
-    """Imagining futures and choosing among them; see :mod:`.planner`.
+    """Planning and exploration; see :mod:`.planner`.
 
     Attributes:
-        depth: Macro-actions that are imagined ahead.
+        depth: Macro-actions that are planned ahead.
         discount: Of rewards, a macro-action.
         branches: Most next codes of one action.
-        least_probability: Less likely ones are not imagined, but for the likeliest.
+        least_probability: Less likely ones are not followed, but for the likeliest.
         states: Most codes that one plan visits.
-        exploration: ``"curiosity"`` goes where most is unknown, ``"optimism"`` believes that the unknown is worth the
-            best reward seen, ``"random"`` acts greedily but for random actions (the last two are ablations).
+        exploration: ``"curiosity"`` goes where most is unknown, ``"optimism"`` values the unknown at the best
+            reward seen, ``"random"`` acts greedily but for random actions (the last two are ablations).
         novelty_discount: Of what is unknown, a macro-action.
-        boredom: Where less than this is unknown within reach, curiosity rests and the agent acts greedily.
+        exploration_threshold: Novelty within reach below which the agent acts greedily.
         epsilon: Probability of a random action where exploration is random.
     """
 
@@ -86,12 +86,12 @@ class PlanningSettings:
     states: int = 3000
     exploration: str = "curiosity"
     novelty_discount: float = 0.95
-    boredom: float = 0.01
+    exploration_threshold: float = 0.01
     epsilon: float = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImagineSettings:
+class FactoredSettings:
     """All settings of the agent."""
 
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
@@ -101,7 +101,7 @@ class ImagineSettings:
 
 _RANGES = {
     "dynamics.parents": COUNT,
-    "dynamics.parent_factor": RATE,
+    "dynamics.parent_decay": RATE,
     "dynamics.persistence": INSIDE,
     "dynamics.concentration": POSITIVE,
     "dynamics.slip": INSIDE,
@@ -110,7 +110,7 @@ _RANGES = {
     "outcomes.pseudo_tests": POSITIVE,
     "outcomes.pseudo_conjunctions": POSITIVE,
     "outcomes.leak": INSIDE,
-    "outcomes.order_factor": RATE,
+    "outcomes.order_decay": RATE,
     "outcomes.sweeps": COUNT,
     "planning.depth": COUNT,
     "planning.branches": COUNT,
@@ -121,10 +121,10 @@ _RANGES = {
 
 def names() -> frozenset[str]:
     """The dotted names of all settings."""
-    return frozenset(flatten(ImagineSettings()))
+    return frozenset(flatten(FactoredSettings()))
 
 
-def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> ImagineSettings:
+def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> FactoredSettings:
     """The settings, with single ones replaced; a preset and a family change nothing.
 
     Args:
@@ -137,7 +137,7 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> ImagineSe
         InvalidValueError: A value of the wrong type or out of its range.
     """
     require_known("preset", preset, FAMILIES[require_known("settings family", family, FAMILIES)].presets)
-    settings: ImagineSettings = checked_values(ImagineSettings(), overrides)
+    settings: FactoredSettings = checked_values(FactoredSettings(), overrides)
     require_known("exploration", settings.planning.exploration, EXPLORATIONS)
     require_ranges(flatten(settings), _RANGES, otherwise=PROBABILITY)
     return settings
