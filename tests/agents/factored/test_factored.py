@@ -134,7 +134,9 @@ class _Chain:
         p_continues = np.zeros((len(codes), 1, self.branches))
         p_continues[:, :, 0] = ~last
         ends = last.astype(float)
-        return SimpleNamespace(following=following, p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends)
+        return SimpleNamespace(
+            following=following, p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends
+        )
 
 
 @pytest.mark.parametrize("depth", [1, 4, 5, 20])
