@@ -66,7 +66,7 @@ def jsonable(values: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-_ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "memory/")
+_ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/")
 
 
 def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = ("filtered", "settings")) -> None:
