@@ -20,7 +20,7 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observatio
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from .latent_observation import LatentObservation
-from .settings import PeerSettings, resolve
+from .settings import HYPERPARAMETERS, PeerSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -107,7 +107,7 @@ def _make(context: AgentContext, target: str) -> LibraryAgent:
     prepare_torch(context.device)
     return LibraryAgent(
         _algorithm(target),
-        resolve(context.preset, context.overrides, context.settings),
+        HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group),
         seed=context.seeds.child("library").integer(),
         device=context.device,
         encoder=None if context.encoder is None else load_perception(context).encoder,
