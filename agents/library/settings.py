@@ -13,7 +13,7 @@ from ..ranges import POSITIVE, PROBABILITY, require_ranges
 
 
 @dataclass(frozen=True, kw_only=True)
-class LibrarySettings:
+class SB3Settings:
     """Keywords of ``stable_baselines3.DQN`` and ``sb3_contrib.QRDQN`` that differ from the library's own.
 
     Attributes:
@@ -42,10 +42,10 @@ class LibrarySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeerSettings:
-    """All settings of a peer."""
+class LibrarySettings:
+    """All settings of an agent from Stable-Baselines3."""
 
-    sb3: LibrarySettings = field(default_factory=LibrarySettings)
+    sb3: SB3Settings = field(default_factory=SB3Settings)
 
 
 _RANGES = {
@@ -58,10 +58,10 @@ _RANGES = {
 
 def names() -> frozenset[str]:
     """The dotted names of all settings."""
-    return frozenset(flatten(PeerSettings()))
+    return frozenset(flatten(LibrarySettings()))
 
 
-def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> PeerSettings:
+def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> LibrarySettings:
     """The settings, with single ones replaced; a preset and a family change nothing.
 
     Args:
@@ -74,6 +74,6 @@ def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> PeerSetti
         InvalidValueError: A value of the wrong type or out of its range.
     """
     require_known("preset", preset, FAMILIES[require_known("settings family", family, FAMILIES)].presets)
-    settings: PeerSettings = checked_values(PeerSettings(), overrides)
+    settings: LibrarySettings = checked_values(LibrarySettings(), overrides)
     require_ranges(flatten(settings), _RANGES)
     return settings

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import Floats, Mixtures
+from imagine_bench.regression.interfaces import Floats, Mixtures
 
 LEVELS = (0.5, 0.8, 0.95)
 """Central intervals whose coverage is reported."""

@@ -15,8 +15,8 @@ from imagine_bench import registry
 from imagine_bench.bench.cohort import cpu_time_s
 from imagine_bench.bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.errors import DivergedError
-from imagine_bench.regression import Dataset, Floats, Prediction, Regressor, RegressorContext
 from imagine_bench.regression.calibration import calibrate
+from imagine_bench.regression.interfaces import Dataset, Floats, Prediction, Regressor, RegressorContext
 from imagine_bench.regression.results import Arrays, RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
