@@ -40,7 +40,8 @@ class AgentEntry:
         learns: Whether training changes it; others are only evaluated.
         needs_encoder: Whether it sees what an encoder gives.
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
+        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
+            ``resolve(hyperparameters, overrides, group)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
         external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
         title: For headings, legends and tables; by default the registered name.
@@ -51,7 +52,7 @@ class AgentEntry:
     learns: bool = True
     needs_encoder: bool = True
     encoder_kind: str = "latents"
-    settings: str = "imagine_bench.agents.presets"
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
     privileged: bool = False
     external_training_loop: bool = False
     title: str = ""
@@ -96,29 +97,31 @@ AGENTS: dict[str, AgentEntry] = {
     "oracle": AgentEntry(
         make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
     ),
-    "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
+    "dqn": AgentEntry(
+        make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS"
+    ),
     "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
     "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings",
+        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
     ),
     "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
@@ -179,9 +182,10 @@ REGRESSORS: dict[str, RegressorEntry] = {
 
 
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
     module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    found = importlib.import_module(module)
+    return getattr(found, attribute) if attribute else found
 
 
 def agents() -> dict[str, AgentEntry]:
@@ -248,7 +252,7 @@ def agent_entry(name: str) -> AgentEntry:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    names: frozenset[str] = load(f"{agent_entry(agent).settings}:names")()
+    names: frozenset[str] = load(agent_entry(agent).settings).names()
     return names
 
 
@@ -258,14 +262,14 @@ def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in overrides.items() if name in names}
 
 
-def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> Any:
+def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
     """An agent's settings, a dataclass, with those of the overrides that it has.
 
     Raises:
-        UnknownNameError: No such preset or family.
+        UnknownNameError: No such set of hyperparameters or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
+    return load(agent_entry(agent).settings).resolve(hyperparameters, own_settings(agent, overrides), group)
 
 
 def task(name: str) -> TaskSpec:

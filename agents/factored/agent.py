@@ -14,13 +14,13 @@ from .. import snapshot
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from ..meters import Meters
-from ..presets import flatten
+from ..settings import flatten
 from .exploration import last_step, query
 from .factors import Code, CodeReplay, CodeTransition, Floats
 from .model import FactoredModel
 from .perception import CodePerception, ImaginedStep
 from .planner import Planner
-from .settings import FactoredSettings, resolve
+from .settings import HYPERPARAMETERS, FactoredSettings
 
 _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
@@ -236,7 +236,7 @@ def make(context: AgentContext) -> FactoredAgent:
     Raises:
         InvalidValueError: The context's encoder gives no codes.
     """
-    settings = resolve(context.preset, context.overrides, context.settings)
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     prepare_torch(context.device)
     encoder = load_perception(context).encoder
     if not encoder.card.code_sizes:

@@ -1,17 +1,10 @@
-"""Every setting of the agent ``factored``. They are the same for every task and preset."""
+"""Every setting of the agent ``factored``. They are the same for every task and set of hyperparameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from imagine_bench.errors import require_known
-
-from ..presets import FAMILIES, checked_values, flatten
-from ..ranges import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, require_ranges
-
-EXPLORATIONS = ("curiosity", "optimism", "random")
+from ..settings import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SWITCH, Hyperparameters, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,12 +20,12 @@ class DynamicsSettings:
         slip: Probability with which a factor that is left alone is misread.
     """
 
-    factored: bool = True
-    parents: int = 3
-    persistence: float = 0.5
-    parent_decay: float = 0.2
-    concentration: float = 0.03
-    slip: float = 0.005
+    factored: bool = setting(True, SWITCH)
+    parents: int = setting(3, COUNT)
+    persistence: float = setting(0.5, INSIDE)
+    parent_decay: float = setting(0.2, RATE)
+    concentration: float = setting(0.03, POSITIVE)
+    slip: float = setting(0.005, INSIDE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +44,15 @@ class OutcomeSettings:
         transfer_weight: Prior probability that a cause of an earlier task is one of the next; 0 forgets it.
     """
 
-    order: int = 3
-    prior: float = 0.1
-    order_decay: float = 0.3
-    pseudo_tests: float = 0.2
-    pseudo_conjunctions: float = 3.0
-    leak: float = 1e-3
-    masked_weight: float = 0.1
-    sweeps: int = 25
-    transfer_weight: float = 0.5
+    order: int = setting(3, NOT_NEGATIVE)
+    prior: float = setting(0.1, INSIDE)
+    order_decay: float = setting(0.3, RATE)
+    pseudo_tests: float = setting(0.2, POSITIVE)
+    pseudo_conjunctions: float = setting(3.0, POSITIVE)
+    leak: float = setting(1e-3, INSIDE)
+    masked_weight: float = setting(0.1, PROBABILITY)
+    sweeps: int = setting(25, COUNT)
+    transfer_weight: float = setting(0.5, PROBABILITY)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,15 +72,15 @@ class PlanningSettings:
         epsilon: Probability of a random action where exploration is random.
     """
 
-    depth: int = 20
-    discount: float = 0.95
-    branches: int = 8
-    least_probability: float = 0.02
-    states: int = 3000
-    exploration: str = "curiosity"
-    novelty_discount: float = 0.95
-    exploration_threshold: float = 0.01
-    epsilon: float = 0.1
+    depth: int = setting(20, COUNT)
+    discount: float = setting(0.95, PROBABILITY)
+    branches: int = setting(8, COUNT)
+    least_probability: float = setting(0.02, PROBABILITY)
+    states: int = setting(3000, COUNT)
+    exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))
+    novelty_discount: float = setting(0.95, PROBABILITY)
+    exploration_threshold: float = setting(0.01, PROBABILITY)
+    epsilon: float = setting(0.1, PROBABILITY)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,45 +92,4 @@ class FactoredSettings:
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
 
-_RANGES = {
-    "dynamics.parents": COUNT,
-    "dynamics.parent_decay": RATE,
-    "dynamics.persistence": INSIDE,
-    "dynamics.concentration": POSITIVE,
-    "dynamics.slip": INSIDE,
-    "outcomes.order": NOT_NEGATIVE,
-    "outcomes.prior": INSIDE,
-    "outcomes.pseudo_tests": POSITIVE,
-    "outcomes.pseudo_conjunctions": POSITIVE,
-    "outcomes.leak": INSIDE,
-    "outcomes.order_decay": RATE,
-    "outcomes.sweeps": COUNT,
-    "planning.depth": COUNT,
-    "planning.branches": COUNT,
-    "planning.states": COUNT,
-}
-"""Ranges of the numbers; every other is a share."""
-
-
-def names() -> frozenset[str]:
-    """The dotted names of all settings."""
-    return frozenset(flatten(FactoredSettings()))
-
-
-def resolve(preset: str, overrides: Mapping[str, Any], family: str) -> FactoredSettings:
-    """The settings, with single ones replaced; a preset and a family change nothing.
-
-    Args:
-        preset: A preset of the family.
-        overrides: Values by dotted name, such as ``{"planning.exploration": "random"}``.
-        family: A name of :data:`..presets.FAMILIES`.
-
-    Raises:
-        UnknownNameError: No such family, preset, setting or exploration; the message lists what exists.
-        InvalidValueError: A value of the wrong type or out of its range.
-    """
-    require_known("preset", preset, FAMILIES[require_known("settings family", family, FAMILIES)].presets)
-    settings: FactoredSettings = checked_values(FactoredSettings(), overrides)
-    require_known("exploration", settings.planning.exploration, EXPLORATIONS)
-    require_ranges(flatten(settings), _RANGES, otherwise=PROBABILITY)
-    return settings
+HYPERPARAMETERS = Hyperparameters.everywhere(FactoredSettings())

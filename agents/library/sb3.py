@@ -19,7 +19,7 @@ from imagine_bench.interfaces import AgentContext, AgentState, Observation, Tran
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from .latent_observation import LatentObservation
-from .settings import LibrarySettings, resolve
+from .settings import HYPERPARAMETERS, LibrarySettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -102,7 +102,7 @@ def _make(context: AgentContext, target: str) -> LibraryAgent:
     prepare_torch(context.device)
     return LibraryAgent(
         _algorithm(target),
-        resolve(context.preset, context.overrides, context.settings),
+        HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group),
         seed=context.seeds.child("library").integer(),
         device=context.device,
         encoder=None if context.encoder is None else load_perception(context).encoder,

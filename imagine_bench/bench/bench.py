@@ -106,7 +106,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
     for name in overrides:
         if name not in known:
             raise UnknownNameError("setting", name, sorted(known))
-    found = {agent: registry.settings(agent, wanted.preset, overrides, wanted.settings) for agent in wanted.agents}
+    found = {agent: registry.settings(agent, wanted.hyperparameters, overrides, wanted.settings) for agent in wanted.agents}
     return {agent: dataclasses.asdict(found[agent]) for agent in wanted.agents if registry.agent_entry(agent).learns}
 
 

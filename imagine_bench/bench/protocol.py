@@ -63,8 +63,9 @@ class Protocol(ProtocolData):
 
     Attributes:
         task: Registered task.
-        preset: Name of this protocol and of the agents' settings preset.
-        settings: Family of settings that the preset belongs to, as the task names it.
+        preset: Name of this protocol.
+        settings: Config group of the agents' settings, as the task names it.
+        hyperparameters: Set of values of that group: ``"minimal"``, ``"fast"`` or ``"published"``.
         agents: Registered agents, in the order of the report.
         seeds: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing
             settings and are tested on starts that no reported run meets; the two kinds never mix.
@@ -93,6 +94,7 @@ class Protocol(ProtocolData):
     task: str
     preset: str
     settings: str = "chapter_5"
+    hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
     budgets: tuple[int, ...] = (100, 250, 500, 1000)
@@ -167,6 +169,7 @@ class Protocol(ProtocolData):
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
+        "hyperparameters": "minimal",
         "seeds": (0,),
         "budgets": (10, 20),
         "evaluation_episodes": 20,
@@ -176,12 +179,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
+        "hyperparameters": "published",
         "agents": _THESIS_AGENTS,
         "seeds": tuple(range(5)),
         "budgets": _THESIS_BUDGETS,
         "evaluation_episodes": 1000,
     },
-    "full": {"agents": _ALL_AGENTS, "seeds": tuple(range(20)), "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000},
+    "full": {
+        "hyperparameters": "published",
+        "agents": _ALL_AGENTS,
+        "seeds": tuple(range(20)),
+        "budgets": _THESIS_BUDGETS,
+        "evaluation_episodes": 1000,
+    },
     "sample_efficiency": {
         "agents": ("factored",),
         "seeds": tuple(range(5)),

@@ -140,14 +140,14 @@ class RegressorContext:
     Attributes:
         datasets: One a network, all of the same size. Length E.
         seeds: One node of the seed tree a network. Length E.
-        preset: Name of the settings preset.
-        overrides: Single settings that replace the preset's.
+        hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
+        overrides: Single settings that replace the set's.
         device: ``"cpu"`` or ``"cuda"``.
     """
 
     datasets: tuple[Dataset, ...]
     seeds: tuple[SeedTree, ...]
-    preset: str = "quick"
+    hyperparameters: str = "fast"
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"
 

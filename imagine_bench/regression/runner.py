@@ -92,7 +92,7 @@ class _Run:
         return RegressorContext(
             datasets=datasets,
             seeds=tuple(node.child("regressor", variant) for node in self.networks),
-            preset=self.protocol.preset,
+            hyperparameters=self.protocol.hyperparameters,
             overrides=dict(self.protocol.overrides),
             device=self.protocol.device,
         )
