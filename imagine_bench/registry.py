@@ -11,7 +11,7 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
-from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ class Protocol(ProtocolData):
 
     Attributes:
         settings: Config group of the agents' settings, as the task names it.
-        hyperparameters: Set of values of that group that every learner takes: ``"minimal"``, ``"fast"`` or ``"published"``.
+        hyperparameters: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
         budgets: Real training episodes at which the agent is evaluated, ascending.
         evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
         execution: ``"physics"`` or ``"kinematic"``.

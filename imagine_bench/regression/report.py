@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.judge.calibration import LEVELS
-from imagine_bench.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
+from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.page import aligned, facts, flat
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
