@@ -92,37 +92,79 @@ TASKS: dict[str, TaskEntry] = {
 }
 
 AGENTS: dict[str, AgentEntry] = {
-    "random": AgentEntry(make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False),
-    "oracle": AgentEntry(
-        make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
+    "random": AgentEntry(
+        make="imagine_bench.agents.baselines:make_random",
+        learns=False,
+        needs_encoder=False,
+        title="random",
+        description="Picks every macro-action by chance: the floor.",
     ),
-    "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
-    "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
-    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
+    "oracle": AgentEntry(
+        make="imagine_bench.agents.baselines:make_oracle",
+        learns=False,
+        needs_encoder=False,
+        privileged=True,
+        title="oracle",
+        description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
+    ),
+    "dqn": AgentEntry(
+        make="imagine_bench.agents.dqn:make",
+        title="DQN",
+        description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
+    ),
+    "imagination": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make",
+        title="imagination",
+        description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
+    ),
+    "imagination_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make_uncertainty",
+        title="imagination + uncertainty",
+        description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
+        "the model is uncertain.",
+    ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings",
+        title="factored",
+        description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
+        "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 DQN (pixels)",
+        description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 QR-DQN (pixels)",
+        description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         settings="imagine_bench.agents.library.settings",
         external_training_loop=True,
+        title="SB3 DQN (latents)",
+        description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
     ),
-    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
-    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.model_only:make_uncertainty"),
+    "imagination_only": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make",
+        title="imagination only",
+        description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
+        "world is trained in that model alone, and is what is tested.",
+    ),
+    "imagination_only_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make_uncertainty",
+        title="imagination only + uncertainty",
+        description="Like imagination only, but an imagined episode ends where the model is uncertain.",
+    ),
 }
 
 
