@@ -174,9 +174,10 @@ def open_loop_figure(data: ReportData) -> Figure:
     for name, line in _KINDS:
         panels[3].plot([], [], linestyle=line, label=name, color=_INK)
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
+    panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error")
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
     measure = "variance of latents" + ("\n(“factored”: probability)" if "factored" in data.open_loop else "")
+    _from_zero(panels[1])
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
@@ -204,14 +205,21 @@ def futures_figure(data: ReportData) -> Figure:
     panels[0].plot([], [], linestyle="--", color=_INK, label="where several are possible")
     panels[0].plot(np.arange(1, len(floor) + 1), floor, label="sampling noise", **_REFERENCE_LINE)
     panels[1].plot([], [], linestyle="--", color=_INK, label=f"depth {len(floor)}")
-    panels[0].set(title="Distance from the exact distribution", ylabel="total variation", ylim=(0, None))
-    panels[1].set(title="The same while learning, depth 1", ylabel="total variation", ylim=(0, None))
-    panels[2].set(title="Missed: possible, not imagined", ylabel="outcomes a start", ylim=(0, None))
-    panels[3].set(title="Hallucinated: imagined, impossible", ylabel="outcomes a start", ylim=(0, None))
+    panels[0].set(title="Distance from the exact distribution", ylabel="total variation")
+    panels[1].set(title="The same while learning, depth 1", ylabel="total variation")
+    panels[2].set(title="Missed: possible, not imagined", ylabel="outcomes a start")
+    panels[3].set(title="Hallucinated: imagined, impossible", ylabel="outcomes a start")
     for index, axes in enumerate(panels):
+        _from_zero(axes)
         axes.set_xlabel("real training episodes" if index == 1 else "imagined depth (macro-actions)")
         axes.legend(fontsize=8, loc="best")
     return figure
+
+
+def _from_zero(axes: Axes) -> None:
+    """Begin just below zero, so that a line of zeros is seen whole."""
+    highest = max((float(np.nanmax(line.get_ydata())) for line in axes.get_lines() if len(line.get_ydata())), default=0)
+    axes.set_ylim(-0.04 * (highest or 1.0), 1.08 * (highest or 1.0))
 
 
 def _log_if_positive(data: ReportData) -> str:

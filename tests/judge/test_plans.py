@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from fake_results import bench_result
 from numpy.typing import NDArray
+from recordings import rerun
 from rerun.chunk import RrdReader
-from test_recording import rerun
 
 from imagine_bench import registry
 from imagine_bench.bench.protocol import protocol

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from imagine_bench.agents.regressors import settings as regressor_settings
-from test_recording import contents, times
+from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import plan
