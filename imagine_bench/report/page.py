@@ -9,9 +9,9 @@ from typing import Any
 
 import jinja2
 
-from imagine_bench.report import imagination, plots, success, text
+from imagine_bench.report import plots, text
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
-from imagine_bench.report.sections import Page, Section
+from imagine_bench.report.sections import Page, Section, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.files import make_folder, write_bytes
 from imagine_bench.store.results import BenchResult

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import matplotlib as mpl
@@ -59,7 +59,14 @@ _KINDS = (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":"))
 _THESIS_LINE: dict[str, Any] = {
     "marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0,
 }  # fmt: skip
-_LEADER: dict[str, Any] = {"arrowstyle": "-", "linewidth": 0.6, "color": "#8c8c8c", "shrinkA": 0, "shrinkB": 0}
+_LEADER: dict[str, Any] = {
+    "arrowstyle": "-",
+    "linewidth": 0.6,
+    "color": "#8c8c8c",
+    "shrinkA": 2,
+    "shrinkB": 0,
+    "relpos": (0, 0.5),
+}
 _THESIS_REACH = 2.0
 """The thesis' points are drawn up to so many times the last budget: farther ones would leave the run's own no room."""
 _REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
@@ -155,71 +162,87 @@ def acceptance_figure(data: ReportData) -> Figure:
 
 def open_loop_figure(data: ReportData) -> Figure:
     """Four panels by imagined depth: correct share, reward error, termination error, uncertainties."""
-    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
-    grid = figure.subplots(2, 2)
-    panels: list[Axes] = list(grid.ravel())
+    figure, panels = _four_panels()
+    filtered = False
     for agent, loop in data.open_loop.items():
         depth = np.arange(1, len(loop.correct) + 1)
         style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
-        title = agent_words(agent).title
-        panels[0].plot(depth, 100.0 * loop.correct, label=title, **style)
+        panels[0].plot(depth, 100.0 * loop.correct, label=agent_words(agent).title, **style)
         if np.isfinite(loop.correct_accepted).any() and (loop.accepted < 1.0).any():
-            label = f"{title}, kept by the filter"
-            panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", label=label, **style)
-        panels[1].plot(depth, loop.reward_mae, label=title, **style)
-        panels[2].plot(depth, 100.0 * loop.termination_error, label=title, **style)
+            panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", **style)
+            filtered = True
+        panels[1].plot(depth, loop.reward_mae, **style)
+        panels[2].plot(depth, 100.0 * loop.termination_error, **style)
         for name, line in _KINDS:
             if getattr(loop, name).any():  # an agent that knows no such kind says 0
                 panels[3].plot(depth, getattr(loop, name), linestyle=line, color=color(agent))
-    for name, line in _KINDS:
-        panels[3].plot([], [], linestyle=line, label=name, color=_INK)
+    _agents_legend(figure, panels[0])
+    _lines_legend(panels[0], {"kept by the filter": "--"} if filtered else {})
+    _lines_legend(panels[3], dict(_KINDS))
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error")
+    _from_zero(panels[1])
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
     measure = "variance of latents" + ("\n(“factored”: probability)" if "factored" in data.open_loop else "")
-    _from_zero(panels[1])
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
-        axes.legend(fontsize=8, loc="best")
     return figure
 
 
 def futures_figure(data: ReportData) -> Figure:
     """Four panels: total variation by depth and by real episodes, missed and hallucinated outcomes by depth."""
-    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
-    panels: list[Axes] = list(figure.subplots(2, 2).ravel())
+    figure, panels = _four_panels()
     for agent, found in data.futures.items():
         depth = np.arange(1, len(found.floor) + 1)
         style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
-        title = agent_words(agent).title
-        panels[0].plot(depth, found.total_variation, label=title, **style)
+        panels[0].plot(depth, found.total_variation, label=agent_words(agent).title, **style)
         panels[0].plot(depth, found.where_random, linestyle="--", **style)
-        budgets = list(found.by_budget)
-        panels[1].plot(budgets, [first for first, _ in found.by_budget.values()], label=title, **style)
-        deepest = [last for _, last in found.by_budget.values()]
-        panels[1].plot(budgets, deepest, linestyle="--", **style)
-        panels[2].plot(depth, found.missed / found.pairs, label=title, **style)
-        panels[3].plot(depth, found.hallucinated / found.pairs, label=title, **style)
+        budgets, pairs = list(found.by_budget), np.array(list(found.by_budget.values()))  # [B, 2]
+        panels[1].plot(budgets, pairs[:, 0], **style)
+        panels[1].plot(budgets, pairs[:, 1], linestyle="--", **style)
+        panels[2].plot(depth, found.missed / found.pairs, **style)
+        panels[3].plot(depth, found.hallucinated / found.pairs, **style)
     floor = next(iter(data.futures.values())).floor
-    panels[0].plot([], [], linestyle="--", color=_INK, label="where several are possible")
+    _agents_legend(figure, panels[0])
     panels[0].plot(np.arange(1, len(floor) + 1), floor, label="sampling noise", **_REFERENCE_LINE)
-    panels[1].plot([], [], linestyle="--", color=_INK, label=f"depth {len(floor)}")
+    _lines_legend(panels[0], {"where several are possible": "--"})
+    _lines_legend(panels[1], {"depth 1": "-", f"depth {len(floor)}": "--"})
     panels[0].set(title="Distance from the exact distribution", ylabel="total variation")
-    panels[1].set(title="The same while learning, depth 1", ylabel="total variation")
+    panels[1].set(title="The same while learning", ylabel="total variation")
     panels[2].set(title="Missed: possible, not imagined", ylabel="outcomes a start")
     panels[3].set(title="Hallucinated: imagined, impossible", ylabel="outcomes a start")
     for index, axes in enumerate(panels):
         _from_zero(axes)
         axes.set_xlabel("real training episodes" if index == 1 else "imagined depth (macro-actions)")
-        axes.legend(fontsize=8, loc="best")
     return figure
+
+
+def _four_panels() -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(9.2, 7.0), layout="constrained")
+    return figure, list(figure.subplots(2, 2).ravel())
+
+
+def _agents_legend(figure: Figure, axes: Axes) -> None:
+    """The agents below all panels, where they hide nothing."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    for line in axes.get_lines():
+        line.set_label("_")  # said
+
+
+def _lines_legend(axes: Axes, styles: Mapping[str, str]) -> None:
+    """The meaning of each kind of line in one panel."""
+    for label, line in styles.items():
+        axes.plot([], [], linestyle=line, color=_INK, label=label)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, loc="best")
 
 
 def _from_zero(axes: Axes) -> None:
     """Begin just below zero, so that a line of zeros is seen whole."""
-    highest = max((float(np.nanmax(line.get_ydata())) for line in axes.get_lines() if len(line.get_ydata())), default=0)
-    axes.set_ylim(-0.04 * (highest or 1.0), 1.08 * (highest or 1.0))
+    values = [np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()]
+    highest = max((float(array[np.isfinite(array)].max(initial=0.0)) for array in values), default=0.0) or 1.0
+    axes.set_ylim(-0.04 * highest, 1.08 * highest)
 
 
 def _log_if_positive(data: ReportData) -> str:
@@ -270,19 +293,25 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     """
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
-    placed: dict[str, float] = {}
-    floor = -np.inf
-    for agent, value in sorted(last.items(), key=lambda item: item[1]):
-        floor = max(value, floor + step)
-        placed[agent] = floor
-    excess = max(0.0, floor - high)
-    for agent, y in placed.items():
+    names = sorted(last, key=lambda agent: last[agent])
+    places = _spread([last[agent] for agent in names], step, top=high)
+    for agent, y in zip(names, places, strict=True):
         axes.annotate(
-            agent_words(agent).title, xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(),
-            xytext=(1.04, y - excess), textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold",
-            va="center", fontsize=9.5, arrowprops=_LEADER,
+            agent_words(agent).title, xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
+            textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
+            arrowprops=_LEADER,
         )  # fmt: skip
     axes.set_xlim(right=to_x * 1.04)
+
+
+def _spread(values: Sequence[float], step: float, *, top: float) -> list[float]:
+    """Ascending values moved as little as it takes to lie ``step`` apart, none above ``top``."""
+    places: list[float] = []
+    for value in values:
+        places.append(max(value, places[-1] + step) if places else value)
+    for index in reversed(range(len(places))):
+        places[index] = min(places[index], top - step * (len(places) - 1 - index))
+    return places
 
 
 def _inline(svg: str, name: str, alt: str) -> str:

@@ -171,13 +171,19 @@ def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
         return ""
     ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
     behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
-    parts, clearly = [], "clearly " if seeds >= FEW_SEEDS else ""
-    for budgets, word in ((ahead, "ahead"), (behind, "behind")):
-        if budgets:
-            parts.append(f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}")
+    clearly = "clearly " if seeds >= FEW_SEEDS else ""
+    parts = [
+        f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}"
+        for budgets, word in ((ahead, "ahead"), (behind, "behind"))
+        if budgets
+    ]
     if not parts:
         return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
-    return f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets)."
+    most = max(comparisons, key=lambda budget: abs(comparisons[budget].difference.value))
+    return (
+        f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets); the largest "
+        f"difference is {estimate_text(comparisons[most].difference)} points at {most:,}."
+    )
 
 
 def _points(difference: Estimate) -> str:

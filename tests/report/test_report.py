@@ -23,7 +23,7 @@ from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
 from imagine_bench.report.data import _nan_mean, collect
-from imagine_bench.report.imagination import encoder_views
+from imagine_bench.report.sections.imagination import encoder_views
 from imagine_bench.report.text import percent, signed_percent
 from imagine_bench.store.results import BenchResult
 
