@@ -154,7 +154,8 @@ class Plan:
 
     def __call__(self) -> None:
         """Find, plan, report."""
-        from imagine_bench.judge.quality import plan_report  # noqa: PLC0415 - matplotlib's fonts and pillow load slowly
+        from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
+        from imagine_bench.report.plans import plan_report  # noqa: PLC0415 - as above
 
         print(
             plan_report(
@@ -163,6 +164,7 @@ class Plan:
                 task=self.task,
                 count=self.count,
                 recorded=self.recorded,
+                record=record_plans,
                 execution=self.execution,
                 max_epistemic=self.max_epistemic,
                 encoder=self.encoder,
@@ -192,7 +194,7 @@ class Generalise(_OfBench):
 
     def __call__(self) -> None:
         """Ask and report."""
-        from imagine_bench.judge.quality import generalisation_report  # noqa: PLC0415 - as above
+        from imagine_bench.report.generalisation import generalisation_report  # noqa: PLC0415 - as above
 
         print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
 
@@ -203,7 +205,7 @@ class Policy(_OfBench):
 
     def __call__(self) -> None:
         """Ask and follow."""
-        from imagine_bench.judge.quality import policy_report  # noqa: PLC0415 - as above
+        from imagine_bench.report.policy import policy_report  # noqa: PLC0415 - as above
 
         print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
 

@@ -32,7 +32,7 @@ from imagine_bench.capabilities import (
 )
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.judge.futures import imagined_futures
-from imagine_bench.judge.imagination_quality import Question, ask, examples, imagine_sampled_rollouts, open_loop
+from imagine_bench.judge.imagination_quality import OpenLoopStart, ask, examples, imagine_sampled_rollouts, open_loop
 from imagine_bench.seeding import SeedTree, episode_seed, evaluation_split
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.checkpoints import load_newest, save_snapshot
@@ -287,7 +287,7 @@ class _Run:
         run_folder.write_metrics(self.folder, self.counters.rows)
 
     @functools.cached_property
-    def _questions(self) -> tuple[Question, ...]:
+    def _questions(self) -> tuple[OpenLoopStart, ...]:
         protocol = self.spec.protocol
         return ask(
             self.task,

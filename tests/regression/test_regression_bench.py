@@ -20,13 +20,13 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
-from imagine_bench.judge.quality import generalisation_report
 from imagine_bench.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext, runner
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
+from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree

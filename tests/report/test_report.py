@@ -389,21 +389,19 @@ def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) 
 
 def test_strip_marks_cut_error_and_end() -> None:
     names = tuple(f"turn cube {index}" for index in range(6))
-    cut, whole = (
-        filmstrips.rollout_strip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None)
-    )
+    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
     assert cut.shape == whole.shape
     assert (cut == filmstrips._CUT).all(axis=2).sum() > 500  # the line
     assert not (whole == filmstrips._CUT).all(axis=2).any()
     for color in (filmstrips.RIGHT, filmstrips.WRONG):
         assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
-    narrow = filmstrips.rollout_strip(compared_rollout(np.random.default_rng(0)), names, columns=2)
+    narrow = filmstrips.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
     assert narrow.shape[1] < whole.shape[1]
 
 
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
     compared = compared_rollout(np.random.default_rng(0), cut=None)
-    strip = filmstrips.rollout_strip(compared, tuple("abcdef"))
+    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
     left, top = filmstrips._left(0), filmstrips._HEADER
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.judge.filmstrips import first_cut, png, rollout_strip
-from imagine_bench.judge.sampled_filmstrips import courses_sheet
+from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData
 from imagine_bench.report.sections import DASH, Cell, Image, Section, Table
@@ -221,7 +220,7 @@ def _filmstrip(data: ReportData, agent: str, seed: int, index: int, compared: Co
     )
     return Image(
         name=f"rollout_{agent}_{index + 1}",
-        png=png(rollout_strip(compared, data.spec.action_names)),
+        png=png(filmstrip(compared, data.spec.action_names)),
         alt=f"Real frames above, imagined frames below. {caption}",
         caption=caption,
     )
@@ -233,7 +232,7 @@ def _sampled_rollouts(data: ReportData) -> Iterator[Image]:
         run = data.result.of(agent)[0]
         if run.sampled_rollouts:
             caption = f"{_capital(agent)}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
-            sheet = png(courses_sheet(run.sampled_rollouts, data.spec))
+            sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
             alt = f"Only the first image is real. {caption}"
             yield Image(name=f"sampled_rollouts_{agent}", png=sheet, alt=alt, caption=caption)
 
