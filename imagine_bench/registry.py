@@ -11,7 +11,7 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
-from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,8 @@ class AgentEntry:
         learns: Whether training changes it; others are only evaluated.
         needs_encoder: Whether it sees what an encoder gives.
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Module of its settings, with ``names()`` and ``resolve(hyperparameters, overrides, group)``.
+        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
+            ``resolve(hyperparameters, overrides, group)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
         external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
         title: For headings, legends and tables; by default the registered name in plain words.
@@ -53,7 +54,7 @@ class AgentEntry:
     learns: bool = True
     needs_encoder: bool = True
     encoder_kind: str = "latents"
-    settings: str = "imagine_bench.agents.presets"
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
     privileged: bool = False
     external_training_loop: bool = False
     title: str = ""
@@ -102,34 +103,33 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "dqn": AgentEntry(
         make="imagine_bench.agents.dqn:make",
+        settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
         title="DQN",
         description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
     ),
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
         title="imagination",
-        description="DQN that also learns a model of its world and trains on transitions it imagines with it, all of "
-        "them.",
+        description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make_uncertainty",
         title="imagination + uncertainty",
-        description="The same, but an imagined transition is thrown away, with the rest of its rollout, where the "
-        "model is unsure.",
+        description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
+        "the model is uncertain.",
     ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings",
+        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         title="factored",
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
-        "every future within reach, explores what is uncertain while it trains, and plans in its model when it is "
-        "tested.",
+        "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 DQN (pixels)",
         description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
@@ -137,28 +137,28 @@ AGENTS: dict[str, AgentEntry] = {
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 QR-DQN (pixels)",
-        description="The same library's QR-DQN, which learns the distribution of the return, on pixels.",
+        description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 DQN (latents)",
-        description="The same library's DQN on the latents that the suite's own DQN sees.",
+        description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
     ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         title="imagination only",
-        description="Explores like DQN and learns a model of its world on the side; a fresh controller that never "
-        "meets the world is trained in that model alone, and is what is tested.",
+        description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
+        "world is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
         title="imagination only + uncertainty",
-        description="The same, but an imagined episode ends where the model is unsure.",
+        description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
 }
 
@@ -230,9 +230,10 @@ OBSERVERS = tuple(
 
 
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
     module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    found = importlib.import_module(module)
+    return getattr(found, attribute) if attribute else found
 
 
 def agents() -> dict[str, AgentEntry]:
@@ -299,7 +300,7 @@ def agent_entry(name: str) -> AgentEntry:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    names: frozenset[str] = load(f"{agent_entry(agent).settings}:names")()
+    names: frozenset[str] = load(agent_entry(agent).settings).names()
     return names
 
 
@@ -316,7 +317,7 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], gro
         UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(f"{agent_entry(agent).settings}:resolve")(hyperparameters, own_settings(agent, overrides), group)
+    return load(agent_entry(agent).settings).resolve(hyperparameters, own_settings(agent, overrides), group)
 
 
 def task(name: str) -> TaskSpec:

@@ -25,7 +25,7 @@ class Protocol(ProtocolData):
 
     Attributes:
         settings: Config group of the agents' settings, as the task names it.
-        hyperparameters: Name of the hyper-parameter set in that group that every learner takes.
+        hyperparameters: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
         budgets: Real training episodes at which the agent is evaluated, ascending.
         evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
         execution: ``"physics"`` or ``"kinematic"``.
@@ -45,7 +45,7 @@ class Protocol(ProtocolData):
     """
 
     settings: str = "chapter_5"
-    hyperparameters: str = "quick"
+    hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
     budgets: tuple[int, ...] = (100, 250, 500, 1000)
@@ -108,7 +108,7 @@ class Protocol(ProtocolData):
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
-        "hyperparameters": "smoke",
+        "hyperparameters": "minimal",
         "seeds": (0,),
         "budgets": (10, 20),
         "evaluation_episodes": 20,
@@ -118,14 +118,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
-        "hyperparameters": "thesis",
+        "hyperparameters": "published",
         "agents": _THESIS_AGENTS,
         "seeds": tuple(range(5)),
         "budgets": _THESIS_BUDGETS,
         "evaluation_episodes": 1000,
     },
     "full": {
-        "hyperparameters": "full",
+        "hyperparameters": "published",
         "agents": _ALL_AGENTS,
         "seeds": tuple(range(20)),
         "budgets": _THESIS_BUDGETS,

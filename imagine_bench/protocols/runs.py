@@ -51,8 +51,8 @@ class RunSpec(Generic[P_co]):
             preprocessing=task.preprocessing,
             encoder=self.encoder if entry.needs_encoder else None,
             seeds=SeedTree(self.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
-            settings=protocol.settings,
-            preset=protocol.hyperparameters,
+            config_group=protocol.settings,
+            hyperparameters=protocol.hyperparameters,
             overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,
             optimal_action=task.rules.optimal_action if entry.privileged else None,

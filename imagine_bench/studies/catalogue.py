@@ -41,7 +41,7 @@ _FACTORS = (
     _variant("model's data", "latents not spread", {"model.spread": 1.0}),
     _variant("model's data", "uniform draws", {"model.balance": 0.0}),
     _variant("model", "MC-dropout 25 %, one network", _MC_DROPOUT),
-    _variant("reward", "reward and end from the transition", {"model.assessment_input": "transition"}),
+    _variant("reward", "reward and end from the transition", {"model.head_input": "transition"}),
     _variant("reward", "reward counted in tens", {"model.reward_scale": 10.0}),
     _variant("rollouts", "from the current state", {"imagination.start_states": "current"}),
     _variant("rollouts", "depth 10, breadth 3", {"imagination.depth": 10, "imagination.breadth": 3}),

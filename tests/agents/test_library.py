@@ -41,7 +41,7 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
 
 
 @pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS])
-def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
+def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
     result = do(tmp_path / "run", agent)
     first, last = result.checkpoints
     assert [row.env_steps for row in result.checkpoints] == [
@@ -87,7 +87,7 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
     assert whole.training_length.tolist() != other.training_length.tolist()
 
 
-def test_the_registry_knows_which_agents_train_themselves() -> None:
+def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
     for name, entry in registry.AGENTS.items():
         if entry.settings == "imagine_bench.agents.library.settings":
             agent = registry.make_agent(name, spec(name).context())
@@ -141,9 +141,9 @@ def test_it_is_never_taken_up_again_half_way() -> None:
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from imagine_bench.agents.library import sb3 as peers
+    from imagine_bench.agents.library import sb3
 
-    present = peers.importlib.import_module
+    present = sb3.importlib.import_module
 
     def missing(name: str) -> Any:
         if name == "sb3_contrib":
@@ -151,10 +151,10 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         return present(name)
 
     context = spec("sb3_qrdqn").context()
-    monkeypatch.setattr(peers.importlib, "import_module", missing)
+    monkeypatch.setattr(sb3.importlib, "import_module", missing)
     sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
     with pytest.raises(SetupError, match=sentence):
-        peers.make_qrdqn(context)
+        sb3.make_qrdqn(context)
     with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
         plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
 

@@ -1,11 +1,11 @@
-"""Parts and their values: found where they are, as many as there are, under jitter, and decoded again."""
+"""Factors and their values: found where they are, as many as there are, under jitter, and decoded again."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from imagine_bench.agents.encoders.factors import PartsCoder, clouds, dependence, discover
+from imagine_bench.agents.encoders.discrete_encoder import DiscreteEncoder, clouds, dependence, discover
 
 from imagine_bench.errors import InvalidValueError
 
@@ -20,8 +20,8 @@ def box(top: float, left: float, height: float, width: float) -> np.ndarray:
     return np.outer(rows, columns)
 
 
-def pictures(n: int, rng: np.random.Generator, jitter: float = 0.3) -> tuple[torch.Tensor, np.ndarray]:
-    """Two independent things that jitter: a bar that lies in 3 ways at the top, a dot in 2 places at the bottom."""
+def images(n: int, rng: np.random.Generator, jitter: float = 0.3) -> tuple[torch.Tensor, np.ndarray]:
+    """Two independent objects that jitter: a bar that lies in 3 ways at the top, a dot in 2 places at the bottom."""
     values = np.stack([rng.integers(3, size=n), rng.integers(2, size=n)], axis=1)
     frames = np.full((n, 1, SIDE, SIDE), 0.5, dtype=np.float32)
     for index, (bar, dot) in enumerate(values.tolist()):
@@ -33,22 +33,22 @@ def pictures(n: int, rng: np.random.Generator, jitter: float = 0.3) -> tuple[tor
 
 
 @pytest.fixture(scope="module")
-def found() -> PartsCoder:
-    return discover(pictures(3000, np.random.default_rng(0))[0], torch.Generator().manual_seed(0))
+def found() -> DiscreteEncoder:
+    return discover(images(3000, np.random.default_rng(0))[0], torch.Generator().manual_seed(0))
 
 
-def test_parts_and_values_are_found_without_being_told(found: PartsCoder) -> None:
+def test_factors_and_values_are_found_without_being_told(found: DiscreteEncoder) -> None:
     assert sorted(found.code_sizes) == [2, 3]
-    fresh, values = pictures(400, np.random.default_rng(1))
+    fresh, values = images(400, np.random.default_rng(1))
     codes = found.codes(fresh).numpy()
     order = [found.code_sizes.index(3), found.code_sizes.index(2)]
-    for part, truth in zip(order, values.T, strict=True):
-        pairs = set(zip(codes[:, part].tolist(), truth.tolist(), strict=True))
+    for factor, truth in zip(order, values.T, strict=True):
+        pairs = set(zip(codes[:, factor].tolist(), truth.tolist(), strict=True))
         assert len(pairs) == len(set(truth.tolist())), "each value is one code and each code one value"
 
 
-def test_a_code_is_decoded_to_how_its_values_look(found: PartsCoder) -> None:
-    fresh, _ = pictures(200, np.random.default_rng(2), jitter=0.0)
+def test_a_code_is_decoded_to_how_its_values_look(found: DiscreteEncoder) -> None:
+    fresh, _ = images(200, np.random.default_rng(2), jitter=0.0)
     mu, log_variance = found.posterior(fresh)
     assert torch.equal(mu.sum(dim=1), torch.full((200,), 2.0))
     assert (log_variance < -10).all()
@@ -56,8 +56,8 @@ def test_a_code_is_decoded_to_how_its_values_look(found: PartsCoder) -> None:
     assert (found.mean(mu) - fresh).square().mean() < 0.5 * (mean - fresh).square().mean()
 
 
-def test_still_pictures_have_no_parts() -> None:
-    with pytest.raises(InvalidValueError, match="No part with two values"):
+def test_still_images_have_no_factors() -> None:
+    with pytest.raises(InvalidValueError, match="No factor with two values"):
         discover(torch.full((50, 1, SIDE, SIDE), 0.5), torch.Generator().manual_seed(0))
 
 
