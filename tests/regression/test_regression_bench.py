@@ -111,7 +111,7 @@ def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
     data = Dataset(inputs=inputs, targets=shift + scale * (np.sin(inputs) + 0.3 * rng.normal(size=(64, 1))))
     overrides = {**dict(_overrides(agent)), "batch_size": 32}
     return RegressorContext(
-        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), preset="smoke", overrides=overrides
+        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), hyperparameters="minimal", overrides=overrides
     )
 
 
@@ -306,9 +306,9 @@ def test_wrong_words_get_one_line_and_write_nothing(
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(("preset", "epochs"), [("smoke", 4), ("quick", 120), ("thesis", 300)])
+@pytest.mark.parametrize(("preset", "epochs"), [("minimal", 4), ("fast", 120), ("published", 300)])
 def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: int) -> None:
-    one, ensemble = (regressor_settings.resolve(preset, {}, ensemble=kind) for kind in (False, True))
+    one, ensemble = regressor_settings.resolve_all(preset, {})
     assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
 
 
@@ -323,7 +323,7 @@ def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int 
 
 
 def test_dropout_is_the_one_networks_and_members_are_the_ensembles() -> None:
-    one, ensemble = regressor_settings.resolve_all("quick", {"dropout": 0.1, "members": 3})
+    one, ensemble = regressor_settings.resolve_all("fast", {"dropout": 0.1, "members": 3})
     assert (one.dropout, one.members) == (0.1, 1)
     assert (ensemble.dropout, ensemble.members) == (0.0, 3)
 
