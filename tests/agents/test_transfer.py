@@ -239,13 +239,13 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch
     live_on_latents(learner, range(8), np.random.default_rng(0))
     model = learner.imagination.model
     kept = [weight.clone() for weight in model.dynamics.parameters()]
-    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.assessment, learner.controller)]
+    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.head, learner.controller)]
     resumed.restore(learner.state())
     learner.reset_for_new_task()
     resumed.reset_for_new_task()
     model = learner.imagination.model
     assert all(bool((a == b).all()) for a, b in zip(kept, model.dynamics.parameters(), strict=True))
-    for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):
+    for before, part in zip(forgotten, (model.head, learner.controller), strict=True):
         assert any(bool((a != b).any()) for a, b in zip(before, part.parameters(), strict=True))
     assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
     assert same(learner.state(), resumed.state())

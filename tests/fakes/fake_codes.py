@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from imagine_bench.agents.factored.agent import FactoredAgent
-from imagine_bench.agents.factored.settings import resolve
+from imagine_bench.agents.factored.settings import HYPERPARAMETERS
 from torch.nn import functional
 
 from imagine_bench.interfaces import Frame, Observation, Transition
@@ -75,7 +75,9 @@ def starts() -> list[tuple[int, ...]]:
 
 
 def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
-    settings = resolve("quick", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5")
+    settings = HYPERPARAMETERS.resolve(
+        "fast", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5"
+    )
     return FactoredAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
 
 

@@ -116,7 +116,7 @@ def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
     data = Dataset(inputs=inputs, targets=shift + scale * (np.sin(inputs) + 0.3 * rng.normal(size=(64, 1))))
     overrides = {**dict(_overrides(agent)), "batch_size": 32}
     return RegressorContext(
-        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), preset="smoke", overrides=overrides
+        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), hyperparameters="minimal", overrides=overrides
     )
 
 
@@ -313,7 +313,7 @@ def test_wrong_words_get_one_line_and_write_nothing(
 
 @pytest.mark.parametrize(("preset", "epochs"), [("smoke", 4), ("quick", 120), ("thesis", 300)])
 def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: int) -> None:
-    one, ensemble = (regressor_settings.resolve(preset, {}, ensemble=kind) for kind in (False, True))
+    one, ensemble = (regressor_settings.HYPERPARAMETERS.resolve(preset, {}, kind) for kind in ("mc_dropout", "ensemble"))
     assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
 
 
