@@ -16,8 +16,9 @@ from imagine_bench.judge.calibration import (
     transform_distance,
 )
 from imagine_bench.regression.interfaces import SCORES, Floats, RegressionSpec, Regressor
-from imagine_bench.regression.results import Arrays, Row
+from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.codec import Arrays
 
 CRPS_POINTS = 50
 """Points of each network at which both distributions are scored: all weight samples together cost (T K)^2 a point."""

@@ -8,17 +8,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from test_runner import same_but_for_time, small
+from small_runs import same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
-from imagine_bench.bench import runner
+from imagine_bench.bench import phases
 from imagine_bench.bench.bench import plan
+from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.evaluation import TrainingStarts
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import ExternalTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.results import RunResult
@@ -34,7 +35,7 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
     few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": tuple(sorted(FEW.items()))}
     path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
-    result = runner.run(spec, folder, lambda progress: None)
+    result = run_observed(spec, folder, lambda progress: None)
     assert result is not None
     return result
 
@@ -75,10 +76,10 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner.run_folder, "finish", killed)
+        patch.setattr(run_folder, "finish", killed)
         do(tmp_path / "run")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner.EvaluationCounts, "add_episode", killed)
+        patch.setattr(phases, "play_test_episode", killed)
         do(tmp_path / "run")
     assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
     assert same_but_for_time(whole, do(tmp_path / "run"))

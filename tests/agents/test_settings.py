@@ -10,8 +10,8 @@ from imagine_bench.agents.presets import FAMILIES, flatten
 from imagine_bench.agents.presets import resolve as resolve_in
 from imagine_bench.agents.settings import Settings
 
-from imagine_bench.bench.protocol import PRESETS as BENCH_PRESETS
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.control import PRESETS as BENCH_PRESETS
 
 PRESETS = [(family, preset) for family in FAMILIES for preset in FAMILIES[family].presets]
 

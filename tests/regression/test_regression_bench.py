@@ -15,12 +15,12 @@ from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import plan
-from imagine_bench.bench.runs import Progress, RunSpec
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
-from imagine_bench.judge.quality import generalisation_report
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.protocols.task_types import task_types
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression import runner
@@ -28,11 +28,11 @@ from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.interfaces import SCORES, Dataset, Mixtures, Prediction, RegressorContext
 from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
+from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.trained import load_trained
-from imagine_bench.task_types import TASK_TYPES
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 
@@ -58,15 +58,10 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
 
 
 def test_every_kind_has_learners_and_all_names_load() -> None:
-    names = [name for kind in TASK_TYPES.values() for name in kind.tasks]
+    names = [name for kind in task_types().values() for name in kind.tasks]
     assert len(names) == len(set(names))
-    for kind in TASK_TYPES.values():
-        assert kind.tasks and kind.learners() and registry.load(kind.presets)
-        for target in (
-            kind.protocol, kind.plan, kind.run, kind.load_run, kind.load_so_far, kind.result, kind.write_report,
-            kind.summary_table,
-        ):  # fmt: skip
-            assert callable(registry.load(target))
+    for kind in task_types().values():
+        assert kind.tasks and kind.learners() and kind.presets
     for name in registry.REGRESSIONS:
         spec = registry.regression(name)
         assert (
