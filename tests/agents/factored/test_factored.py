@@ -16,7 +16,7 @@ from imagine_bench.agents.factored.factors import CodeTransition
 from imagine_bench.agents.factored.model import FactoredModel
 from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.planner import Planner
-from imagine_bench.agents.factored.settings import DynamicsSettings, FactoredSettings, OutcomeSettings, resolve
+from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import Imaginer, Label, ReplayReader, ValueReader
@@ -299,7 +299,7 @@ def test_curiosity_outlearns_random_exploration() -> None:
 @pytest.mark.parametrize(
     ("override", "error", "words"),
     [
-        ({"planning.exploration": "bold"}, UnknownNameError, "No exploration 'bold'"),
+        ({"planning.exploration": "bold"}, UnknownNameError, "No value of setting planning.exploration: 'bold'"),
         ({"planning.depht": 3}, UnknownNameError, "Did you mean 'planning.depth'"),
         ({"planning.depth": 0}, InvalidValueError, "planning.depth is 0; it must be at least 1"),
         ({"dynamics.persistence": 1.0}, InvalidValueError, "must lie between 0 and 1"),
@@ -309,4 +309,4 @@ def test_curiosity_outlearns_random_exploration() -> None:
 )
 def test_wrong_settings_are_refused(override: dict[str, object], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        resolve("quick", override, "chapter_5")
+        HYPERPARAMETERS.resolve("fast", override, "chapter_5")
