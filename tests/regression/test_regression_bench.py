@@ -89,7 +89,7 @@ def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> No
 
 
 @pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
-def test_variances_and_nll_are_those_of_all_weight_samples_pooled(agent: str) -> None:
+def test_variances_and_nll_are_those_of_pooled_weight_samples(agent: str) -> None:
     """Of targets far from 0 and from unit variance, so that they must be scaled back rightly."""
     rng, context = np.random.default_rng(0), tiny_context(agent, scale=50.0, shift=300.0)
     regressor = registry.make_regressor(agent, context)
@@ -176,9 +176,7 @@ def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) ->
             np.testing.assert_array_equal(array, parts.evaluations[variant][name], err_msg=name)
 
 
-def test_a_checkpoint_gives_the_variants_back_in_the_order_of_the_protocol(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_keeps_the_protocols_order_of_variants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file of arrays has no order; recordings and figures do."""
     spec = tiny("toy_regression", variants=("base", "low_data", "high_noise"), recorded=False)
 
@@ -312,7 +310,7 @@ def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int 
     assert regressor.state().values["batches"] == 2 * updates
 
 
-def test_dropout_is_the_one_networks_and_members_are_the_ensembles() -> None:
+def test_dropout_is_of_one_network_and_members_of_the_ensemble() -> None:
     one, ensemble = regressor_settings.resolve_all("fast", {"dropout": 0.1, "members": 3})
     assert (one.dropout, one.members) == (0.1, 1)
     assert (ensemble.dropout, ensemble.members) == (0.0, 3)
@@ -355,7 +353,7 @@ def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
 
 
 @pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
-def test_regressors_learn_two_branches_and_refuse_a_foreign_snapshot(agent: str) -> None:
+def test_regressors_learn_two_branches_refuse_foreign_states(agent: str) -> None:
     """Chance: |y| is uniform in [0.5, 1.5], so a network that ignores x cannot go below log 2 = 0.69 nats."""
     rng = np.random.default_rng(0)
 
