@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imagine_bench.interfaces import Floats
 from imagine_bench.judge.calibration import (
     LEVELS,
     auroc,
@@ -13,7 +14,7 @@ from imagine_bench.judge.calibration import (
     probability_transform,
     transform_distance,
 )
-from imagine_bench.regression.interfaces import SCORES, Floats, Mixtures, RegressionSpec, Regressor
+from imagine_bench.regression.interfaces import SCORES, Mixtures, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.codec import Arrays
