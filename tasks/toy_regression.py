@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.regression.interfaces import SCORES, Dataset, Floats, Predict, RegressionSpec
+from imagine_bench.interfaces import Floats
+from imagine_bench.regression.interfaces import SCORES, Dataset, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 DOMAIN = (-30.0, 30.0)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -16,7 +16,7 @@ from ..encoders.perception import load_perception, prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .exploration import last_step, query
-from .factors import Code, CodeReplay, CodeTransition, Floats
+from .factors import Code, CodeReplay, CodeTransition
 from .model import FactoredModel
 from .perception import CodePerception, ImaginedStep
 from .planner import Planner

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .factors import Codes, Floats, strides, table_size
+from imagine_bench.interfaces import Floats
+
+from .factors import Codes, strides, table_size
 from .settings import DynamicsSettings
 
 _LARGEST_TABLE = 1 << 16

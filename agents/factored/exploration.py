@@ -11,7 +11,9 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from .factors import Code, Codes, Floats, as_codes
+from imagine_bench.interfaces import Floats
+
+from .factors import Code, Codes, as_codes
 from .model import FactoredModel
 from .settings import PlanningSettings
 

@@ -15,7 +15,6 @@ from ..snapshot import Arrays
 
 Code = tuple[int, ...]
 Codes = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 def as_codes(code: Code) -> Codes:

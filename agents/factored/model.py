@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imagine_bench.interfaces import Floats
+
 from .dynamics import Dynamics
-from .factors import Code, Codes, CodeTransition, Floats, as_codes
+from .factors import Code, Codes, CodeTransition, as_codes
 from .outcomes import OutcomeModel
 from .settings import FactoredSettings
 

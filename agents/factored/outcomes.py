@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .factors import Code, Codes, CodeTransition, Floats, strides, table_size
+from imagine_bench.interfaces import Floats
+
+from .factors import Code, Codes, CodeTransition, strides, table_size
 from .settings import OutcomeSettings
 
 _LARGEST_TEMPLATE = 1 << 15

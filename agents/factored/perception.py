@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from imagine_bench.capabilities import ImaginedRollout
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import Floats, Frame
 
 from ..encoders.encoder import Encoder
-from .factors import Code, Floats
+from .factors import Code
 
 ACCEPTED = 0.5
 """A transition of which more than this is unknown is not accepted, and neither is what follows from it."""

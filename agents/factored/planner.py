@@ -14,7 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .factors import Code, Codes, Floats
+from imagine_bench.interfaces import Floats
+
+from .factors import Code, Codes
 from .model import FactoredModel
 from .settings import PlanningSettings
 

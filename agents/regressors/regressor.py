@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentState
-from imagine_bench.regression.interfaces import Dataset, Floats, Mixtures, Prediction, RegressorContext
+from imagine_bench.interfaces import AgentState, Floats
+from imagine_bench.regression.interfaces import Dataset, Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn

@@ -6,6 +6,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from imagine_bench.interfaces import Floats
 from imagine_bench.judge.calibration import (
     LEVELS,
     auroc,
@@ -15,7 +16,7 @@ from imagine_bench.judge.calibration import (
     probability_transform,
     transform_distance,
 )
-from imagine_bench.regression.interfaces import SCORES, Floats, RegressionSpec, Regressor
+from imagine_bench.regression.interfaces import SCORES, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.codec import Arrays

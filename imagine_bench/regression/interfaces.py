@@ -15,10 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentState, Motion, Shape3D
+from imagine_bench.interfaces import AgentState, Floats, Motion, Shape3D
 from imagine_bench.seeding import SeedTree
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Floats
 
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE, arm_spec
-
-Floats = NDArray[np.float64]
 
 
 class ArmModel:

@@ -9,10 +9,12 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from imagine_bench.interfaces import Floats
+
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
-from .arm_model import ArmModel, Floats
+from .arm_model import ArmModel
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose

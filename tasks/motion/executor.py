@@ -12,10 +12,11 @@ import mujoco.rollout
 import numpy as np
 
 from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces import Floats
 
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from .arm_model import ArmModel, Floats
+from .arm_model import ArmModel
 from .trajectory import Trajectory, Waypoint, plan
 
 REST_OPENING_M = 0.0365

@@ -9,10 +9,11 @@ import mink
 import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
+from imagine_bench.interfaces import Floats
 
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import HOME_QPOS_RAD
-from .arm_model import ArmModel, Floats
+from .arm_model import ArmModel
 
 POSITION_TOLERANCE_M = 2e-4
 ANGLE_TOLERANCE_RAD = 2e-3

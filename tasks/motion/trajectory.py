@@ -14,7 +14,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from .arm_model import ArmModel, Floats
+from imagine_bench.interfaces import Floats
+
+from .arm_model import ArmModel
 
 PEAK_SPEED = 15 / 8
 """Of the minimum-jerk profile, in Δq / T."""

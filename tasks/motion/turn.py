@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
-from .arm_model import ArmModel, Floats
+from .arm_model import ArmModel
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.interfaces import Floats
+
 from ..macro_env import Reading
 from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult, at_rest
@@ -25,7 +27,6 @@ from .scene import IDLE_FINGERTIP_M, IDLE_PALM_M, PALM_M, compile_pick_scene, fi
 if TYPE_CHECKING:
     from ..motion.carry import CarryExecutor
 
-Floats = NDArray[np.float64]
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Motion, Shape3D
-from imagine_bench.regression.interfaces import Floats
+from imagine_bench.interfaces import Floats, Motion, Shape3D
 
 from ..scene_reader import body_names, poses_of, shapes_of
 
