@@ -31,7 +31,7 @@ TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
 LATENT_LIMIT = 1e6
 """A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
-is in the norm of the gradient of a controller that learns from it, which must not overflow."""
+is in the square of a gradient of a controller that learns from it, which Adam keeps and which must not overflow."""
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
