@@ -20,10 +20,10 @@ from imagine_bench import registry
 from imagine_bench.errors import SetupError
 
 PACKAGES = (
-    "daqp", "dm-control", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
+    "daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
 )  # fmt: skip
-OPTIONAL_PACKAGES = ("sb3-contrib", "stable-baselines3")
-"""Of the extra ``peers``; named where they are installed."""
+OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "stable-baselines3")
+"""Of adapters and of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 """What decides results, in a checkout."""
@@ -117,10 +117,17 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "cpu": cpu_model(),
         "cores": usable_cores(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "memory_gib": _memory_gib(),
         "gpu": gpu_model(),
         "thread_variables": {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ},
     }
+
+
+def _memory_gib() -> float | None:
+    """Memory of the machine; None where the system does not say."""
+    if not hasattr(os, "sysconf"):
+        return None
+    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
 
 
 def cpu_model() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, ImaginedRollout, planned_actions
+from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -122,17 +122,17 @@ class FactoredAgent:
         self.model.outcomes.reset_for_new_task()
         self.planner.clear()
 
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
         """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.exploration`."""
         with self.meters.cpu_time("time/model_s"):
             code = self.perception.code(observation.frame)
             return query(self.model, code, self.settings.planning, without=self.replay.without_label)
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
         """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no label."""
         code, action, following = last_step(self.model, self.perception.code(observation.frame), actions)
-        reward, terminated = (0.0, False) if answer is None else (answer.reward, answer.terminated)
-        labelled = answer is not None
+        reward, terminated = (0.0, False) if label is None else (label.reward, label.terminated)
+        labelled = label is not None
         self.replay.add(
             CodeTransition(code, action, following, reward, terminated, has_dynamics=False, has_reward=labelled)
         )

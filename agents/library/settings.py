@@ -8,7 +8,7 @@ from ..settings import COUNT, POSITIVE, PROBABILITY, Hyperparameters, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class LibrarySettings:
+class SB3Settings:
     """Keywords of ``stable_baselines3.DQN`` and ``sb3_contrib.QRDQN`` that differ from the library's own.
 
     Attributes:
@@ -37,10 +37,10 @@ class LibrarySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeerSettings:
-    """All settings of a peer."""
+class LibrarySettings:
+    """All settings of an agent from Stable-Baselines3."""
 
-    sb3: LibrarySettings = field(default_factory=LibrarySettings)
+    sb3: SB3Settings = field(default_factory=SB3Settings)
 
 
-HYPERPARAMETERS = Hyperparameters.everywhere(PeerSettings())
+HYPERPARAMETERS = Hyperparameters.everywhere(LibrarySettings())

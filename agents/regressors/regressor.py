@@ -17,12 +17,12 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.regression import Dataset, Floats, Mixtures, Prediction, RegressorContext
+from imagine_bench.regression.interfaces import Dataset, Floats, Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
-from ..imagination.uncertainty import decompose, drawn_variance, surprise
+from ..imagination.uncertainty import decompose, nll, sampled_component_variance
 from ..networks.mlp import dropout_mask
 from ..networks.precision import settle
 from ..snapshot import (
@@ -40,7 +40,7 @@ from .settings import HYPERPARAMETERS, RegressorSettings
 from .stationarity import jensen_shannon
 
 _ROWS = 256
-"""Rows assessed at a time: T mixtures of each are in memory."""
+"""Rows predicted at a time: T mixtures of each are in memory."""
 
 
 class MixtureRegressor:
@@ -111,11 +111,11 @@ class MixtureRegressor:
         return {"loss/likelihood": float(np.mean(losses))} if losses else {}
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
-        """Predict and say how sure that is; see :class:`imagine_bench.regression.Regressor`."""
+        """Predict, with uncertainties; see :class:`imagine_bench.regression.interfaces.Regressor`."""
         self._require_inputs(inputs)
         generator = self._generator(int(rng.integers(2**62)))
         return _joined([
-            _joined([self._assess_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
+            _joined([self._predict_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
             for e in range(self.networks)
         ])  # fmt: skip
 
@@ -181,16 +181,16 @@ class MixtureRegressor:
         samples = self._trained.weight_samples(part, x, masks)
         return rescaled(samples, self._shift[network], self._scale[network])
 
-    def _assess_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
+    def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
         samples = self._weight_samples(network, x)
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
-        drawn = drawn_variance(samples, predictive, prediction, self.settings.members)
+        sampled = sampled_component_variance(samples, predictive, prediction, self.settings.members)
         return Prediction(
             prediction=prediction.double().cpu().numpy(),
-            drawn=drawn.double().cpu().numpy(),
-            surprise=surprise(samples, prediction).double().cpu().numpy(),
+            sampled_variance=sampled.double().cpu().numpy(),
+            nll=nll(samples, prediction).double().cpu().numpy(),
             mean=mdn.mean(samples).mean(dim=0).double().cpu().numpy(),
             epistemic=parts.epistemic.double().cpu().numpy(),
             aleatoric=parts.aleatoric.double().cpu().numpy(),
@@ -236,7 +236,7 @@ def _numpy(mixture: Mixture) -> Mixtures:
 
 
 def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
-    """Assessments joined along rows, or stacked as networks where no axis is given."""
+    """Predictions joined along rows, or stacked as networks where no axis is given."""
     join = np.stack if axis is None else np.concatenate
 
     def field(owner: Sequence[object], name: str) -> Floats:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import ProtocolData, digest, require_seeds
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
+from imagine_bench.protocols.data import ProtocolData, digest, require_seeds
 
 _SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -33,7 +33,7 @@ class RegressionProtocol(ProtocolData):
         test_points: Unseen points of each network, for errors and calibration.
         recorded: Whether runs leave a recording.
         overrides: Settings that replace the preset's, as sorted (name, value) pairs.
-        settings_digest: As of :class:`imagine_bench.bench.protocol.Protocol`.
+        settings_digest: As of :class:`imagine_bench.protocols.data.ProtocolData`.
         device: ``"cpu"`` or ``"cuda"``.
     """
 

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import Protocol
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.task_types import Result
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import is_archive
-from imagine_bench.store.bench_folder import BenchStore, read_protocol
+from imagine_bench.store.bench_folder import BenchStore, read_control
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import read_json, reading
 from imagine_bench.store.results import BenchResult, RunResult
@@ -35,7 +36,7 @@ class Trained:
     """
 
     agent: Agent
-    spec: RunSpec
+    spec: RunSpec[Protocol]
     task: TaskSpec
     episodes: int
     folder: Path
@@ -92,24 +93,18 @@ def require_control(task: str, what: str) -> None:
         raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
 
 
-def require_runs(bench: Path) -> None:
-    """Raise ArtefactError for results that were kept without the agents."""
+def protocol_of_agents(bench: Path) -> Protocol:
+    """The protocol of a bench whose agents can be taken up again.
+
+    Raises:
+        ArtefactError: There is none, or it is of a regression task, or its results were kept without the agents.
+    """
+    protocol = read_control(bench)
     if is_archive(bench):
         raise ArtefactError(
             f"{bench} holds kept results and no agents; give a bench's own folder, runs/<task>/<preset>-<hash>."
         )
-
-
-def imagining(result: BenchResult) -> tuple[RunResult, ...]:
-    """The runs of a bench whose agents imagine.
-
-    Raises:
-        ArtefactError: There are none.
-    """
-    runs = tuple(run for run in result.runs if run.imagined)
-    if not runs:
-        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
-    return runs
+    return protocol
 
 
 def learners(bench: Path) -> tuple[Path, ...]:
@@ -118,7 +113,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
     Raises:
         ArtefactError: There are none.
     """
-    protocol = read_protocol(bench)
+    protocol = read_control(bench)
     store = BenchStore(bench, protocol)
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
     able = [agent for agent, entry in entries.items() if entry.learns and not entry.external_training_loop]
@@ -138,13 +133,16 @@ def _has_learned(run: Path) -> bool:
     return snapshot is not None and snapshot.episode > 0
 
 
-def best_run(result: BenchResult) -> RunResult:
+def best_run(result: Result) -> RunResult:
     """The imagining run of a bench that solves most of its last test; of equals, most of the one before, and so on.
 
     Raises:
         ArtefactError: There is none.
     """
-    return max(imagining(result), key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
+    runs = [run for run in result.runs if run.imagined] if isinstance(result, BenchResult) else []
+    if not runs:
+        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
+    return max(runs, key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
 
 
 def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:

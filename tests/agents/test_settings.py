@@ -14,8 +14,8 @@ from imagine_bench.agents.regressors import settings as regressor_settings
 from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import PRESETS
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.control import PRESETS
 from imagine_bench.regression.protocol import PRESETS as REGRESSION_PRESETS
 
 

@@ -18,7 +18,7 @@ from imagine_bench.agents.factored.exploration import last_step, likeliest
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only as imagination_only
 
-from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
+from imagine_bench.capabilities import Label, QueryingAgent, TransferLearner
 from imagine_bench.interfaces import Observation
 
 GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
@@ -135,21 +135,21 @@ def ask(learner: FactoredAgent, questions: int, code: tuple[int, ...] = (0, 1, 1
     """Let it ask and answer truly; the plans asked about."""
     asked = []
     for _ in range(questions):
-        actions = learner.question(Observation(frame=frame(code)))
+        actions = learner.query(Observation(frame=frame(code)))
         if actions is None:
             break
         asked.append(tuple(actions.tolist()))
         here = code
         for action in actions:
             here, reward, ended = _STEP(here, int(action))
-        learner.learn_label(Observation(frame=frame(code)), actions, Answer(reward, ended))
+        learner.learn_label(Observation(frame=frame(code)), actions, Label(reward, ended))
     return asked
 
 
 def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics() -> None:
     learner = agent()
     assert isinstance(learner, QueryingAgent)
-    assert learner.question(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
+    assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
     learner.learn()  # what was no surprise too
     known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.replay.count_real()
@@ -184,7 +184,7 @@ def test_what_has_no_answer_is_not_asked_again() -> None:
     live(learner, range(12), np.random.default_rng(0))
     seen, asked = Observation(frame=frame((0, 1, 1))), []
     for _ in range(5):
-        actions = learner.question(seen)
+        actions = learner.query(seen)
         assert actions is not None
         code, action, _ = last_step(learner.model, (0, 1, 1), actions)
         asked.append((code, action))

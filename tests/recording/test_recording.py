@@ -13,13 +13,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
 from numpy.typing import NDArray
+from recordings import contents, rerun, times
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
-from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.judge.imagination_quality import compare_rollout
 from imagine_bench.recording import episodes, q_table, record_run, recording_file
 from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
 
@@ -36,19 +37,6 @@ VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: str | int) -> Path:
     settings = {"seed": 3, "execution": "kinematic", "appearance": "mild", "episodes": 2, **changes}
     return record_run("arrow_puzzle", agent, name=name, path=path, **settings)  # type: ignore[arg-type]
-
-
-def contents(path: Path) -> dict[str, set[str]]:
-    """Entity paths and their timelines."""
-    found: dict[str, set[str]] = {}
-    for chunk in RrdReader(path).stream():
-        found.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
-    return found
-
-
-def rerun(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rerun", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +62,6 @@ def test_entities_and_timelines(imagined: Path) -> None:
         assert found[path] >= {"sim_time", "env_step", "episode"}
     assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
     assert all("imagined_depth" in found[path] for path in BY_DEPTH)
-
-
-def times(path: Path, entity: str, timeline: str) -> set[int]:
-    """When something was logged for an entity."""
-    return {
-        time
-        for chunk in RrdReader(path).stream()
-        if chunk.entity_path == entity and timeline in chunk.timeline_names
-        for time in chunk.to_record_batch().column(timeline).to_pylist()
-    }
 
 
 def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:

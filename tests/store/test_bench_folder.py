@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runner import do, same_but_for_time, small
+from small_runs import do, same_but_for_time, small
 
 from imagine_bench.bench.bench import bench
 from imagine_bench.bench.launchers import launcher
 from imagine_bench.errors import ArtefactError, BusyError
-from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
+from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import write_json
-from imagine_bench.store.results import OpenLoop
+from imagine_bench.store.results import Checkpoint, OpenLoop
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
@@ -95,7 +95,7 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     assert "color" in path.read_text()
 
 
-def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
+def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     opened(tmp_path).begin_session(_ENVIRONMENT)
     changed = opened(tmp_path).begin_session({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
     assert changed == ["versions"]
@@ -105,7 +105,7 @@ def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
     assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]
 
 
-def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
+def test_a_session_that_was_killed_at_any_write_can_be_begun_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for survived in (0, 1):
@@ -127,7 +127,7 @@ def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
 
 
 @pytest.mark.parametrize("content", ["[{}]", "[1]", '[{"wall_s": null}]'])
-def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
+def test_sessions_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
     store = opened(tmp_path)
     store.begin_session(_ENVIRONMENT)
     (store.folder / "sessions.json").write_text(content)
@@ -136,7 +136,7 @@ def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> No
 
 
 @pytest.mark.parametrize(("name", "content"), [("sessions.json", "null"), ("environment.json", "[]")])
-def test_a_damaged_sitting_is_named(tmp_path: Path, name: str, content: str) -> None:
+def test_a_damaged_session_is_named(tmp_path: Path, name: str, content: str) -> None:
     store = opened(tmp_path)
     store.begin_session(_ENVIRONMENT)
     (store.folder / name).write_text(content)
@@ -180,7 +180,8 @@ def test_imagined_rollouts_and_open_loop_come_back(tmp_path: Path) -> None:
         assert isinstance(row.open_loop, OpenLoop)
         assert row.open_loop.count.tolist() == [6] * 10
         assert row.open_loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
-        again = run_folder.checkpoint_from_json(json.loads(json.dumps(run_folder.checkpoint_to_json(row))))
+        values, arrays = pack(row)
+        again = unpack(Checkpoint, json.loads(json.dumps(values)), arrays)
         assert again.open_loop is not None
         np.testing.assert_array_equal(again.open_loop.correct_accepted, row.open_loop.correct_accepted)
         assert np.isnan(row.open_loop.correct_accepted[3:]).all()

@@ -19,7 +19,7 @@ from imagine_bench.agents.factored.planner import Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, Imaginer, ReplayReader, ValueReader
+from imagine_bench.capabilities import Imaginer, Label, ReplayReader, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 
@@ -279,7 +279,7 @@ def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored
     done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
     for code, action in done:
         learner.observe(fake_codes.transition(code, action), episode=0)
-    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
+    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Label(reward=1.0, terminated=True))
     macrostates, actions = learner.replayed()
     assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
 
