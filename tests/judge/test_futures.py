@@ -193,8 +193,9 @@ def learned(components: int) -> Imagination:
         after, reward, over = TableSampler()._next(state, action, rng)
         sigma = torch.full((LATENTS,), 0.05)
         real.add((CODES[state], sigma), action, reward, (CODES[after], sigma), over)
-    for _ in range(20):
-        imagination.learn(real)
+    draws = torch.Generator().manual_seed(1)
+    for batch in real.sample(20 * 16 * 64, draws).split(64):
+        imagination.model.update(batch, draws)
     return imagination
 
 
