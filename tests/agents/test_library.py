@@ -96,7 +96,7 @@ def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
             assert not entry.external_training_loop
 
 
-def test_its_episodes_start_where_every_agent_of_that_seed_starts() -> None:
+def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
     entry = registry.task_entry("arrow_puzzle")
     with_starts = TrainingStarts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
     plain = gymnasium.make(entry.env_id, execution="kinematic")

@@ -36,9 +36,9 @@ class FakeCodes:
 
 
 def frame(code: tuple[int, ...]) -> Frame:
-    picture = np.zeros((64, 64, 3), dtype=np.uint8)
-    picture[0, : len(code), 0] = code
-    return picture
+    image = np.zeros((64, 64, 3), dtype=np.uint8)
+    image[0, : len(code), 0] = code
+    return image
 
 
 def step(code: tuple[int, ...], action: int) -> tuple[tuple[int, ...], float, bool]:

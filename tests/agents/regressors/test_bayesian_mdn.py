@@ -57,7 +57,7 @@ def test_networks_differ_from_one_another() -> None:
 
 
 def test_clipping_one_member_leaves_the_others() -> None:
-    settings = MDNSettings(hidden=(16,), components=2, dropout=0.0, gradient_clip=0.5)
+    settings = MDNSettings(hidden=(16,), components=2, gradient_clip=0.5, dropout=0.0)
     x, y = data(2)
     wild = y.clone()
     wild[0] *= 1e3
@@ -82,11 +82,11 @@ def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
     assert moved == [True, True, False, True, False, False], "weights, then biases; hidden biases begin at 0"
 
 
-def test_folding_gives_what_the_normed_network_gives_on_a_batch_of_the_noted_statistics() -> None:
+def test_folding_gives_what_the_normed_network_gives() -> None:
     network = NormedMLP((2, 16, 16, 3), generators=[generator(0), generator(1)], dropout=0.0)
     x, _ = data(2, rows=300)
     for _ in range(3):
-        expected = network(x.mT.contiguous(), None).mT  # the same batch again: the noted statistics are its own
+        expected = network(x.mT.contiguous(), None).mT  # the same batch again: the running statistics are its own
         network.update_running_stats()
     torch.testing.assert_close(network.folded()(x), expected, rtol=1e-4, atol=1e-4)
 
@@ -96,7 +96,7 @@ def test_dropped_units_are_dropped_after_folding_too() -> None:
     network = NormedMLP((2, 16, 16, 3), generators=[generator(0)], dropout=0.5)
     x, _ = data(1, rows=200)
     mask = [dropout_mask((1, 16), 0.5, generator(5)) for _ in range(2)]
-    spread = [m.view(1, 16, 1).expand(1, 16, 200).contiguous() for m in mask]
+    spread = [each.view(1, 16, 1).expand(1, 16, 200).contiguous() for each in mask]
     expected = network(x.mT.contiguous(), spread).mT
     network.update_running_stats()
     torch.testing.assert_close(sample_outputs(network.folded(), x[0], mask)[0], expected[0], rtol=1e-3, atol=1e-3)
@@ -170,7 +170,7 @@ def gaussians(means: list[float], sigma: float) -> Mixture:
     return Mixture(torch.zeros(count, 1, 1), values, torch.full_like(values, math.log(sigma)))
 
 
-def test_equal_distributions_are_stationary_and_disjoint_ones_as_far_as_can_be() -> None:
+def test_equal_distributions_diverge_by_0_disjoint_ones_by_log_t() -> None:
     assert jensen_shannon(gaussians([1.0] * 5, 1.0), 50, generator())[0].item() == pytest.approx(0.0, abs=1e-5)
     apart = gaussians([100.0 * t for t in range(5)], 1.0)
     assert jensen_shannon(apart, 4, generator())[0].item() == pytest.approx(math.log(5), abs=1e-5)
@@ -204,7 +204,7 @@ def test_sigmas_stay_between_floor_and_ceiling() -> None:
     assert sigmas[2].item() == pytest.approx(1.0, rel=0.1)  # in between hardly touched
 
 
-def test_a_likelihood_that_is_not_finite_is_named_and_leaves_weights_and_statistics() -> None:
+def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
     model = BayesianMDN(2, 2, _SMALL, [generator(0), generator(1)])
     x, y = data(2)
     y[1, 3, 0] = math.nan
