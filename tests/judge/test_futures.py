@@ -180,9 +180,9 @@ def learned(components: int) -> Imagination:
         reward_hidden=(),
         termination_hidden=(),
         dropout=0.0,
-        learning_rate=5e-3,
+        learning_rate=2e-3,
         sigma_floor=0.05,
-        batch_size=64,
+        batch_size=256,
     )
     settings = Settings(model=model, imagination=ImaginationSettings(weight_samples=1))
     device = prepare_torch("cpu")
@@ -194,7 +194,7 @@ def learned(components: int) -> Imagination:
         sigma = torch.full((LATENTS,), 0.05)
         real.add((CODES[state], sigma), action, reward, (CODES[after], sigma), over)
     draws = torch.Generator().manual_seed(1)
-    for batch in real.sample(20 * 16 * 64, draws).split(64):
+    for batch in real.sample(640 * 256, draws).split(256):
         imagination.model.update(batch, draws)
     return imagination
 
