@@ -35,6 +35,17 @@ class Batch:
     next_z: Tensor
     terminated: Tensor
 
+    def split(self, size: int) -> list[Batch]:
+        """Batches of ``size`` transitions each, one behind another."""
+        return [Batch(*parts) for parts in zip(*(column.split(size) for column in self._columns()), strict=True)]
+
+    def where(self, chosen: Tensor) -> Batch:
+        """The transitions that a mask (B,) chooses."""
+        return Batch(*(column[chosen] for column in self._columns()))
+
+    def _columns(self) -> tuple[Tensor, ...]:
+        return self.z, self.action, self.reward, self.next_z, self.terminated
+
 
 class _Ring:
     """Named columns of a fixed number of rows; a full ring overwrites its oldest ones."""
@@ -118,9 +129,9 @@ class RealMemory(_Ring):
         Args:
             count: B.
             generator: Draws rows and latents.
-            spread: Latents are drawn with this many times the posterior's standard deviation.
+            spread: Latents are sampled with this many times the posterior's standard deviation.
             balance: A transition's probability is proportional to n ** -balance, with n the number of those of the same
-                reward and end: 0 draws all alike, 1 draws every outcome as often.
+                reward and end: 0 makes all transitions equally likely, 1 all outcomes.
         """
         rows = self._draw(count, generator, self._weights(balance) if balance else None)
         noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * spread

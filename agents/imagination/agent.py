@@ -72,8 +72,13 @@ class ImaginingAgent(DQN):
 
     def learn_model(self) -> None:
         """N_E updates of the world model on real transitions."""
+        model, draws = self.imagination.model, self.imagination.generators
+        settings, size = model.settings, model.settings.batch_size
         with self.meters.cpu_time("time/model_s"):
-            for losses in self.imagination.learn(self.real):
+            rows = settings.updates_per_step * size  # for all updates at once, which is quicker
+            sampled = self.real.sample(rows, draws["replay"], spread=settings.spread, balance=settings.balance)
+            for batch in sampled.split(size):
+                losses = model.update(batch, draws["dropout"])
                 for name, value in asdict(losses).items():
                     self.meters.add(f"loss/{name}", value)
         self.meters.count("time/model_s")

@@ -8,7 +8,7 @@ of the reward network disagree there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,13 +25,13 @@ from . import mixture as mdn
 from .mixture import Mixture
 from .settings import Settings
 from .uncertainty import decompose, reduction
-from .world_model import ModelLosses, WorldModel
+from .world_model import WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
 LATENT_LIMIT = 1e6
 """A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
-is in the norm of the gradient of a controller that learns from it, which must not overflow."""
+is in the square of a gradient of a controller that learns from it, which Adam keeps and which must not overflow."""
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
@@ -118,11 +118,11 @@ class Imagination:
                 "imagination.weight_samples above 1, or imagination.reward_threshold to null."
             )
         self.settings, self.filtered = settings.imagination, filtered
-        self._generators = {
+        self.generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
             for name in ("weights", "replay", "dropout", "rollouts")
         }
-        self.model = WorldModel(latent_size, n_actions, settings.model, self._generators["weights"])
+        self.model = WorldModel(latent_size, n_actions, settings.model, self.generators["weights"])
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
         self._reduce = reduction(self.settings.reduction)
         self.threshold = self.settings.threshold
@@ -130,20 +130,10 @@ class Imagination:
     def reset_for_new_task(self) -> None:
         """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
         known, model = self.model.dynamics.state_dict(), self.model
-        self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self._generators["weights"])
+        self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self.generators["weights"])
         self.model.dynamics.load_state_dict(known)
         self.memory.clear()
         self.threshold = self.settings.threshold
-
-    def learn(self, real: RealMemory) -> list[ModelLosses]:
-        """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
-        settings = self.model.settings
-        updates, size = settings.updates_per_step, settings.batch_size
-        drawn = real.sample(
-            updates * size, self._generators["replay"], spread=settings.spread, balance=settings.balance
-        )
-        parts = zip(*(getattr(drawn, field.name).split(size) for field in fields(Batch)), strict=True)
-        return [self.model.update(Batch(*part), self._generators["dropout"]) for part in parts]
 
     def draw_weights(self, generator: torch.Generator) -> Weights:
         """T weight samples of what the filter reads."""
@@ -152,7 +142,7 @@ class Imagination:
         return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self._reads_reward else None)
 
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
-        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'.
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then sample z'.
 
         Raises:
             DivergedError: What the model predicts is NaN.
@@ -178,7 +168,7 @@ class Imagination:
     def keeps(self, step: Imagined) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
 
-        A variance that is drawn whole and fed back can grow without bound, within some five imagined steps.
+        A variance that is sampled in full and fed back can grow without bound, within some five imagined steps.
         """
         keep = step.next_z.abs().amax(dim=-1) < LATENT_LIMIT
         if not self.filtered:
@@ -201,9 +191,9 @@ class Imagination:
             real: What really happened so far.
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
-        settings, generator = self.settings, self._generators["rollouts"]
-        weights = self.draw_weights(self._generators["dropout"])
-        self.move_threshold(real, weights, self._generators["replay"])
+        settings, generator = self.settings, self.generators["rollouts"]
+        weights = self.draw_weights(self.generators["dropout"])
+        self.move_threshold(real, weights, self.generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):
             action = self.act(controller, z, max(epsilon, settings.exploration), generator)
@@ -214,7 +204,7 @@ class Imagination:
             predicted, accepted = predicted + len(z), accepted + kept
             if kept:
                 batch = Batch(z, action, step.reward, step.next_z, terminated.float())
-                self.memory.add(Batch(*(getattr(batch, field.name)[keep] for field in fields(Batch))))
+                self.memory.add(batch.where(keep))
             z = step.next_z[keep & ~terminated]
             if len(z) == 0:
                 break
@@ -224,7 +214,7 @@ class Imagination:
         """Where this step's rollouts begin. Shape (I_B, Z)."""
         if self.settings.start_states == "current":
             return current.expand(self.settings.breadth, -1)
-        return real.sample(self.settings.breadth, self._generators["replay"]).z
+        return real.sample(self.settings.breadth, self.generators["replay"]).z
 
     def move_threshold(self, real: RealMemory, weights: Weights, generator: torch.Generator) -> None:
         """Where the settings want it, set the threshold to a quantile of the uncertainty about real transitions."""
@@ -245,7 +235,7 @@ class Imagination:
 
     def arrays(self) -> snapshot.Arrays:
         """Copies of weights, moments, memory and generators."""
-        generators = {name: snapshot.generator_array(generator) for name, generator in self._generators.items()}
+        generators = {name: snapshot.generator_array(generator) for name, generator in self.generators.items()}
         return {
             **snapshot.prefixed("model", snapshot.training_arrays(self.model, self.model.optimiser)),
             **snapshot.prefixed("memory", self.memory.arrays()),
@@ -258,7 +248,7 @@ class Imagination:
         snapshot.load_training(self.model, self.model.optimiser, snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)
         self.threshold = float(arrays["threshold"])
-        for name, generator in self._generators.items():
+        for name, generator in self.generators.items():
             snapshot.load_generator(generator, arrays[f"generator/{name}"])
 
 

@@ -52,12 +52,12 @@ class WorldModelSettings:
         max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
         updates_per_step: Model updates a real step, N_E.
         batch_size: Transitions an update.
-        spread: Latents of a batch are drawn from N(mu, (spread sigma)^2), anew for each batch; the thesis draws with 1.
+        spread: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1.
             Where an encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the
             few frames they saw by heart; a larger spread keeps them from it.
-        balance: How much batches make up for rare outcomes: a transition is drawn in proportion to n ** -balance, with
-            n the number of replayed ones of the same reward and end. The thesis draws all alike, 0. A good policy
-            fails rarely, and a model that has forgotten what fails imagines that nothing does.
+        balance: How much batches make up for rare outcomes: a transition is sampled in proportion to n ** -balance,
+            with n the number of replayed ones of the same reward and end. In the thesis all are equally likely, 0. A
+            good policy fails rarely, and a model that has forgotten what fails imagines that nothing does.
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
@@ -107,12 +107,12 @@ class ImaginationSettings:
         end_episode: First training episode that imagines no more; its updates are made on real transitions instead, of
             which there are enough by then. None: imagination never ends (thesis).
         start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``,
-            states drawn from the real memory.
+            states sampled from the real memory.
         model_only_episodes: Imagined episodes of a controller that is trained in the model alone (thesis 3.2.2).
         breadth: Rollouts a real step, I_B.
         depth: Longest rollout in macro-actions, I_D.
         updates_per_step: Controller updates on imagined transitions a real step, N_I.
-        temperature: Scale of the component's standard deviation when z' is drawn: 1 the thesis, 0 its mean.
+        temperature: Scale of the component's standard deviation when z' is sampled: 1 the thesis, 0 its mean.
         exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
         weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
         reduction: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation

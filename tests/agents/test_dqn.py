@@ -14,7 +14,7 @@ from imagine_bench.agents.snapshot import load_training, training_arrays
 from imagine_bench.errors import DivergedError
 
 
-def test_target_by_hand_termination_stops_bootstrapping_and_truncation_does_not() -> None:
+def test_termination_stops_bootstrapping_truncation_does_not() -> None:
     reward, q_next = torch.tensor([50.0, -1.0]), torch.tensor([[3.0, 7.0], [3.0, 7.0]])
     ended_and_cut_off = torch.tensor([1.0, 0.0])  # a truncated transition is stored with terminated = 0
     assert td_target(reward, ended_and_cut_off, q_next, 0.9).tolist() == pytest.approx([50.0, -1.0 + 0.9 * 7.0])
@@ -64,7 +64,7 @@ def test_no_gradient_flows_through_the_target() -> None:
     assert expected.abs().max() > 0.0
 
 
-def test_a_loss_that_is_no_number_stops_the_run_and_leaves_the_weights() -> None:
+def test_a_loss_that_is_no_number_leaves_the_weights() -> None:
     controller = make()
     before = weights(controller)
     with pytest.raises(DivergedError, match=r"controller's loss is nan. Lower controller.learning_rate"):
@@ -72,7 +72,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_leaves_the_weights() -> None
     assert torch.equal(weights(controller), before)
 
 
-def test_a_target_network_follows_at_its_rate_and_gives_the_targets() -> None:
+def test_a_target_network_follows_at_its_rate() -> None:
     settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
     controller = Controller(3, 2, settings, torch.Generator().manual_seed(0))
     before = weights(controller.network)

@@ -52,7 +52,7 @@ def test_the_imagined_memory_keeps_only_recent_imagination() -> None:
     assert torch.equal(batch.next_z, batch.z + 0.5)
 
 
-def test_more_rows_at_once_than_there_is_room_for_leave_the_last_in_pairs() -> None:
+def test_more_rows_than_fit_leave_the_last_ones_in_pairs() -> None:
     memory = ImaginedMemory(3, 2, CPU)
     z = torch.arange(8, dtype=torch.float32)[:, None].expand(8, 2)
     memory.add(Batch(z, torch.zeros(8, dtype=torch.int64), z[:, 0], z + 0.5, torch.zeros(8)))
@@ -109,7 +109,7 @@ def test_rare_outcomes_are_drawn_as_often_as_the_balance_says(balance: float, ex
     assert float((drawn.terminated == 0.0).float().mean()) == pytest.approx(expected, abs=0.01)
 
 
-def test_the_same_reward_with_and_without_an_end_are_two_outcomes() -> None:
+def test_one_reward_with_and_without_an_end_is_two_outcomes() -> None:
     memory, nothing = RealMemory(8, 2, CPU), (torch.zeros(2), torch.zeros(2))
     for reward, terminated in ((1.0, True), (1.0, False), (2.0, False), (2.0, False)):
         memory.add(nothing, 0, reward, nothing, terminated)

@@ -165,7 +165,7 @@ def test_an_unknown_config_group_lists_what_exists() -> None:
         resolve("fast", {}, "chapter_4")
 
 
-def test_the_dqn_has_the_controller_s_settings_of_those_who_imagine() -> None:
+def test_the_dqn_and_imagining_agents_share_their_settings() -> None:
     for group in CONFIG_GROUPS:
         for name in SETS:
             dqn, imagining = ALL["dqn"].resolve(name, {}, group), resolve(name, {}, group)
@@ -199,7 +199,7 @@ def test_settings_cannot_be_changed() -> None:
         Settings().controller.discount = 0.1  # type: ignore[misc]
 
 
-def test_an_unknown_setting_lists_what_exists_and_the_nearest_name() -> None:
+def test_an_unknown_setting_lists_what_exists() -> None:
     with pytest.raises(
         UnknownNameError, match=r"No setting 'controller.discont'. Did you mean 'controller.discount'"
     ) as e:

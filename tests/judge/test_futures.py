@@ -180,9 +180,9 @@ def learned(components: int) -> Imagination:
         reward_hidden=(),
         termination_hidden=(),
         dropout=0.0,
-        learning_rate=5e-3,
+        learning_rate=2e-3,
         sigma_floor=0.05,
-        batch_size=64,
+        batch_size=256,
     )
     settings = Settings(model=model, imagination=ImaginationSettings(weight_samples=1))
     device = prepare_torch("cpu")
@@ -193,8 +193,9 @@ def learned(components: int) -> Imagination:
         after, reward, over = TableSampler()._next(state, action, rng)
         sigma = torch.full((LATENTS,), 0.05)
         real.add((CODES[state], sigma), action, reward, (CODES[after], sigma), over)
-    for _ in range(20):
-        imagination.learn(real)
+    draws = torch.Generator().manual_seed(1)
+    for batch in real.sample(640 * 256, draws).split(256):
+        imagination.model.update(batch, draws)
     return imagination
 
 

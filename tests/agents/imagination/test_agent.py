@@ -97,7 +97,7 @@ def test_algorithm_1_in_its_order(monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls == [*waking, "imagine", *["imagined 8"] * 4]
 
 
-def test_rollouts_begin_where_the_robot_acted_and_explore_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rollouts_begin_and_explore_as_the_robot_acts(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = imagination_agents.make(context(monkeypatch))
     given: list[tuple[list[float], float]] = []
     rollouts = agent.imagination.rollouts
@@ -115,7 +115,7 @@ def test_rollouts_begin_where_the_robot_acted_and_explore_as_it_does(monkeypatch
     assert chances[0] > chances[-1] > 0.0
 
 
-def test_batches_of_the_model_are_spread_and_balanced_and_those_of_the_controller_are_not(
+def test_only_the_model_s_batches_are_spread_and_balanced(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     wanted = {"spread": 4.0, "balance": 0.5}
@@ -126,7 +126,7 @@ def test_batches_of_the_model_are_spread_and_balanced_and_those_of_the_controlle
     assert how == [*[{}] * agent.settings.controller.updates_per_step, wanted]
 
 
-def test_after_imagination_its_updates_are_made_on_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_imagination_updates_are_on_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two agents are one until the last episode that imagines; then one's imagined memory stays as it is."""
     forever, ending = (
         imagination_agents.make_uncertainty(context(monkeypatch, {"imagination.end_episode": end})) for end in (None, 5)
@@ -168,9 +168,7 @@ def test_truncation_is_stored_as_alive_and_termination_as_ended(monkeypatch: pyt
 
 
 @imaginers
-def test_imagining_for_a_picture_changes_nothing_and_follows_its_generator(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_imagine_changes_nothing_and_follows_its_generator(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = MAKERS[kind](context(monkeypatch))
     live(agent, range(4), np.random.default_rng(0))
     assert isinstance(agent, Imaginer)
@@ -198,9 +196,7 @@ def test_imagining_for_a_picture_changes_nothing_and_follows_its_generator(
 
 
 @imaginers
-def test_what_is_held_likeliest_is_what_one_component_without_noise_imagines(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_predict_map_is_imagination_without_noise(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     overrides = {"model.components": 1, "imagination.temperature": 0.0, "model.dropout": 0.01}
     agent = MAKERS[kind](context(monkeypatch, overrides))
     live(agent, range(4), np.random.default_rng(0))

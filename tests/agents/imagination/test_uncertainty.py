@@ -58,7 +58,7 @@ def test_each_cause_is_its_equation() -> None:
     torch.testing.assert_close(parts.modal, ((alpha * mu.square()).sum(2) - inner.square()).mean(0))  # 4.27
 
 
-def test_one_weight_sample_has_no_epistemic_and_one_component_no_modal_uncertainty() -> None:
+def test_single_samples_and_components_have_no_spread() -> None:
     mixtures = samples(torch.float64)
     lone = Mixture(mixtures.log_weights[:1], mixtures.means[:1], mixtures.log_sigmas[:1])
     assert decompose(lone).epistemic.abs().max() == 0.0
@@ -73,7 +73,7 @@ def test_reductions_by_name(name: str, expected: float) -> None:
     assert reduction(name)(torch.tensor([[1.0, 2.0, 3.0]])).tolist() == [expected]
 
 
-def test_a_drawn_value_is_as_uncertain_as_the_component_it_came_from() -> None:
+def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
     """Two components far apart: noise 1 and weights that move the mean by 1, noise 9 and weights that agree."""
     means = torch.tensor([[[[0.0], [100.0]]], [[[2.0], [100.0]]]])  # [T = 2, N = 1, K = 2, Z = 1]
     log_sigmas = torch.tensor([1.0, 3.0]).log().view(1, 1, 2, 1).expand(2, 1, 2, 1)
@@ -86,7 +86,7 @@ def test_a_drawn_value_is_as_uncertain_as_the_component_it_came_from() -> None:
         assert found.item() == pytest.approx(variance, rel=1e-5)
 
 
-def test_nll_is_the_negative_log_density_of_all_weight_samples_together() -> None:
+def test_nll_is_that_of_all_weight_samples_together() -> None:
     mixtures, values = samples(torch.float64), torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), values).exp() for t in range(T)]
     torch.testing.assert_close(nll(mixtures, values), -torch.stack(densities).mean(dim=0).log())

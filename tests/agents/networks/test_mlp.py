@@ -55,7 +55,7 @@ def test_members_are_independent_networks() -> None:
         torch.testing.assert_close(together[member], alone)
 
 
-def test_without_masks_a_network_is_deterministic_and_with_them_it_is_not() -> None:
+def test_a_network_is_random_with_masks_only() -> None:
     network = MemberMLP((3, 32, 2), members=1, dropout=0.5, generator=generator())
     x, masks = torch.ones(1, 4, 3), generator(1)
     assert torch.equal(network(x), network(x))
@@ -126,7 +126,7 @@ def _norms(gradients: list[torch.Tensor]) -> list[float]:
     return [float(torch.cat([gradient[member].flatten() for gradient in gradients]).norm()) for member in range(2)]
 
 
-def test_a_single_network_begins_glorot_uniform_from_its_generator() -> None:
+def test_a_single_network_begins_glorot_uniform() -> None:
     before = torch.get_rng_state()
     network, again = mlp((200, 100, 2), generator(3)), mlp((200, 100, 2), generator(3))
     assert torch.equal(before, torch.get_rng_state()), "the global generator was used"
