@@ -396,7 +396,7 @@ def test_numbers_show_what_there_is(value: float, digits: int, text: str) -> Non
     assert number(value, digits) == text
 
 
-def test_lists_of_sittings_are_rows_not_python() -> None:
+def test_lists_of_sessions_are_rows_not_python() -> None:
     facts = {"seeds": [0, 1], "sessions": [{"wall_s": 1.0, "changed": {}}, {"wall_s": 2.0, "changed": {"commit": "a"}}]}
     assert flat("", facts) == [
         ("seeds", "0; 1"), ("sessions.1.wall_s", "1.0"),
