@@ -15,6 +15,7 @@ from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from small_runs import do
 
+from imagine_bench import registry
 from imagine_bench.bench import run_state
 from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.launchers import Failure, Job
