@@ -83,11 +83,16 @@ def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[F
     with ProgressBars(specs, _done_before(store)) as show:
         for until in store.protocol.stages:
             failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
-            pairs = [pair for pair in store.missing(until) if pair not in failed]
+            pairs = _costliest_first([pair for pair in store.missing(until) if pair not in failed], store.protocol)
             jobs = [_job(store, paths, *pair, until) for pair in pairs]
             if jobs:
                 failures += launcher.launch(jobs, _saving_time(store, show))
     return failures
+
+
+def _costliest_first(pairs: Sequence[tuple[str, int]], protocol: ProtocolData) -> list[tuple[str, int]]:
+    """Seed by seed, and of each seed the agents listed last, which cost most, first: so no worker is idle for long."""
+    return sorted(pairs, key=lambda pair: (pair[1], -protocol.agents.index(pair[0])))
 
 
 def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:

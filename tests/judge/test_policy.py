@@ -233,7 +233,7 @@ def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: py
         bench(tmp_path, Inline(patience=3))  # both agents of seed 0, and one of seed 1, to the end
     (folder,) = tmp_path.glob("*/*/")
     assert [path.relative_to(folder).as_posix() for path in learners(folder)] == [
-        "table/seed_0", "table/seed_1", "imaginer/seed_0",
+        "table/seed_0", "imaginer/seed_0", "imaginer/seed_1",
     ]  # fmt: skip
     for command, held in (("policy", ".policy.lock"), ("generalise", ".generalisation.lock")):
         with lock(folder / held, "This"):
@@ -241,12 +241,12 @@ def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: py
         assert "is in use by process" in capsys.readouterr().err
     assert main(["policy", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert "| table | 9 | 2 |" in said and "| imaginer | 9 | 1 |" in said and str(folder / "policy") in said
+    assert "| table | 9 | 1 |" in said and "| imaginer | 9 | 2 |" in said and str(folder / "policy") in said
     assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
     assert main(["generalise", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert "imaginer, 9 episodes (1 seed(s))" in said and str(folder / "generalisation") in said
-    assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 192 * 6
+    assert "imaginer, 9 episodes (2 seed(s))" in said and str(folder / "generalisation") in said
+    assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 2 * 192 * 6
 
 
 def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None:
