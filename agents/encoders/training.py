@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,7 +38,6 @@ _CHUNK = 500  # frames rendered at once, to bound memory
 _CHECK_EVERY = 50  # steps between checks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
-_Network = TypeVar("_Network", bound=torch.nn.Module)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +137,7 @@ def train_encoder(
     progress = progress or (lambda stage, done: None)
     prepare_torch("cpu")
     seeds = SeedTree(seed)
-    train_seeds, probe_seeds = (
-        seeds.child(name, spec.id, appearance) for name in ("encoder_training", "encoder_probe")
-    )
+    train_seeds, probe_seeds = (seeds.child(use, spec.id, appearance) for use in ("encoder_training", "encoder_probe"))
     clock = _Clock()
 
     data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress)
@@ -149,16 +146,17 @@ def train_encoder(
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
     network: EncoderNetwork
     if recipe.kind == "codes":
-        network = _rounded_to_half(discover(data.batch(torch.arange(recipe.frames)), generator))
+        network = discover(data.batch(torch.arange(recipe.frames)), generator)
     else:
         network = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
+    _round_to_half(network)
     clock.lap("training")
     cardinalities = tuple(len(values) for values in spec.macrostate_values)
     latents = latents_of(network, data)
-    probe, linear = (
-        _trained_probe(network.latent_size, hidden, cardinalities, latents, data, recipe, generator)
-        for hidden in (PROBE_HIDDEN, 0)
-    )
+    probe, linear = (empty_probe(network.latent_size, cardinalities, hidden) for hidden in (PROBE_HIDDEN, 0))
+    for reader in (probe.to_empty(device="cpu"), linear.to_empty(device="cpu")):
+        train_probe(reader, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
+        _round_to_half(reader)
     clock.lap("probe")
     progress("probe", 1.0)
     noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
@@ -208,29 +206,14 @@ def _trained_vae(
     if isinstance(vae, MlpVae):
         vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
     train_vae(vae, data, recipe, generator, progress)
-    return _rounded_to_half(vae)
+    return vae
 
 
-def _trained_probe(
-    latent_size: int,
-    hidden: int,
-    cardinalities: tuple[int, ...],
-    latents: Latents,
-    data: FrameSet,
-    recipe: Recipe,
-    generator: torch.Generator,
-) -> Probe:
-    probe = empty_probe(latent_size, cardinalities, hidden).to_empty(device="cpu")
-    train_probe(probe, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
-    return _rounded_to_half(probe)
-
-
-def _rounded_to_half(network: _Network) -> _Network:
+@torch.no_grad()
+def _round_to_half(network: torch.nn.Module) -> None:
     """Keep only what the artefact stores, so that what is measured is what is loaded."""
-    with torch.no_grad():
-        for value in network.state_dict().values():
-            value.copy_(value.half())
-    return network
+    for value in network.state_dict().values():
+        value.copy_(value.half())
 
 
 @torch.no_grad()

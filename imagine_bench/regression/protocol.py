@@ -71,7 +71,7 @@ class RegressionProtocol(ProtocolData):
                 raise InvalidValueError(f"{name} is {value}; it must lie in [{low}, {high}].")
 
     def work(self, agent: str, until: int | None = None) -> int:
-        """Parts of a run's work: a hundred a variant for training, ten for measuring; it never rests before its end."""
+        """Units of a run's work: 100 a variant for training, 10 for measuring; it never pauses before its end."""
         return 110 * len(self.variants)
 
 

@@ -26,9 +26,9 @@ from imagine_bench.store.codec import Arrays, grouped
 from imagine_bench.store.files import lock, make_folder
 
 _SLICES = 100
-"""Parts that a variant's training is told in."""
+"""Steps of progress in which a variant's training is reported."""
 _MEASURING = 10
-"""What measuring counts beside them."""
+"""Steps of progress that measuring counts."""
 
 
 def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
@@ -37,7 +37,7 @@ def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress
     Args:
         spec: What to run, with a regression protocol.
         folder: The run's own folder.
-        on_progress: Told now and then how far it is.
+        on_progress: Called now and then with the progress.
 
     Raises:
         BusyError: Another process is at this run.
@@ -48,7 +48,7 @@ def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress
     make_folder(folder)
     with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):
         if not run_folder.is_done(folder):
-            _Run(spec, folder, on_progress).to_the_end()
+            _Run(spec, folder, on_progress).execute()
     return load_run(folder)
 
 
@@ -68,7 +68,7 @@ class _Run:
             self.evaluations = {variant: found[variant] for variant in self.protocol.variants if variant in found}
         self.saved_s = time.monotonic()
 
-    def to_the_end(self) -> None:
+    def execute(self) -> None:
         """Train and measure every variant, record, and mark the run as done."""
         for variant in self.protocol.variants[len(self.evaluations) :]:
             regressor = self._regressor(variant)
@@ -76,7 +76,7 @@ class _Run:
             self._measure(regressor, variant)
         self._record()
         finish(self.folder, self.rows, self.evaluations)
-        self._tell("done", "done", 0)
+        self._report("done", "done", 0)
 
     def _regressor(self, variant: str) -> Regressor:
         """A new regressor, or the one of the newest checkpoint where that was made in the middle of this variant."""
@@ -117,7 +117,7 @@ class _Run:
                 regressor.train(min(step, regressor.epochs - regressor.epoch))
                 self.train_cpu_s += time.process_time() - start_s
                 done = _SLICES * regressor.epoch // regressor.epochs
-                self._tell("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
+                self._report("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
                 if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
                     self._save(regressor, variant)
         except DivergedError as error:
@@ -126,7 +126,7 @@ class _Run:
         self._save(regressor, variant)
 
     def _measure(self, regressor: Regressor, variant: str) -> None:
-        self._tell("testing", f"{variant}, measuring", _SLICES)
+        self._report("testing", f"{variant}, measuring", _SLICES)
         start_s = time.process_time()
         rows, arrays = calibrate(
             self.task, regressor, variant, self.networks, points=self.protocol.test_points,
@@ -150,7 +150,7 @@ class _Run:
         """Record beside the results; the file appears whole or not at all."""
         if self.task.recorder is None or not self.protocol.recorded:
             return
-        self._tell("recording", "recording", 0)
+        self._report("recording", "recording", 0)
         registry.load(self.task.recorder)(
             self.evaluations, task=self.task, name=self.spec.agent, path=run_folder.recording_path(self.folder)
         )
@@ -164,7 +164,7 @@ class _Run:
         save_snapshot(self.folder / "checkpoints", self._snapshot(regressor, variant))
         self.saved_s = time.monotonic()
 
-    def _tell(self, phase: Phase, detail: str, done: int) -> None:
+    def _report(self, phase: Phase, detail: str, done: int) -> None:
         before = (_SLICES + _MEASURING) * len(self.evaluations)
         progress = Progress(
             agent=self.spec.agent, seed=self.spec.seed, phase=phase, done=min(before + done, self.spec.work),

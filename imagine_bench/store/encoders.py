@@ -26,7 +26,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
         spec: The task.
         appearance: Its appearance level; each has its own bundled encoders.
         given: A bundled name or a path instead; None for the task's own.
-        kind: Which of the task's own: ``"latents"``, continuous, or ``"codes"``, one-hot, of discrete parts.
+        kind: Which of the task's own: ``"latents"``, continuous, or ``"codes"``, one-hot, of factors.
 
     Raises:
         UnknownNameError: ``given`` is neither; the message lists the bundled names.
