@@ -138,7 +138,7 @@ class PerformanceTargets:
     Attributes:
         objects: Bodies of the loose objects; coordinate i of a macrostate is object i's.
         as_ruled: Least share of random macro-actions that end exactly as the rules say.
-        bystander_mm: An object that an action leaves where it stands moves by less.
+        other_objects_mm: An object that an action leaves where it stands moves by less.
         error_mm: The object acted on ends nearer to where a perfect execution leaves it, 99 times of 100; None asks
             for nothing.
         error_deg: The same for its yaw.
@@ -150,7 +150,7 @@ class PerformanceTargets:
 
     objects: tuple[str, ...]
     as_ruled: float
-    bystander_mm: float
+    other_objects_mm: float
     error_mm: float | None = None
     error_deg: float | None = None
     physics_per_cpu_s: float
@@ -343,7 +343,7 @@ class SceneReader(Protocol):
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """A picture of the whole scene with the arm. Shape (height, width, 3)."""
+        """An image of the whole scene with the arm. Shape (height, width, 3)."""
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -19,16 +19,18 @@ class TaskEntry:
     """A registered task.
 
     Attributes:
-        spec: ``"module:attr"`` of its TaskSpec.
+        spec: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it.
         env_id: Gymnasium id, registered by ``import imagine_bench``.
         env: ``"module:attr"`` of the environment's constructor.
         horizon: Macro-actions before truncation.
+        options: Keyword arguments of both, which say which member of a family it is.
     """
 
     spec: str
     env_id: str
     env: str
     horizon: int
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,30 +61,21 @@ class AgentEntry:
 
 
 TASKS: dict[str, TaskEntry] = {
-    "arrow_puzzle": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:SPEC",
-        env_id="imagine_bench/ArrowPuzzle-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_hard": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:HARD_SPEC",
-        env_id="imagine_bench/ArrowPuzzleHard-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_hard_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_toward": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:TOWARD_SPEC",
-        env_id="imagine_bench/ArrowPuzzleToward-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_toward_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_clockwise": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:CLOCKWISE_SPEC",
-        env_id="imagine_bench/ArrowPuzzleClockwise-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_clockwise_env",
-        horizon=10,
-    ),
+    **{
+        name: TaskEntry(
+            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of",
+            env_id=f"imagine_bench/{gymnasium_name}-v0",
+            env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
+            horizon=10,
+            options={"goal": goal},
+        )
+        for name, gymnasium_name, goal in (
+            ("arrow_puzzle", "ArrowPuzzle", "toward_human"),
+            ("arrow_puzzle_hard", "ArrowPuzzleHard", "toward_human_alone"),
+            ("arrow_puzzle_toward", "ArrowPuzzleToward", "toward_agent"),
+            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", "left"),
+        )
+    },
     "pick_place": TaskEntry(
         spec="imagine_bench.tasks.pick_place.spec:SPEC",
         env_id="imagine_bench/PickPlace-v0",
@@ -318,8 +311,9 @@ def task(name: str) -> TaskSpec:
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
-    spec: TaskSpec = load(entry.spec)
-    for field, ours, theirs in (
+    loaded = load(entry.spec)
+    spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
+    for what, ours, theirs in (
         ("id", name, spec.id),
         ("env_id", entry.env_id, spec.env_id),
         ("horizon", entry.horizon, spec.horizon),
@@ -329,7 +323,7 @@ def task(name: str) -> TaskSpec:
     ):
         if ours != theirs:
             raise InvalidValueError(
-                f"{entry.spec} says {field} {theirs!r} where the registry line or the rules of {name} say {ours!r}; "
+                f"{entry.spec} says {what} {theirs!r} where the registry line or the rules of {name} say {ours!r}; "
                 "make them one."
             )
     return spec

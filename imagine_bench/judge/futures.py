@@ -12,7 +12,7 @@ from collections import Counter
 import numpy as np
 
 from imagine_bench.capabilities import FutureSampler, SampledFutures
-from imagine_bench.interfaces import Macrostate, Rules, State, TaskSpec
+from imagine_bench.interfaces import Floats, Macrostate, Rules, State, TaskSpec
 from imagine_bench.rules import Belief, advance, by_macrostate
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import Futures
@@ -72,18 +72,12 @@ def follow_optimum(rules: Rules, macrostates: Macrostate) -> Macrostate:
 
 
 def compare(rules: Rules, pairs: list[tuple[State, int]], sampled: SampledFutures) -> Futures:
-    """Compare sampled futures with the rules.
-
-    Args:
-        rules: The macrostate machine.
-        pairs: Starts (macrostate, macro-action), P of them.
-        sampled: Futures of P F rows, F rows a pair one after the other.
-    """
+    """Compare sampled futures with the rules: F rows for each of P pairs (macrostate, macro-action), pair by pair."""
     depth, rows, samples = sampled.rewards.shape
     count = rows // len(pairs) * samples
     macrostates = sampled.macrostates.reshape(depth, len(pairs), count, -1)
     rewards, ended = (values.reshape(depth, len(pairs), count) for values in (sampled.rewards, sampled.ended))
-    table: dict[str, np.ndarray] = {}
+    table: dict[str, Floats] = {}
     for column, (state, action) in enumerate(pairs):
         belief: Belief = {(state, False): 1.0}
         for step in range(depth):

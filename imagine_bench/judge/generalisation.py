@@ -54,6 +54,11 @@ class TransitionSet:
     legal: Mask
     possible: tuple[tuple[Outcome, ...], ...]
 
+    @property
+    def consequences(self) -> list[str]:
+        """See :func:`consequence`. Length N."""
+        return [consequence(possible) for possible in self.possible]
+
     def allows(self, macrostates: Sequence[Sequence[int]]) -> Mask:
         """Whether the rules allow each of N macrostates as what comes of the transition. Shape (N,)."""
         pairs = zip(macrostates, self.possible, strict=True)
@@ -97,15 +102,7 @@ class Predictions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """How right an agent's predictions of some transitions are; NaN where there are none, or the agent cannot say.
-
-    Attributes:
-        count: Transitions.
-        right: Share of them whose next macrostate is right.
-        likeliest_right: The same of what the model holds likeliest instead of what it samples.
-        end_right: Share of them whose termination, or going on, is right.
-        reward_error: Their mean error, in units of reward.
-    """
+    """The number of some transitions and the means of an agent's :class:`Predictions` of them; NaN where unknown."""
 
     count: int
     right: float
@@ -199,17 +196,17 @@ def _visit_count(agent: Imaginer, transitions: TransitionSet) -> NDArray[np.int6
     return np.array([visits[pair] for pair in pairs], dtype=np.int64)
 
 
-def consequence(possible: Sequence[Outcome]) -> str | None:
-    """The one of :data:`CONSEQUENCES` that the rules say comes of a transition; None where they leave it open."""
+def consequence(possible: Sequence[Outcome]) -> str:
+    """The one of :data:`CONSEQUENCES` that comes of a transition; ``"open"`` where the rules leave it to chance."""
     success, failure, goes_on = CONSEQUENCES
     found = {success if o.success else failure if o.terminated else goes_on for o in possible}
-    return found.pop() if len(found) == 1 else None
+    return found.pop() if len(found) == 1 else "open"
 
 
 def generalisation(transitions: TransitionSet, predictions: Predictions) -> Generalisation:
     """Score one agent's predictions."""
     terminal, visits = transitions.terminal, predictions.visit_count
-    found = np.array([consequence(possible) or "" for possible in transitions.possible])
+    found = np.array(transitions.consequences)
     consequences = {name: predictions.scores(~terminal & (found == name)) for name in CONSEQUENCES}
     return Generalisation(
         unseen=predictions.scores(terminal),
@@ -217,10 +214,9 @@ def generalisation(transitions: TransitionSet, predictions: Predictions) -> Gene
         seen=predictions.scores(~terminal),
         auroc=auroc(predictions.epistemic, terminal),
         consequences={name: scores for name, scores in consequences.items() if scores.count},
-        visit_counts={}
-        if visits is None
-        else {
+        visit_counts={
             name: predictions.scores(~terminal & (visits >= least) & (visits <= most))
             for name, (least, most) in VISIT_COUNTS.items()
+            if visits is not None
         },
     )

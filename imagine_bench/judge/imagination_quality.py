@@ -74,9 +74,8 @@ def ask(
 def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTree) -> OpenLoop:
     """Imagine the macro-actions of every start in closed loop of the model and compare by depth.
 
-    An imagined macrostate is correct if it is one the rules allow after these actions, which for deterministic rules
-    is exactly one; the reward is compared with its expectation. The rules keep every rollout alive: any predicted
-    termination is wrong.
+    An imagined macrostate is correct if the rules allow it after these actions; the reward is compared with its
+    expectation. The rules keep every rollout alive: any predicted termination is wrong.
 
     Args:
         agent: It is not changed.
@@ -87,36 +86,31 @@ def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTre
         agent.imagine(start.frame, actions=start.actions, depth=len(start.actions), rng=seeds.child(index).generator())
         for index, start in enumerate(starts)
     ]
+
+    def stacked(name: str) -> Floats:  # [starts, D]
+        return np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
+
     correct = np.array([
         [tuple(row) in belief for row, belief in zip(rollout.macrostates.tolist(), start.beliefs, strict=True)]
         for start, rollout in zip(starts, rollouts, strict=True)
     ])  # fmt: skip  # [starts, D]
-    accepted = np.array([rollout.accepted for rollout in rollouts])
-    rewards = np.array([rollout.rewards for rollout in rollouts], dtype=np.float64)
-    kept = accepted.sum(axis=0)  # [D]
-    causes = {
-        cause: np.array([getattr(rollout, cause) for rollout in rollouts], dtype=np.float64)
-        for cause in ("epistemic", "aleatoric", "modal")
-    }
+    accepted, kept = stacked("accepted"), stacked("accepted").sum(axis=0)
+    rewards = np.array([start.rewards for start in starts])
+    causes = {cause: stacked(cause) for cause in ("epistemic", "aleatoric", "modal")}
     return OpenLoop(
         count=np.full(correct.shape[1], len(starts), dtype=np.int64),
         correct=correct.mean(axis=0),
-        correct_accepted=np.where(kept > 0, (correct & accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
+        correct_accepted=np.where(kept > 0, (correct * accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
         accepted=accepted.mean(axis=0),
-        reward_mae=np.abs(rewards - np.array([start.rewards for start in starts])).mean(axis=0),
-        termination_error=np.array([rollout.p_terminated > 0.5 for rollout in rollouts], dtype=np.float64).mean(axis=0),
+        reward_mae=np.abs(stacked("rewards") - rewards).mean(axis=0),
+        termination_error=(stacked("p_terminated") > 0.5).mean(axis=0),
         **{cause: values.mean(axis=0) for cause, values in causes.items()},
         **_detection(correct, causes),
     )
 
 
 def _detection(correct: NDArray[np.bool_], causes: dict[str, Floats]) -> dict[str, Floats]:
-    """How well each uncertainty tells wrong transitions from correct ones, by depth, where they began correct.
-
-    Args:
-        correct: Shape (starts, D).
-        causes: Uncertainties by cause, each of that shape.
-    """
+    """How well each uncertainty (starts, D) tells wrong transitions from correct ones that began correct, by depth."""
     from imagine_bench.judge.calibration import auroc  # noqa: PLC0415 - scipy loads slowly
 
     began = np.concatenate([np.ones((len(correct), 1), dtype=np.bool_), correct[:, :-1]], axis=1)
@@ -139,12 +133,12 @@ def examples(
         seeds: Names the generators that imagination draws from.
         purpose: What the starts are drawn for.
     """
+    starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
-    known = len(spec.rules.start_states)
-    picks = rng.choice(known, size=EXAMPLES, replace=known < EXAMPLES)
-    states = np.array([spec.rules.start_states[index] for index in picks], dtype=np.int64)
-    starts = list(zip(spec.render_macrostates(states, appearance, rng), states, strict=True))
-    return _compared_greedy(agent, spec, starts, depth=spec.horizon, appearance=appearance, seeds=seeds, rng=rng)
+    picks = rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)
+    states = np.array([starts[index] for index in picks], dtype=np.int64)
+    frames = spec.render_macrostates(states, appearance, rng)
+    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=spec.horizon)
 
 
 def imagine_sampled_rollouts(
@@ -162,41 +156,30 @@ def imagine_sampled_rollouts(
 def sampled_rollouts_from(
     agent: Imaginer, spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, appearance: str, seeds: SeedTree
 ) -> tuple[ComparedRollout, ...]:
-    """Imagine one start several times, the agent's greedy controller choosing.
-
-    Args:
-        agent: It is not changed.
-        spec: The task.
-        frame: The real frame it starts from.
-        macrostate: What that frame shows. Shape (M,).
-        appearance: Appearance level of the real counterparts.
-        seeds: Names the generators that imagination and reality draw from.
-    """
-    starts, rng = [(frame, macrostate)] * SAMPLED_ROLLOUTS, seeds.child("reality").generator()
-    return _compared_greedy(agent, spec, starts, depth=SAMPLED_DEPTH, appearance=appearance, seeds=seeds, rng=rng)
+    """Imagine one start several times: the real ``frame``, which shows ``macrostate``. See :func:`examples`."""
+    frames, states = [frame] * SAMPLED_ROLLOUTS, [macrostate] * SAMPLED_ROLLOUTS
+    rng = seeds.child("reality").generator()
+    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=SAMPLED_DEPTH)
 
 
-def _compared_greedy(
+def _greedy_rollouts(
     agent: Imaginer,
     spec: TaskSpec,
-    starts: Sequence[tuple[Frame, Macrostate]],
-    *,
-    depth: int,
+    frames: Iterable[Frame],
+    states: Iterable[Macrostate],
     appearance: str,
     seeds: SeedTree,
     rng: np.random.Generator,
+    *,
+    depth: int,
 ) -> tuple[ComparedRollout, ...]:
-    return tuple(
-        compare_rollout(
-            spec,
-            frame=frame,
-            macrostate=state,
-            rollout=agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator()),
-            appearance=appearance,
-            rng=rng,
+    found = []
+    for index, (frame, state) in enumerate(zip(frames, states, strict=True)):
+        rollout = agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator())
+        found.append(
+            compare_rollout(spec, frame=frame, macrostate=state, rollout=rollout, appearance=appearance, rng=rng)
         )
-        for index, (frame, state) in enumerate(starts)
-    )
+    return tuple(found)
 
 
 def compare_rollout(
@@ -242,14 +225,10 @@ def beside_reality(
     frames: Sequence[Frame] | Frame,
     real: Sequence[tuple[State, float, bool]],
 ) -> ComparedRollout:
-    """An imagined rollout and what really came of it.
+    """An imagined rollout from a ``frame`` that shows ``macrostate``, and what really came of it.
 
-    Args:
-        rollout: What was imagined.
-        frame: The real frame it starts from.
-        macrostate: What that frame shows. Length M.
-        frames: The real frame after each macro-action that was carried out. Length D.
-        real: Macrostate, reward, and whether the episode ended, after each of them. Length D.
+    ``frames`` and ``real`` (macrostate, reward, whether the episode has ended) have an entry for each macro-action
+    that was carried out.
     """
     done = len(real)
     return ComparedRollout(

@@ -113,6 +113,12 @@ class Analysis(ABC, Generic[Value]):
         write_bytes(folder / f"{self.name}.md", page.encode())
 
 
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """The lines of a table."""
+    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
+    return [first, f"|{'---|' * len(head)}", *others]
+
+
 def analyse(
     analysis: type[Analysis[Value]], folder: Path | None, *, root: Path, task: str | None, encoder: str | None
 ) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,37 +14,28 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.generalisation import (
     Generalisation,
     Predictions,
-    consequence,
     generalisation,
     predict,
     transition_set,
 )
-from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse
+from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.trained import Trained
 
 Found = tuple[Predictions, Generalisation]
 
-_ROWS: dict[str, tuple[Callable[[Generalisation], float], str]] = {
-    "unseen": (
-        lambda found: found.unseen.right,
-        "next macrostate right, out of terminal macrostates (never seen), %",
-    ),
-    "unseen_legal": (lambda found: found.unseen_legal.right, "of these out of legal ones (goals), %"),
+_ROWS = {
+    "unseen": ("unseen.right", "next macrostate right, out of terminal macrostates (never seen), %"),
+    "unseen_legal": ("unseen_legal.right", "of these out of legal ones (goals), %"),
     "unseen_likeliest": (
-        lambda found: found.unseen.likeliest_right,
+        "unseen.likeliest_right",
         "of all these by what the model holds likeliest, instead of what it samples, %",
     ),
-    "seen": (lambda found: found.seen.right, "next macrostate right, out of all others, %"),
-    "seen_likeliest": (
-        lambda found: found.seen.likeliest_right,
-        "of these by what the model holds likeliest, %",
-    ),
-    "auroc": (
-        lambda found: found.auroc,
-        "epistemic uncertainty tells the unseen from the others (AUROC, %)",
-    ),
+    "seen": ("seen.right", "next macrostate right, out of all others, %"),
+    "seen_likeliest": ("seen.likeliest_right", "of these by what the model holds likeliest, %"),
+    "auroc": ("auroc", "epistemic uncertainty tells the unseen from the others (AUROC, %)"),
 }
+"""The figures of summary.json: where they are found in a :class:`.Generalisation`, and their row of the table."""
 
 
 def generalisation_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
@@ -80,18 +72,21 @@ class GeneralisationAnalysis(Analysis[Found]):
         terminal = self.transitions.terminal
         unseen = int(terminal.sum())
         heads = [f"{title} ({len(seeds)} seed(s))" for title, seeds in zip(groups.titles, groups.values(), strict=True)]
+        rows = []
+        for name, (figure, words) in _ROWS.items():
+            cells = [groups.cell([attrgetter(figure)(found) for _, found in seeds], name) for seeds in groups.values()]
+            there = f"{thesis['correct']} (of {thesis['attempted']})" if name == "unseen" and thesis else "–"
+            if any(cell != "–" for cell in (*cells, there)):
+                rows.append([words, *cells, there])
         lines = [
             f"{unseen} transitions out of terminal macrostates, {len(terminal) - unseen} others; {groups.caution}",
             "",
-            f"| {spec.title} | {' | '.join(heads)} | thesis |",
-            f"|---|{'---|' * len(groups)}---|",
+            *markdown([spec.title, *heads, "thesis"], rows),
+            "",
+            *_by_consequence(groups),
+            *_by_visit_count(groups),
         ]
-        for name, (figure, words) in _ROWS.items():
-            cells = [groups.cell([figure(found) for _, found in seeds], name) for seeds in groups.values()]
-            there = f"{thesis['correct']} (of {thesis['attempted']})" if name == "unseen" and thesis else "–"
-            if any(cell != "–" for cell in (*cells, there)):
-                lines.append(f"| {words} | {' | '.join(cells)} | {there} |")
-        return "\n".join([*lines, "", *_consequence_lines(groups), *_visit_count_lines(groups)])
+        return "\n".join(lines)
 
     def rows(self, runs: Sequence[Measured[Found]]) -> Iterable[Sequence[object]]:
         """One row a run and transition."""
@@ -100,7 +95,7 @@ class GeneralisationAnalysis(Analysis[Found]):
             "right", "end_right", "reward_error", "epistemic", "likeliest_right", "visit_count",
         ]  # fmt: skip
         transitions = self.transitions
-        known = [consequence(possible) or "open" for possible in transitions.possible]
+        consequences = transitions.consequences
         for run in runs:
             found, _ = run.value
             for index, state in enumerate(transitions.macrostates):
@@ -108,45 +103,34 @@ class GeneralisationAnalysis(Analysis[Found]):
                 right, end, likeliest, visits = ("" if each is None else int(each[index]) for each in integers)
                 yield [
                     *run.head.values(), " ".join(map(str, state)), int(transitions.actions[index]),
-                    int(transitions.terminal[index]), int(transitions.legal[index]), known[index], right, end,
+                    int(transitions.terminal[index]), int(transitions.legal[index]), consequences[index], right, end,
                     f"{found.reward_error[index]:.6g}", f"{found.epistemic[index]:.6g}", likeliest, visits,
                 ]  # fmt: skip
 
     def summary(self, value: Found) -> dict[str, Any]:
         """The figures of the table."""
         _, found = value
-        figures: dict[str, Any] = {name: figure(found) for name, (figure, _) in _ROWS.items()}
+        figures = {name: attrgetter(figure)(found) for name, (figure, _) in _ROWS.items()}
         parts = asdict(found)
         return {**figures, "consequences": parts["consequences"], "visit_counts": parts["visit_counts"]}
 
 
-def _consequence_lines(groups: Groups[Found]) -> list[str]:
+def _by_consequence(groups: Groups[Found]) -> list[str]:
     """The transitions that training can contain, by what the rules say comes of them: one row an agent and kind."""
-    lines = [
-        "The others, by what the rules say comes of them:",
-        "",
-        "| agent | consequence | transitions | next macrostate right, % | end right, % | reward's mean error |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for title, seeds in zip(groups.titles, groups.values(), strict=True):
         for name, first in seeds[0][1].consequences.items():
             scores = [found.consequences[name] for _, found in seeds]
             right = groups.cell([one.right for one in scores], f"{name} right")
             end = groups.cell([one.end_right for one in scores], f"{name} end")
             reward = groups.cell([one.reward_error for one in scores], f"{name} reward", "{:.2f}".format)
-            lines.append(f"| {title} | {name} | {first.count} | {right} | {end} | {reward} |")
-    return lines
+            rows.append([title, name, first.count, right, end, reward])
+    head = ("agent", "consequence", "transitions", "next macrostate right, %", "end right, %", "reward's mean error")
+    return ["The others, by what the rules say comes of them:", "", *markdown(head, rows)]
 
 
-def _visit_count_lines(groups: Groups[Found]) -> list[str]:
+def _by_visit_count(groups: Groups[Found]) -> list[str]:
     """The same transitions by the agents' visit counts: one row an agent that knows them, and count."""
-    lines = [
-        "",
-        "The others, by how many real visits of them the agent remembers:",
-        "",
-        "| agent | visits | transitions | next macrostate right, % | by what the model holds likeliest, % |",
-        "|---|---|---|---|---|",
-    ]
     rows = []
     for title, seeds in zip(groups.titles, groups.values(), strict=True):
         for name in seeds[0][1].visit_counts:
@@ -154,5 +138,8 @@ def _visit_count_lines(groups: Groups[Found]) -> list[str]:
             count = groups.cell([float(one.count) for one in scores], f"{name} count", "{:.0f}".format)
             right = groups.cell([one.right for one in scores], f"{name} right")
             likeliest = groups.cell([one.likeliest_right for one in scores], f"{name} likeliest")
-            rows.append(f"| {title} | {name} | {count} | {right} | {likeliest} |")
-    return [*lines, *rows] if rows else []
+            rows.append([title, name, count, right, likeliest])
+    if not rows:
+        return []
+    head = ("agent", "visits", "transitions", "next macrostate right, %", "by what the model holds likeliest, %")
+    return ["", "The others, by how many real visits of them the agent remembers:", "", *markdown(head, rows)]

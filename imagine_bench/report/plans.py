@@ -18,7 +18,7 @@ from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import EXECUTIONS, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, png
 from imagine_bench.judge.plans import Plan, make_plans, require_threshold
-from imagine_bench.report.analysis import chosen, provenance
+from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.text import percent
 from imagine_bench.store.bench_folder import load_bench, read_protocol
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
@@ -110,19 +110,10 @@ def _write(trained: Trained, plans: Sequence[Plan], folder: Path, how: dict[str,
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSummary:
-    """Counts over plans.
+    """Counts over plans, and macro-actions of the solved ones (0 and NaN where none was).
 
-    Attributes:
-        attempted: Plans asked for.
-        refused: Those not carried out: too uncertain.
-        solved: Those that solved the task.
-        optimal: Those of them that took the fewest macro-actions possible.
-        shortest: Macro-actions of the shortest solved plan; 0 where none was solved.
-        longest: Macro-actions of the longest solved plan.
-        mean_length: Mean macro-actions of the solved plans; NaN where none was.
-        steps: Macro-actions carried out.
-        steps_as_imagined: Those that led where they were imagined to.
-        faults: Those whose physics disagreed with the rules.
+    ``steps`` are macro-actions carried out, ``steps_as_imagined`` those that led where they were imagined to, and
+    ``faults`` those whose physics disagreed with the rules.
     """
 
     attempted: int
@@ -158,22 +149,19 @@ def plan_table(summary: PlanSummary, task: TaskSpec) -> str:
     """The counts as Markdown, the thesis' beside them where it has any."""
     thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
     low, high = statistics.wilson(summary.solved, summary.attempted)
+    share = f"{summary.solved} = {percent(summary.solved / summary.attempted)} % [{percent(low)}, {percent(high)}]"
+    lengths = f"{summary.shortest} to {summary.longest}, mean {summary.mean_length:.2f}" if summary.solved else "–"
     rows = [
         ("plans", f"{summary.attempted}", thesis.get("attempted")),
-        (
-            "solved",
-            f"{summary.solved} = {percent(summary.solved / summary.attempted)} % [{percent(low)}, {percent(high)}]",
-            thesis.get("solved"),
-        ),
+        ("solved", share, thesis.get("solved")),
         ("of these optimal", f"{summary.optimal}", thesis.get("optimal_among_solved")),
         ("refused as too uncertain", f"{summary.refused}", None),
-        ("macro-actions of a solved plan", _lengths(summary), _thesis_lengths(thesis)),
+        ("macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else None),
         ("macro-actions that led where imagined", f"{summary.steps_as_imagined} of {summary.steps}", None),
         ("faults of the physics", f"{summary.faults}", None),
     ]
-    lines = ["| open-loop plans, carried out blindly | here | thesis |", "|---|---|---|"]
-    lines += [f"| {name} | {here} | {'–' if there is None else there} |" for name, here, there in rows]
-    return "\n".join(lines)
+    shown = [(name, here, "–" if there is None else there) for name, here, there in rows]
+    return "\n".join(markdown(["open-loop plans, carried out blindly", "here", "thesis"], shown))
 
 
 def write_plans(
@@ -206,14 +194,6 @@ def write_plans(
     for plan in failures[:_SHOWN_FAILURES]:
         write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))
     return summary
-
-
-def _lengths(summary: PlanSummary) -> str:
-    return f"{summary.shortest} to {summary.longest}, mean {summary.mean_length:.2f}" if summary.solved else "–"
-
-
-def _thesis_lengths(thesis: dict[str, Any]) -> str | None:
-    return f"{thesis['shortest']} to {thesis['longest']}" if thesis else None
 
 
 def _page(summary: PlanSummary, failures: Sequence[Plan], task: TaskSpec) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.policy import FRAMES, Terminations, action_shares, eval_states, optimal_length, terminations
-from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse
+from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.seeding import Purpose
 from imagine_bench.store.trained import Trained
@@ -53,20 +53,24 @@ class PolicyAnalysis(Analysis[Terminations]):
     def table(self, runs: Sequence[Measured[Terminations]]) -> str:
         """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
         groups = Groups(runs, self.name)
+        head = ["agent", "real episodes", "seeds", *(f"{words}, %" for words in _SHARES.values())]
+        rows = []
+        for (agent, episodes), seeds in groups.items():
+            means = {name: [float(getattr(each, name).mean()) for each in seeds] for name in (*_SHARES, "length")}
+            cells = [groups.cell(means[share], f"{agent} {share}") for share in _SHARES]
+            length = groups.cell(means["length"], f"{agent} length", "{:.2f}".format)
+            rows.append([agent_words(agent).title, f"{episodes:,}", len(seeds), *cells, length])
         lines = [
             f"All {len(self._optimal)} starts, followed by the rules; every visit of a macrostate shows one of "
             f"{FRAMES} frames of it; {groups.caution}",
             "",
-            f"| agent | real episodes | seeds | {' | '.join(f'{words}, %' for words in _SHARES.values())} "
-            f"| macro-actions (optimal: {self._optimal.mean():.2f}) |",
-            f"|---|---|---|{'---|' * len(_SHARES)}---|",
+            *markdown([*head, f"macro-actions (optimal: {self._optimal.mean():.2f})"], rows),
+            "",
+            *self._by_distance(groups),
+            "",
+            *self._missed(groups),
         ]
-        for (agent, episodes), seeds in groups.items():
-            means = {name: [float(getattr(each, name).mean()) for each in seeds] for name in (*_SHARES, "length")}
-            cells = [groups.cell(means[share], f"{agent} {share}") for share in _SHARES]
-            cells.append(groups.cell(means["length"], f"{agent} length", "{:.2f}".format))
-            lines.append(f"| {agent_words(agent).title} | {episodes:,} | {len(seeds)} | {' | '.join(cells)} |")
-        return "\n".join([*lines, "", *self._by_distance(groups), "", *self._missed(groups)])
+        return "\n".join(lines)
 
     def rows(self, runs: Sequence[Measured[Terminations]]) -> Iterable[Sequence[object]]:
         """One row a run and start."""
@@ -83,31 +87,28 @@ class PolicyAnalysis(Analysis[Terminations]):
 
     def _by_distance(self, groups: Groups[Terminations]) -> list[str]:
         """What is solved of the starts from which an optimal agent needs equally long, in whole macro-actions."""
-        needs, solved = self._optimal.round().astype(int), _solved(groups)
-        lines = [f"| optimal macro-actions | starts | {_heads(groups)} |", f"|---|---|{'---|' * len(groups)}"]
+        needs, solved, rows = self._optimal.round().astype(int), _solved(groups), []
         for need in np.unique(needs):
-            cells = " | ".join(percent(float(share)) for share in solved[:, needs == need].mean(axis=1))
-            lines.append(f"| {need} | {int((needs == need).sum())} | {cells} |")
-        return lines
+            shares = solved[:, needs == need].mean(axis=1)
+            rows.append([need, int((needs == need).sum()), *map(percent, shares)])
+        return markdown(["optimal macro-actions", "starts", *_heads(groups)], rows)
 
     def _missed(self, groups: Groups[Terminations]) -> list[str]:
         """The starts that are solved least, with what an optimal agent needs there."""
-        solved = _solved(groups)
+        solved, states = _solved(groups), self.spec.rules.start_states
         worst = np.min([one.success for seeds in groups.values() for one in seeds], axis=0)  # [starts]
         order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]
         if not order:
             return ["Every run solves every start."]
-        lines = [
+        rows = [
+            [self._words(states[index]), f"{self._optimal[index]:.2f}", *map(percent, solved[:, index])]
+            for index in order[:_LISTED]
+        ]
+        return [
             f"Starts that some run does not always solve: {len(order)} of {len(self._optimal)}. Solved least:",
             "",
-            f"| start | optimal macro-actions | {_heads(groups)} |",
-            f"|---|---|{'---|' * len(groups)}",
+            *markdown(["start", "optimal macro-actions", *_heads(groups)], rows),
         ]
-        for index in order[:_LISTED]:
-            cells = " | ".join(percent(float(share)) for share in solved[:, index])
-            start = self._words(self.spec.rules.start_states[index])
-            lines.append(f"| {start} | {self._optimal[index]:.2f} | {cells} |")
-        return lines
 
     def _words(self, state: State) -> str:
         named = zip(self.spec.macrostate_names, self.spec.value_names(state), strict=True)
@@ -119,5 +120,5 @@ def _solved(groups: Groups[Terminations]) -> Floats:
     return np.array([np.mean([one.success for one in seeds], axis=0) for seeds in groups.values()])
 
 
-def _heads(groups: Groups[Terminations]) -> str:
-    return " | ".join(f"{title}: solved, %" for title in groups.titles)
+def _heads(groups: Groups[Terminations]) -> list[str]:
+    return [f"{title}: solved, %" for title in groups.titles]

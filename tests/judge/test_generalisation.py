@@ -137,7 +137,7 @@ def test_scores_by_visit_count(analysis: GeneralisationAnalysis, transitions: Tr
 def test_rules_that_leave_it_open() -> None:
     end = Outcome(probability=0.5, macrostate=(0,), reward=0.0, terminated=True, success=False)
     on = dataclasses.replace(end, terminated=False)
-    assert (consequence([end]), consequence([on]), consequence([end, on])) == ("failure", "the episode goes on", None)
+    assert (consequence([end]), consequence([on]), consequence([end, on])) == ("failure", "the episode goes on", "open")
 
 
 def test_a_task_without_terminal_macrostates_says_so(spec: TaskSpec) -> None:

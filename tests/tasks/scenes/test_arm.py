@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, arm_root
+from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, arm_spec
 from imagine_bench.tasks.scenes.constants import ARM_GROUP, HOME_QPOS_RAD, OBSERVATION_QPOS_RAD
 
 # RethinkRobotics/sawyer_robot, sawyer_base.urdf.xacro, commit 2fe61d9: origin xyz (m) and rpy (rad), limits (rad),
@@ -31,7 +31,7 @@ HAND_OFFSET_M, HAND_YAW_RAD = (0, 0, 0.0245), math.pi / 2
 
 @pytest.fixture(scope="module")
 def model():
-    return mujoco.MjModel.from_xml_string(arm_root().to_xml_string())
+    return arm_spec().compile()
 
 
 def rotation(roll, pitch, yaw):
@@ -129,7 +129,7 @@ def test_only_the_fingertips_touch(model):
     assert set(model.geom_group) == {ARM_GROUP}
 
 
-def test_wrist_camera_sees_the_human_above_and_right_at_the_right(model):
+def test_wrist_camera_sees_the_human_above_and_right_as_right(model):
     data = mujoco.MjData(model)
     data.qpos[:7] = OBSERVATION_QPOS_RAD
     mujoco.mj_forward(model, data)

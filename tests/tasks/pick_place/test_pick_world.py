@@ -16,7 +16,7 @@ from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
-from imagine_bench.tasks.scenes.objects import THINGS, standing_m
+from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.tools.fidelity import measure_fidelity
@@ -59,7 +59,7 @@ def test_objects_stand_still_on_the_table(world):
         frozenset(world.model.geom(int(geom)).name.split("_")[0] for geom in contact.geom)
         for contact in world.data.contact[: world.data.ncon]
     }
-    assert touching == {frozenset(("table", thing.name)) for thing in THINGS}
+    assert touching == {frozenset(("table", spec.name)) for spec in OBJECTS}
     for _ in range(300):
         mujoco.mj_step(world.model, world.data)
     assert np.abs(world._poses()[:, :3] - before[:, :3]).max() < 5e-4
@@ -132,7 +132,7 @@ def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, p
 
 
 @pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION)
-def test_every_motion_does_what_the_rules_say_within_the_robot_s_limits(world, state, action, intended):
+def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action, intended):
     assert intended in [outcome.macrostate for outcome in RULES.outcomes(state, action)]
     world.place(state, rng())
     before = world._poses()
@@ -154,7 +154,7 @@ def test_gripper_and_object_pass_the_pointing_hand(world, index):
     people = world.data.mocap_pos.copy()
     motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
     model, hand = world.model, world.model.geom("hand_skin").id
-    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", THINGS[index].name))]
+    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", OBJECTS[index].name))]
     closest_m, data = 1.0, mujoco.MjData(model)
     data.mocap_pos[:] = people
     for qpos in motion:
@@ -182,7 +182,7 @@ def test_only_friction_lifts(spoil, index):
     spoil(world.model)
     world.place((0, 0, 0, index), rng())
     result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate, 0.0)
-    assert result.fault == f"the fingers closed and do not hold the {THINGS[index].name}"
+    assert result.fault == f"the fingers closed and do not hold the {OBJECTS[index].name}"
     assert world.read().macrostate[index] == 0
     assert world.read().macrostate[3] == WITHDRAWN
 
@@ -212,7 +212,7 @@ def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
     assert info["macrostate"][3] == WITHDRAWN
 
 
-def test_a_pushed_bystander_is_a_fault(world, monkeypatch):
+def test_pushing_another_object_is_a_fault(world, monkeypatch):
     world.place((0, 0, 0, 0), rng())
     world.execute(0, (1, 0, 0, 1), 0.0)
     place = world._executor.place
@@ -263,7 +263,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
 
 
 @pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:8:2])
-def test_a_macro_action_is_a_pure_function_of_positions_and_arguments(state, action, intended):
+def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
     """In another world, after other actions and with velocities left over: the same bits, an object held included."""
     one, other = PickWorld(FIXED), PickWorld(FIXED)
     one.place(state, rng())
@@ -282,20 +282,20 @@ def test_a_macro_action_is_a_pure_function_of_positions_and_arguments(state, act
 
 
 def test_the_handed_over_object_rests_in_the_palm(world):
-    for index, thing in enumerate(THINGS):
+    for index, spec in enumerate(OBJECTS):
         state = tuple(1 if each == index else 0 for each in range(3))
         world.place((*state, OPEN_PALM), rng())
         world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM), 0.0)
         before = world._poses()[index, :3]
         assert math.dist(before[:2], PALM_M[:2]) < 0.015
-        assert before[2] - PALM_M[2] == pytest.approx(thing.grip_height_m, abs=2e-3)
+        assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)
         for _ in range(300):
             mujoco.mj_step(world.model, world.data)
         assert np.abs(world._poses()[index, :3] - before).max() < 2e-3
 
 
 @pytest.mark.parametrize("seed", [83393, 3046])
-def test_the_palm_stays_where_it_varied_to_under_what_was_laid_into_it(seed: int) -> None:
+def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
     env = gymnasium.make("imagine_bench/PickPlace-v0", appearance="strong")
     env.reset(seed=seed, options={"macrostate": (0, 1, 0, OPEN_PALM)})
@@ -321,7 +321,7 @@ def check_fidelity(actions):
     found = measure_fidelity(SPEC, SPEC.targets, actions)
     assert found.actions == actions
     assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
-    assert found.bystander_mm < SPEC.targets.bystander_mm
+    assert found.other_objects_mm < SPEC.targets.other_objects_mm
     assert np.percentile(found.error_mm, 99) < SPEC.targets.error_mm
     assert len(found.error_mm) > actions / 10
 
@@ -369,20 +369,20 @@ def test_every_macrostate_looks_different():
             assert (np.abs(frames[one] - frames[other]).max(axis=-1) > 40).sum() > 40
 
 
-def test_the_arm_is_out_of_the_agent_s_frame_while_it_holds_something(world):
+def test_an_arm_that_holds_something_is_out_of_the_agent_s_frame(world):
     world.place((0, 1, 0, 0), rng())
     views = [View(camera=c.AGENT_CAMERA, groups=groups) for groups in ((0,), (0, 2))]
-    eyes = [Renderer(world.model, view) for view in views]
-    hidden, shown = (eye.frame(world.data) for eye in eyes)
-    for eye in eyes:
-        eye.close()
+    cameras = [Renderer(world.model, view) for view in views]
+    hidden, shown = (camera.frame(world.data) for camera in cameras)
+    for camera in cameras:
+        camera.close()
     assert np.array_equal(hidden[:40], shown[:40])  # only the fingers beside what they hold would be seen
 
 
 # --- recordings --------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_shows_the_human_answer_when_the_motion_is_over():
+def test_a_recording_shows_the_human_s_answer_after_the_motion():
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.capture_motion_hz = 20.0
     env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})

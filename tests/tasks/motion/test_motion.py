@@ -102,9 +102,9 @@ def test_servo_forces_stay_below_their_limits(turner):
     planned = {}
     original = turner.executor.run
 
-    def keep(data, trajectory):
+    def keep(data, trajectory, **options):
         planned["trajectory"] = trajectory
-        return original(data, trajectory)
+        return original(data, trajectory, **options)
 
     turner.executor.run = keep
     try:

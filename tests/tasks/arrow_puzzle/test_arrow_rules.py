@@ -7,23 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.rules import (
-    LEFT,
-    TOWARD_AGENT,
-    TOWARD_HUMAN,
-    ArrowPuzzleRules,
-    left_and_clear_clockwise,
-    toward_agent,
-    toward_human_alone,
-)
+from imagine_bench.tasks.arrow_puzzle.rules import GOALS, LEFT, TOWARD_AGENT, TOWARD_HUMAN, ArrowPuzzleRules
+from imagine_bench.tasks.arrow_puzzle.spec import make_env, spec_of
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import evaluate, facts, greedy, optimal_policy, tabulate
 
-EASY, HARD = ArrowPuzzleRules(), ArrowPuzzleRules(toward_human_alone)
-TOWARD, CLOCKWISE = ArrowPuzzleRules(toward_agent), ArrowPuzzleRules(left_and_clear_clockwise)
-FAMILY = (EASY, HARD, TOWARD, CLOCKWISE)
+FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(ArrowPuzzleRules(goal) for goal in GOALS.values())
 NAMES = ["easy", "hard", "toward", "clockwise"]
 ALL = pytest.mark.parametrize("rules", FAMILY, ids=NAMES)
 
@@ -47,6 +38,18 @@ def test_goals_are_what_their_tasks_say():
     assert goals(HARD) == {(TOWARD_HUMAN, frozenset({0, 1, 3}))}
     assert goals(TOWARD) == {(TOWARD_AGENT, frozenset(arrows)) for arrows in with_agent}
     assert goals(CLOCKWISE) == {(LEFT, frozenset({1, 2, 3}))}
+
+
+def test_each_goal_has_a_task_that_says_it():
+    specs = {goal: spec_of(goal) for goal in GOALS}
+    assert [spec.rules.goal for spec in specs.values()] == list(GOALS.values())
+    assert "to point toward the human, and no two" in specs["toward_human"].description
+    assert "toward the human, with no arrow toward the agent, and no two" in specs["toward_human_alone"].description
+    assert "to point left, with no arrow toward the human, and no two" in specs["left"].description
+    assert specs["left"].action_names[3] == "turn the middle cube counter-clockwise"
+    for make in (spec_of, lambda goal: make_env(goal=goal)):
+        with pytest.raises(UnknownNameError, match=r"goal 'lefft'.*'left'"):
+            make("lefft")
 
 
 def test_the_family_shares_everything_but_the_goal():
@@ -99,7 +102,7 @@ def _shortest_by_search(rules, start):
 
 
 @ALL
-def test_plan_lengths_agree_with_breadth_first_search_and_the_optimal_actions_follow_them(rules):
+def test_optimal_plans_are_as_short_as_breadth_first_search_says(rules):
     lengths = Counter()
     for start in rules.start_states:
         shortest = _shortest_by_search(rules, start)

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
-from imagine_bench.tasks.arrow_puzzle.spec import SPEC
+from imagine_bench.tasks.arrow_puzzle.spec import spec_of
 from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
-from imagine_bench.tasks.macro_env import agent_eye
+from imagine_bench.tasks.macro_env import agent_camera
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
@@ -28,8 +28,8 @@ def world():
 
 
 @pytest.fixture(scope="module")
-def eye(world):
-    renderer = agent_eye(world.model)
+def camera(world):
+    renderer = agent_camera(world.model)
     yield renderer
     renderer.close()
 
@@ -113,7 +113,7 @@ def test_the_gripper_passes_the_pointing_finger(world, pointed):
 @pytest.mark.parametrize("level", LEVELS)
 def test_every_macrostate_is_read_back_at_every_level(level):
     world, generator = ArrowWorld(appearance(level)), rng()
-    for state in SPEC.rules.states:
+    for state in spec_of().rules.states:
         world.place(state, generator)
         world.vary(generator)
         reading = world.read()
@@ -152,17 +152,17 @@ def test_a_cube_off_its_place_is_a_problem(world, change, problem):
 # --- what the camera sees ----------------------------------------------------------------------------------------
 
 
-def test_the_arm_is_out_of_the_agent_s_view(world, eye):
+def test_the_arm_is_out_of_the_agent_s_view(world, camera):
     world.place((0, 1, 2, 1), rng())
-    hidden = eye.frame(world.data)
+    hidden = camera.frame(world.data)
     with_arm = Renderer(world.model, View(camera=c.AGENT_CAMERA, groups=(c.SCENE_GROUP, c.ARM_GROUP)))
     assert np.array_equal(hidden, with_arm.frame(world.data))
     with_arm.close()
     human = {groups: Renderer(world.model, View(camera=c.HUMAN_CAMERA, groups=groups)) for groups in ((0,), (0, 2))}
-    pictures = [renderer.frame(world.data) for renderer in human.values()]
+    images = [renderer.frame(world.data) for renderer in human.values()]
     for renderer in human.values():
         renderer.close()
-    assert not np.array_equal(*pictures)  # hiding a group does something
+    assert not np.array_equal(*images)  # hiding a group does something
 
 
 def _strip_of_column(column):
@@ -206,10 +206,10 @@ def _pointing(dark):
     return ("down" if down > 0 else "up") if abs(down) > abs(right) else ("right" if right > 0 else "left")
 
 
-def test_arrows_point_where_their_names_say(world, eye):
+def test_arrows_point_where_their_names_say(world, camera):
     for direction, name in enumerate(("up", "right", "down", "left")):
         world.place((direction,) * 3 + (1,), rng())
-        dark = _is_dark(eye.frame(world.data))[34:]
+        dark = _is_dark(camera.frame(world.data))[34:]
         assert [_pointing(dark[:, columns]) for columns in (slice(0, 20), slice(22, 42), slice(45, 64))] == [name] * 3
 
 
@@ -218,10 +218,10 @@ def _skin(frame):
     return (red - blue > 45) & (red - green > 20)
 
 
-def test_the_hand_is_at_the_top_and_its_finger_in_the_strip_of_its_cube(world, eye):
+def test_the_hand_is_at_the_top_its_finger_in_its_cube_s_strip(world, camera):
     for pointed in range(3):
         world.place((0, 1, 2, pointed), rng())
-        rows, columns = np.nonzero(_skin(eye.frame(world.data)))
+        rows, columns = np.nonzero(_skin(camera.frame(world.data)))
         assert len(rows) > 100
         assert rows.max() < 36
         tip = columns[rows >= rows.max() - 6]
@@ -242,11 +242,11 @@ def test_levels_are_ordered_and_named():
         appearance("mid")
 
 
-def test_clean_frames_differ_by_cubes_only_and_other_levels_by_more(eye):
+def test_clean_frames_differ_by_cubes_alone_other_levels_by_more(camera):
     changed = {}
     for level in LEVELS:
         world, generator = ArrowWorld(appearance(level)), rng()
-        own = agent_eye(world.model)
+        own = agent_camera(world.model)
         frames = []
         for _ in range(2):
             world.place((0, 1, 2, 1), generator)
@@ -287,7 +287,7 @@ def test_samples_of_looks_do_not_add_up():
     frames = []
     for warm_up in (0, 100):
         world = ArrowWorld(appearance("strong"))
-        own, warm, last = agent_eye(world.model), rng(), np.random.default_rng(7)
+        own, warm, last = agent_camera(world.model), rng(), np.random.default_rng(7)
         for _ in range(warm_up):
             world.vary(warm)
         world.place((0, 1, 2, 1), last)

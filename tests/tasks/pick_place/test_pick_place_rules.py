@@ -47,7 +47,7 @@ def test_outcomes_are_distributions_over_known_states():
             assert outcome.terminated == RULES.is_terminal(outcome.macrostate)
 
 
-def test_exactly_one_action_is_asked_for_in_play_and_none_after_an_end():
+def test_one_action_is_asked_for_in_play_and_none_after_an_end():
     for state in RULES.states:
         right = [action for action in range(4) if RULES.is_asked_for(state, action)]
         assert len(right) == (0 if RULES.is_terminal(state) else 1)
@@ -56,7 +56,7 @@ def test_exactly_one_action_is_asked_for_in_play_and_none_after_an_end():
             assert (outcome.reward, outcome.terminated, outcome.success) == (-5.0, True, False)
 
 
-def test_rewards_are_a_function_of_the_macrostate_reached_in_play():
+def test_rewards_in_play_depend_on_the_macrostate_reached_alone():
     """So that a reward network r(z') can be right."""
     rewards: dict[tuple[int, ...], set[float]] = {}
     for state, action in itertools.product(PLAY, range(4)):
@@ -73,7 +73,7 @@ def test_a_pick_as_asked_leaves_the_human_three_wishes():
     assert all(outcome.probability == pytest.approx(1 / 3) and outcome.reward == 1.0 for outcome in outcomes)
 
 
-def test_the_human_keeps_pointing_while_the_held_object_is_put_back():
+def test_the_human_keeps_pointing_while_an_object_is_put_back():
     (outcome,) = RULES.outcomes((1, 0, 0, 2), 0)
     assert (outcome.macrostate, outcome.reward, outcome.terminated) == ((0, 0, 0, 2), 0.0, False)
 
