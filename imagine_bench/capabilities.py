@@ -100,8 +100,8 @@ class TransferLearner(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What a teacher says of an action that was only imagined: the reward it would bring, and whether it would end
+class Label:
+    """What an oracle says of an action that was only imagined: the reward it would bring, and whether it would end
     the episode.
     """
 
@@ -111,20 +111,20 @@ class Answer:
 
 @runtime_checkable
 class QueryingAgent(Protocol):
-    """An agent that can ask a teacher what actions which it only imagines would bring."""
+    """An agent that can query an oracle about actions that it only imagines."""
 
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
         """Before it acts: the macro-actions whose last one is asked about, from the frame seen, or None to ask nothing.
 
         It changes nothing but the agent's measurements.
 
         Returns:
             Macro-actions (D,) with D of at least 1. The scene is imagined to go on through ends of episodes, so the
-            answer concerns the last one alone.
+            label concerns the last one alone.
         """
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
-        """Take in the answer to :meth:`question`; None says that it is a matter of chance, so that there is none."""
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+        """Take in the label of :meth:`query`; None says that it is a matter of chance, so that there is none."""
 
 
 @runtime_checkable

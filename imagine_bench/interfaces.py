@@ -227,9 +227,9 @@ class AgentContext:
         preprocessing: Name of the task's declared observation preprocessing.
         encoder: The encoder artefact (``.safetensors``), or None for agents that need none.
         seeds: The agent's node of the seed tree.
-        settings: Name of the settings family, as the task names it.
-        preset: Name of the family's preset (``"smoke"``, ``"quick"``, ``"thesis"``, ``"full"``).
-        overrides: Single settings that replace the preset's, by dotted name.
+        config_group: Name of the config group of settings, as the task names it.
+        hyperparameters: Name of the group's set of values (``"minimal"``, ``"fast"`` or ``"published"``).
+        overrides: Single settings that replace the set's, by dotted name.
         device: A torch device name, ``"cpu"`` or ``"cuda"``.
         optimal_action: The rules' optimal action, only for agents registered as privileged; None for every other.
     """
@@ -238,8 +238,8 @@ class AgentContext:
     preprocessing: str
     encoder: Path | None
     seeds: SeedTree
-    settings: str = "chapter_5"
-    preset: str = "quick"
+    config_group: str = "chapter_5"
+    hyperparameters: str = "fast"
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"
     optimal_action: Callable[[State], int] | None = None

@@ -11,7 +11,7 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
-from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,18 +42,19 @@ class AgentEntry:
         learns: Whether training changes it; others are only evaluated.
         needs_encoder: Whether it sees what an encoder gives.
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
+        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
+            ``resolve(hyperparameters, overrides, group)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
-        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
-        title: For headings, legends and tables; by default the registered name.
-        description: One sentence for a reader of the report.
+        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
+        title: For headings, legends and tables; by default the registered name in plain words.
+        description: One sentence for a reader who knows none of this.
     """
 
     make: str
     learns: bool = True
     needs_encoder: bool = True
     encoder_kind: str = "latents"
-    settings: str = "imagine_bench.agents.presets"
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
     privileged: bool = False
     external_training_loop: bool = False
     title: str = ""
@@ -102,6 +103,7 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "dqn": AgentEntry(
         make="imagine_bench.agents.dqn:make",
+        settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
         title="DQN",
         description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
     ),
@@ -119,7 +121,7 @@ AGENTS: dict[str, AgentEntry] = {
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings",
+        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         title="factored",
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
         "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
@@ -127,7 +129,7 @@ AGENTS: dict[str, AgentEntry] = {
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 DQN (pixels)",
         description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
@@ -135,14 +137,14 @@ AGENTS: dict[str, AgentEntry] = {
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 QR-DQN (pixels)",
         description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 DQN (latents)",
         description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
@@ -213,10 +215,25 @@ REGRESSORS: dict[str, RegressorEntry] = {
 }
 
 
+TASK_TYPES = {
+    "control": "imagine_bench.bench.control:CONTROL",
+    "regression": "imagine_bench.regression.task_type:REGRESSION",
+}
+"""The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
+
+OBSERVERS = tuple(
+    f"imagine_bench.cli.observers:{name}"
+    for name in ("OpenLoopObserver", "FuturesObserver", "ExamplesObserver", "RecordingObserver")
+)
+"""What looks at every control run, in this order, each the ``"module:attr"`` of a
+:class:`.bench.runner.RunObserver` without arguments."""
+
+
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
     module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    found = importlib.import_module(module)
+    return getattr(found, attribute) if attribute else found
 
 
 def agents() -> dict[str, AgentEntry]:
@@ -283,24 +300,24 @@ def agent_entry(name: str) -> AgentEntry:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    names: frozenset[str] = load(f"{agent_entry(agent).settings}:names")()
+    names: frozenset[str] = load(agent_entry(agent).settings).names()
     return names
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a protocol's overrides that this agent has settings for; the others are some other agent's."""
+    """Those of a protocol's overrides that this agent has settings for; the others are another agent's."""
     names = setting_names(agent) if overrides else frozenset()
     return {name: value for name, value in overrides.items() if name in names}
 
 
-def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> Any:
+def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
     """An agent's settings, a dataclass, with those of the overrides that it has.
 
     Raises:
-        UnknownNameError: No such preset or family.
+        UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
+    return load(agent_entry(agent).settings).resolve(hyperparameters, own_settings(agent, overrides), group)
 
 
 def task(name: str) -> TaskSpec:
@@ -335,7 +352,7 @@ def _numbers_of_values(rules: Rules) -> tuple[int, ...]:
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:
-    """A new agent of a registered kind."""
+    """A new agent by its registered name."""
     make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
     return make(context)
 
@@ -360,6 +377,6 @@ def regressor_entry(name: str) -> RegressorEntry:
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
-    """A new regressor of a registered kind."""
+    """A new regressor by its registered name."""
     make: Callable[[RegressorContext], Regressor] = load(regressor_entry(name).make)
     return make(context)

@@ -15,7 +15,7 @@ from scipy import special, stats
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.regression import Mixtures
+from imagine_bench.regression.interfaces import Mixtures
 
 LEVELS = (0.5, 0.8, 0.95)
 """Central intervals whose coverage is reported."""

@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.judge.calibration import LEVELS
-from imagine_bench.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
-from imagine_bench.regression.results import RegressionResult, rows_csv
+from imagine_bench.regression.interfaces import SCORES
+from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.page import aligned, made, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import Image, Page, Section, Table, mean_std, number
+from imagine_bench.store.codec import table_text
 from imagine_bench.store.files import csv_text
 
 _SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -41,7 +42,7 @@ def write_report(result: RegressionResult) -> Path:
         question=spec.description,
         answers=[answer for section in sections for answer in section.answers],
         sections=[_compared(result), *sections],
-        files={"results.csv": rows_csv(rows), **tables},
+        files={"results.csv": table_text(rows), **tables},
         **made(result, {agent: _title(agent) for agent in protocol.agents}),
     )
     return write_page(result.folder / "report", page)

@@ -13,12 +13,12 @@ from imagine_bench.bench.progress import counted
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.machine import describe_environment
+from imagine_bench.protocols.task_types import task_type
 from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
-from imagine_bench.store.bench_folder import newest_bench, read_protocol, require_either
+from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol, require_either
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json
 from imagine_bench.store.trained import Trained, learners, load_trained, require_control, require_runs
-from imagine_bench.task_types import task_type
 
 Value = TypeVar("Value")
 
@@ -146,7 +146,7 @@ def analyse(
     require_runs(bench)
     where = bench / analysis.name
     with lock(bench / f".{analysis.name}.lock", f"The folder {where}"):
-        protocol, folders = read_protocol(bench), learners(bench)
+        protocol, folders = read_control(bench), learners(bench)
         spec, appearance = registry.task(protocol.task), protocol.appearance
         found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         runs = []

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.bench_folder import read_protocol
-from imagine_bench.store.partial import largest_part
+from imagine_bench.store.merge import largest_part
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
-from imagine_bench.task_types import TASK_TYPES
 
 _RESULTS = "results.csv"
 _COUNTS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
@@ -38,7 +38,7 @@ def load_archive(folder: Path) -> BenchResult:
         InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
-    if whole.task not in TASK_TYPES["control"].tasks:
+    if not isinstance(whole, Protocol):
         raise InvalidValueError(
             f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
             "that act have a report. The command in its environment.json makes the bench anew, with one."

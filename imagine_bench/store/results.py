@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.files import first_difference
 
 
@@ -156,7 +156,7 @@ class RunResult:
         training_success: Whether each training episode succeeded. Shape (episodes,).
         training_length: Macro-actions of each training episode. Shape (episodes,).
         imagined: Example rollouts at the last budget, for agents that imagine.
-        sampled_rollouts: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
+        sampled_rollouts: Several from one beginning at the last budget, where the rules leave something to chance.
         folder: Where the run's files lie.
         recording: Its Rerun recording, or None.
     """

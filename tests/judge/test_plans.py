@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame, State
 from imagine_bench.judge.plans import Plan, carry_out, make_env, make_plans
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.plans import plan_table, summarise, write_plans
 from imagine_bench.rules import fewest_actions

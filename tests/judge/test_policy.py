@@ -17,7 +17,6 @@ from inline_bench import Inline, bench
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, State, TaskSpec
@@ -30,6 +29,7 @@ from imagine_bench.judge.policy import (
     optimal_length,
     terminations,
 )
+from imagine_bench.protocols.control import protocol
 from imagine_bench.report.analysis import Measured
 from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.policy import PolicyAnalysis

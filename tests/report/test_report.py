@@ -16,9 +16,9 @@ import pytest
 from fake_results import bench_result, compared_rollout
 
 from imagine_bench import reference, registry
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.judge import filmstrips
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words

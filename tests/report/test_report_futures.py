@@ -13,9 +13,9 @@ from fake_results import bench_result, compared_rollout
 from PIL import Image
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import changes, sampled_filmstrips
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
 from imagine_bench.store.results import BenchResult, Futures, RunResult

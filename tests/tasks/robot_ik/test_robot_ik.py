@@ -8,7 +8,7 @@ from imagine_bench.tasks.robot_ik import spec as ik
 from imagine_bench.tasks.robot_ik.planar_arm import MOVE_S
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import Prediction
+from imagine_bench.regression.interfaces import Prediction
 from imagine_bench.seeding import SeedTree
 
 
@@ -129,7 +129,7 @@ def test_decisions_are_carried_out_by_the_arm() -> None:
     def predict(points: np.ndarray, purpose: str) -> Prediction:
         shape, rng = points.shape[:2], np.random.default_rng(len(purpose))
         said = {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
-        scores = {name: rng.random(shape) for name in ("stationarity", "drawn", "surprise")}
+        scores = {name: rng.random(shape) for name in ("stationarity", "sampled_variance", "nll")}
         told = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
         return Prediction(prediction=told, **said, **scores, predictive=None)  # type: ignore[arg-type]
 
