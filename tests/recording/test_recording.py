@@ -112,7 +112,7 @@ class _HandsOver(FakeImaginer):
         return np.arange(4, dtype=np.float32)
 
 
-def test_where_chance_plays_several_courses_are_shown_and_elsewhere_not(imagined: Path, tmp_path: Path) -> None:
+def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
     options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
     path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}

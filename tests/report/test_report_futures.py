@@ -126,7 +126,7 @@ def test_the_values_of_futures_are_not_clipped(result: BenchResult) -> None:
     assert (last_line != 255).any()
 
 
-def test_the_thesis_is_quoted_for_chapter_3_without_a_standard_deviation(folder: Path) -> None:
+def test_chapter_3_is_quoted_without_a_standard_deviation(folder: Path) -> None:
     page = (folder / "index.html").read_text()
     assert "<small>thesis 98.0</small>" in page
     assert "<small>thesis 78.0</small>" in page
