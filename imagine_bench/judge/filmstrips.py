@@ -20,7 +20,7 @@ _LABELS = 108  # width of the column that names the rows
 _HEADER, _FOOTER = 62, 92
 _ROW = _CELL + _GAP
 _BOTTOM = _HEADER + 2 * _ROW
-_SHEET_HEADER, _SHEET_ROW = 36, 36 + _CELL + 54 + _SHEET_GAP
+_SHEET_HEADER, _SHEET_LINE = 36, 14
 _LINE = 20  # characters
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: color-blind safe
@@ -77,11 +77,13 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
         The image. Shape (height, width, 3), uint8.
     """
     depth = max(len(each.rollout.actions) for each in sampled_rollouts)
+    texts = [_what_changes(each, step, spec) for each in sampled_rollouts for step in range(len(each.rollout.actions))]
+    height = _SHEET_HEADER + _CELL + 12 + _SHEET_LINE * max(len(lines) for lines in texts) + _SHEET_GAP  # of a row
     width = 2 * _MARGIN + (depth + 1) * (_CELL + _SHEET_GAP)
-    canvas = Image.new("RGB", (width, 2 * _MARGIN + len(sampled_rollouts) * _SHEET_ROW), PAPER)
+    canvas = Image.new("RGB", (width, 2 * _MARGIN + len(sampled_rollouts) * height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for row, compared in enumerate(sampled_rollouts):
-        top = _MARGIN + row * _SHEET_ROW + _SHEET_HEADER
+        top = _MARGIN + row * height + _SHEET_HEADER
         if row == 0:
             _paste(canvas, compared.start_frame, (_MARGIN, top))
             draw.text((_MARGIN, top - 18), "the real start", font=font(12, bold=True), fill=INK)
@@ -175,14 +177,23 @@ def _sampled_cell(
 ) -> None:
     rollout, left = compared.rollout, _MARGIN + (step + 1) * (_CELL + _SHEET_GAP)
     action, now = int(rollout.actions[step]), rollout.macrostates[step]
-    before = compared.start_macrostate if step == 0 else rollout.macrostates[step - 1]
+    before = _before(compared, step)
     title = textwrap.wrap(spec.action_names[action], width=_LINE)[:2]
     draw.multiline_text((left, top - _SHEET_HEADER), "\n".join(title), font=font(11, bold=True), fill=INK, spacing=2)
     _paste(canvas, rgb(rollout.frames[step]), (left, top))
-    end = "; the end" if rollout.p_terminated[step] > 0.5 else ""
-    lines = textwrap.wrap(changes(before, now, spec) + end, width=_LINE)[:3]
+    lines = _what_changes(compared, step, spec)
     color = RIGHT if is_possible(spec.rules, before, action, now) else WRONG
     draw.multiline_text((left, top + _CELL + 3), "\n".join(lines), font=font(11), fill=color, spacing=2)
+
+
+def _before(compared: ComparedRollout, step: int) -> Macrostate:
+    return compared.start_macrostate if step == 0 else compared.rollout.macrostates[step - 1]
+
+
+def _what_changes(compared: ComparedRollout, step: int, spec: TaskSpec) -> list[str]:
+    """The lines below one imagined image."""
+    end = "; the end" if compared.rollout.p_terminated[step] > 0.5 else ""
+    return textwrap.wrap(changes(_before(compared, step), compared.rollout.macrostates[step], spec) + end, width=_LINE)
 
 
 def _paste(canvas: Image.Image, pixels: NDArray[np.uint8], corner: tuple[int, int], *, pale: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""How a recording looks when it is opened: the story without a click."""
+"""How a recording looks when it is opened: everything is seen without a click."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.recording.scene import ROOT
 
-_EYE_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
+_CAMERA_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
 """Beside the human's hand, across the table from the arm: neither hides the objects."""
 
 
@@ -18,7 +18,7 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
         origin=ROOT,
         name="The scene: the arm acts, a human gestures",
         eye_controls=rrb.EyeControls3D(
-            position=target_m + _EYE_FROM_TARGET_M, look_target=target_m, eye_up=[0.0, 0.0, 1.0]
+            position=target_m + _CAMERA_FROM_TARGET_M, look_target=target_m, eye_up=[0.0, 0.0, 1.0]
         ),
         background=[214, 222, 230],
         line_grid=False,
@@ -26,24 +26,24 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
 
 
 def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool) -> rrb.Blueprint:
-    """The layout: the scene large, beside it what the agent sees, says and expects, below it what it imagines.
+    """The layout: the scene large, beside it what the agent sees and predicts, below it what it imagines.
 
     Args:
         target_m: What the 3D view looks at. Shape (3,).
         values: Whether the agent has Q-values.
         imagines: Whether the agent imagines.
-        several: Whether it imagines several sampled_rollouts from each frame.
+        several: Whether it imagines several rollouts from each frame.
     """
     scene = scene_view(target_m)
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
-    story = rrb.TextDocumentView(origin="/real/story", name="What happens")
-    side: list[rrb.Container | rrb.View] = [rrb.Horizontal(story, frame)]
+    text = rrb.TextDocumentView(origin="/real/text", name="What happens")
+    side: list[rrb.Container | rrb.View] = [rrb.Horizontal(text, frame)]
     if values:
         side.append(rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action"))
     top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.1, 1.0])
     pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
     if imagines:
-        pages = [_imagined_now(), *([_courses()] if several else []), *pages, _by_depth()]
+        pages = [_imagined_now(), *([_sampled_rollouts()] if several else []), *pages, _by_depth()]
     bottom = rrb.Tabs(*pages, active_tab=0)
     return playing(rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]))
 
@@ -60,7 +60,7 @@ def playing(layout: rrb.Container) -> rrb.Blueprint:
 
 def _imagined_now() -> rrb.Horizontal:
     strip = rrb.Spatial2DView(
-        origin="/imagined/strip",
+        origin="/imagined/filmstrip",
         name="The agent's own plan from here: what would really happen (above), what it imagines (below)",
         background=[255, 255, 255],
     )
@@ -72,7 +72,7 @@ def _imagined_now() -> rrb.Horizontal:
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
 
 
-def _courses() -> rrb.Spatial2DView:
+def _sampled_rollouts() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin="/imagined/sampled_rollouts",
         name="Several futures from the current frame",

@@ -6,28 +6,23 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ValueReader
-from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
-from imagine_bench.judge.filmstrips import filmstrip, png, rgb, sampled_filmstrips
+from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import make_folder
@@ -78,45 +73,14 @@ def record_run(
             several=isinstance(agent, Imaginer) and is_random(spec.rules),
         )
         with recording_file(path, task, layout) as recording:
-            story = _Story(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
+            recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
             if isinstance(scene, SceneReader):
                 log_shapes(recording, scene.shapes())
             for episode in range(1, episodes + 1):
-                story.tell(env, episode)
+                recorder.record(env, episode)
     finally:
         env.close()
     return path
-
-
-@contextmanager
-def recording_file(path: Path, task: str, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A recording that is closed however the block ends, and gets its name only if it is complete."""
-    partial = path.with_name(f"{path.stem}.partial.rrd")
-    recording = rr.RecordingStream(f"imagine_bench_{task}")
-    recording.save(partial, default_blueprint=layout)
-    try:
-        yield recording
-    finally:
-        recording.flush()
-        recording.disconnect()
-    partial.replace(path)
-
-
-def open_in_viewer(path: Path) -> None:
-    """Open a recording in the Rerun viewer and return when it is closed.
-
-    Raises:
-        ArtefactError: No such file.
-        SetupError: There is no display; the message says how to look at it elsewhere.
-    """
-    if not path.is_file():
-        raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
-    displayed = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or not sys.platform.startswith("linux")
-    if not displayed or subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode:
-        raise SetupError(
-            f"No display here to open {path}, or the viewer failed; copy it to a machine with one and run "
-            f"'rerun {path.name}' there, or run 'rerun --serve-web {path}' here and open the address it prints."
-        )
 
 
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
@@ -136,8 +100,8 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
     return "\n".join(["```", *rows, "```", "\\> is the one it carries out."])
 
 
-class _Story:
-    """Tells one episode after the other on a common clock.
+class _EpisodeRecorder:
+    """Records one episode after the other on a common clock.
 
     Args:
         recording: Where to.
@@ -149,121 +113,96 @@ class _Story:
     """
 
     def __init__(
-        self,
-        recording: rr.RecordingStream,
-        spec: TaskSpec,
-        agent: Agent,
-        appearance: str,
-        *,
-        privileged: bool,
-        seed: int,
+        self, recording: Recording, spec: TaskSpec, agent: Agent, appearance: str, *, privileged: bool, seed: int
     ) -> None:
         self._recording, self._spec, self._agent, self._appearance = recording, spec, agent, appearance
         self._privileged, self._seed = privileged, seed
         self._clock_s, self._env_step = 0.0, -1
 
-    def tell(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
+    def record(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
         frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
-            self._recording.set_time("imagined_depth", sequence=0)
-        self._arrive(episode, frame)
-        self._move(env.unwrapped, episode, only_moved=False)
-        done, step, story = False, 0, f"### Episode {episode}: a new start"
+            self._recording.stream.set_time("imagined_depth", sequence=0)
+        self._log_frame(env.unwrapped, episode, frame)
+        done, step, heading = False, 0, f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
             observation = Observation(frame=frame, macrostate=macrostate if self._privileged else None)
             action = int(self._agent.act(observation, explore=False))
-            self._say(f"{story}\n\n{self._seen(macrostate)}\n\n**Next: {self._spec.action_names[action]}.**")
-            self._expect(observation, action)
-            self._recording.disable_timeline("imagined_depth")
-            self._imagine(frame, macrostate, episode, step)
+            self._describe(heading, macrostate, f"Next: {self._spec.action_names[action]}.")
+            self._log_values(observation, action)
+            self._recording.stream.disable_timeline("imagined_depth")
+            self._log_imagination(frame, macrostate, episode, step)
             frame, reward, terminated, truncated, info = env.step(np.int64(action))
             self._clock_s += macro_duration_s(env.unwrapped)
-            self._arrive(episode, frame)
-            self._move(env.unwrapped, episode, only_moved=True)
-            self._recording.log("/real/reward", rr.Scalars(float(reward)), strict=True)
+            self._log_frame(env.unwrapped, episode, frame)
+            self._recording.scalar("/real/reward", float(reward))
             done, step = terminated or truncated, step + 1
-            story = f"### Episode {episode}, after macro-action {step}\n\n{self._outcome(action, float(reward), info)}"
-        ending = "**Solved.**" if info["is_success"] else "**Not solved.**"
-        self._say(f"{story}\n\n{self._seen(np.asarray(info['macrostate']))}\n\n{ending}")
-        self._expect_no_more()
+            fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
+            outcome = f"Done: {self._spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
+            heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
+        self._describe(heading, np.asarray(info["macrostate"]), "Solved." if info["is_success"] else "Not solved.")
+        self._clear_predictions()
         self._clock_s += _STILL_S
 
-    def _arrive(self, episode: int, frame: Frame) -> None:
-        """A new real frame: set the clocks and show it."""
+    def _log_frame(self, scene: Any, episode: int, frame: Frame) -> None:
+        """A new real frame: set the clocks, show it and how the scene stands."""
         self._env_step += 1
-        self._recording.set_time("sim_time", duration=self._clock_s)
-        self._recording.set_time("env_step", sequence=self._env_step)
-        self._recording.set_time("episode", sequence=episode)
-        self._recording.log("/real/frame", rr.Image(frame), strict=True)
-
-    def _move(self, scene: Any, episode: int, *, only_moved: bool) -> None:
+        sequences = {"env_step": self._env_step, "episode": episode}
+        self._recording.stream.set_time("sim_time", duration=self._clock_s)
+        for name, value in sequences.items():
+            self._recording.stream.set_time(name, sequence=value)
+        self._recording.log("/real/frame", rr.Image(frame))
         if isinstance(scene, SceneReader):
-            sequences = {"env_step": self._env_step, "episode": episode}
             if self._env_step == 0:
                 sequences["imagined_depth"] = 0
-            motion = scene.motion()
-            log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
+            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
 
-    def _say(self, markdown: str) -> None:
-        document = rr.TextDocument(f"*{self._spec.description}*\n\n{markdown}", media_type=rr.MediaType.MARKDOWN)
-        self._recording.log("/real/story", document, strict=True)
-
-    def _seen(self, macrostate: NDArray[np.int64]) -> str:
-        """The macrostate in words."""
+    def _describe(self, heading: str, macrostate: NDArray[np.int64], last: str) -> None:
+        """What has happened, what the frame shows, what comes next."""
         pairs = zip(self._spec.macrostate_names, self._spec.value_names(macrostate), strict=True)
-        return "\n".join(f"- {name}: {value}" for name, value in pairs)
+        seen = "\n".join(f"- {name}: {value}" for name, value in pairs)
+        self._recording.text("/real/text", f"*{self._spec.description}*\n\n{heading}\n\n{seen}\n\n**{last}**")
 
-    def _outcome(self, action: int, reward: float, info: dict[str, Any]) -> str:
-        fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
-        return f"Done: {self._spec.action_names[action]}. Reward {reward:+.0f}.{fault}"
-
-    def _expect(self, observation: Observation, action: int) -> None:
-        """The Q-values: a series each, and a table with bars, the chosen one marked."""
+    def _log_values(self, observation: Observation, action: int) -> None:
+        """The Q-values: a curve each, and a table with bars, the chosen one marked."""
         if not isinstance(self._agent, ValueReader):
             return
         names, values = self._spec.action_names, self._agent.q_values(observation)
         for name, value in zip(names, values, strict=True):
-            self._recording.log(f"/real/q_values/{entity_name(name)}", rr.Scalars(float(value)), strict=True)
-        table = rr.TextDocument(q_table(names, values, action), media_type=rr.MediaType.MARKDOWN)
-        self._recording.log("/real/q_table", table, strict=True)
+            self._recording.scalar(f"/real/q_values/{entity_name(name)}", value)
+        self._recording.text("/real/q_table", q_table(names, values, action))
 
-    def _expect_no_more(self) -> None:
-        """Take away what was expected of the frame before: at an episode's end nothing more is carried out."""
+    def _clear_predictions(self) -> None:
+        """Remove what was predicted from the frame before: at an episode's end nothing more is carried out."""
         stale = ["/real/q_table"] if isinstance(self._agent, ValueReader) else []
         if isinstance(self._agent, Imaginer):
-            stale += ["/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in _KINDS)]
+            stale += ["/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in _KINDS)]
             stale += ["/imagined/sampled_rollouts"] if is_random(self._spec.rules) else []
         for path in stale:
-            self._recording.log(path, rr.Clear(recursive=False), strict=True)
+            self._recording.clear(path)
 
-    def _imagine(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
+    def _log_imagination(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
         """The agent's greedy plan, imagined from here and set beside what would really happen."""
         if not isinstance(self._agent, Imaginer):
             return
-        rng = SeedTree(self._seed).child("recording", episode, step).generator()
+        spec, seeds = self._spec, SeedTree(self._seed)
+        rng = seeds.child("recording", episode, step).generator()
         rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
         compared = compare_rollout(
-            self._spec, frame=frame, macrostate=macrostate, rollout=rollout, appearance=self._appearance, rng=rng
+            spec, frame=frame, macrostate=macrostate, rollout=rollout, appearance=self._appearance, rng=rng
         )
-        strip = png(filmstrip(compared, self._spec.action_names, columns=IMAGINED_DEPTH))
-        self._recording.log("/imagined/strip", rr.EncodedImage(contents=strip, media_type="image/png"), strict=True)
+        self._recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
         self._uncertainty_bars(compared)
-        if is_random(self._spec.rules):
-            self._several(self._agent, frame, macrostate, SeedTree(self._seed).child("sampled_rollouts", episode, step))
+        if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
+            sampled = sampled_rollouts_from(
+                self._agent, spec, frame=frame, macrostate=macrostate, appearance=self._appearance,
+                seeds=seeds.child("sampled_rollouts", episode, step),
+            )  # fmt: skip
+            self._recording.sheet("/imagined/sampled_rollouts", sampled_filmstrips(sampled, spec))
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
-
-    def _several(self, agent: Imaginer, frame: Frame, macrostate: NDArray[np.int64], seeds: SeedTree) -> None:
-        """Several rollouts sampled from here, where what happens next is partly chance."""
-        sampled_rollouts = sampled_rollouts_from(
-            agent, self._spec, frame=frame, macrostate=macrostate, appearance=self._appearance, seeds=seeds
-        )
-        sheet = png(sampled_filmstrips(sampled_rollouts, self._spec))
-        self._recording.log(
-            "/imagined/sampled_rollouts", rr.EncodedImage(contents=sheet, media_type="image/png"), strict=True
-        )
 
     def _uncertainty_bars(self, compared: ComparedRollout) -> None:
         """Three bars, side by side, at each depth; none after the rollout's end, so that the axis stays the same."""
@@ -273,28 +212,24 @@ class _Story:
             places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
             widths = np.full(len(values), 0.25)
             bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
-            self._recording.log(f"/imagined/uncertainty/{kind}", bars, strict=True)
+            self._recording.log(f"/imagined/uncertainty/{kind}", bars)
 
     def _by_depth(self, compared: ComparedRollout, root: str) -> None:
         """The same rollout along ``imagined_depth``; depth 0 is the real start."""
         rollout, recording = compared.rollout, self._recording
+        curves: dict[str, NDArray[Any]] = {
+            **{f"uncertainty/{kind}": getattr(rollout, kind) for kind in _KINDS},
+            "prediction/reward": rollout.rewards,
+            "prediction/p_terminated": rollout.p_terminated,
+            "prediction/true_reward": compared.real_rewards,
+            "prediction/kept_by_filter": rollout.accepted,
+        }
         for depth in range(len(rollout.actions) + 1):
-            recording.set_time("imagined_depth", sequence=depth)
+            recording.stream.set_time("imagined_depth", sequence=depth)
             real = compared.start_frame if depth == 0 else compared.real_frames[depth - 1]
             imagined = rollout.start_frame if depth == 0 else rollout.frames[depth - 1]
-            recording.log(f"{root}/real_frame", rr.Image(real), strict=True)
-            recording.log(f"{root}/frame", rr.Image(rgb(imagined)), strict=True)
-            if depth == 0:
-                continue
-            for kind in _KINDS:
-                value = float(getattr(rollout, kind)[depth - 1])
-                recording.log(f"{root}/uncertainty/{kind}", rr.Scalars(value), strict=True)
-            predictions: dict[str, NDArray[Any]] = {
-                "reward": rollout.rewards,
-                "p_terminal": rollout.p_terminated,
-                "true_reward": compared.real_rewards,
-                "kept_by_filter": rollout.accepted,
-            }
-            for word, values in predictions.items():
-                recording.log(f"{root}/prediction/{word}", rr.Scalars(float(values[depth - 1])), strict=True)
-        recording.disable_timeline("imagined_depth")
+            recording.log(f"{root}/real_frame", rr.Image(real))
+            recording.log(f"{root}/frame", rr.Image(rgb(imagined)))
+            for name, values in curves.items() if depth else ():
+                recording.scalar(f"{root}/{name}", values[depth - 1])
+        recording.stream.disable_timeline("imagined_depth")

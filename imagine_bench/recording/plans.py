@@ -16,11 +16,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench.interfaces import SceneReader
-from imagine_bench.judge.filmstrips import filmstrip, png, rgb
+from imagine_bench.judge.filmstrips import filmstrip, rgb
 from imagine_bench.judge.plans import Plan, carry_out, make_env
 from imagine_bench.recording.blueprint import playing, scene_view
-from imagine_bench.recording.episodes import MOTION_HZ, recording_file
+from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
@@ -48,18 +49,18 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
         with recording_file(path, trained.task.id, _layout(scene, trained)) as recording:
             if isinstance(scene, SceneReader):
                 log_shapes(recording, scene.shapes())
-            story = _PlanStory(recording, trained, env, count, max_epistemic)
+            recorder = _PlanRecorder(recording, trained, env, count, max_epistemic)
             for number in range(count):
-                story.tell(number)
+                recorder.record(number)
     return path
 
 
-class _PlanStory:
-    """Tells one plan after the other on a common clock."""
+class _PlanRecorder:
+    """Records one plan after the other on a common clock."""
 
     def __init__(
         self,
-        recording: rr.RecordingStream,
+        recording: Recording,
         trained: Trained,
         env: gymnasium.Env[Any, Any],
         count: int,
@@ -69,10 +70,10 @@ class _PlanStory:
         self._count, self._max_epistemic = count, max_epistemic
         self._clock_s, self._env_step, self._number = 0.0, 0, 0
 
-    def tell(self, number: int) -> None:
-        """One plan: the scene stands, the plan appears, the arm does it, and it is seen what came of it."""
+    def record(self, number: int) -> None:
+        """One plan: the scene stands, the plan appears, the arm does it, and its outcome is shown."""
         self._number = number
-        self._recording.set_time("plan", sequence=number)
+        self._recording.stream.set_time("plan", sequence=number)
         moments: list[tuple[float, int]] = []
 
         def on_plan(*_: object) -> None:
@@ -96,8 +97,8 @@ class _PlanStory:
         self._env_step += 1
 
     def _set_clocks(self, clock_s: float, env_step: int) -> None:
-        self._recording.set_time("sim_time", duration=clock_s)
-        self._recording.set_time("env_step", sequence=env_step)
+        self._recording.stream.set_time("sim_time", duration=clock_s)
+        self._recording.stream.set_time("env_step", sequence=env_step)
 
     def _arrive(self, *, only_moved: bool) -> None:
         scene: Any = self._env.unwrapped
@@ -112,14 +113,13 @@ class _PlanStory:
         recording, compared, rollout = self._recording, plan.compared, plan.compared.rollout
         real = compared.start_frame if done == 0 else compared.real_frames[done - 1]
         imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
-        recording.log("/real/frame", rr.Image(real), strict=True)
-        recording.log("/imagined/frame", rr.Image(rgb(imagined)), strict=True)
-        task = self._trained.task  # room for the longest plan: the viewer takes no pictures of different sizes
-        strip = filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
-        image = rr.EncodedImage(contents=png(strip), media_type="image/png")
-        recording.log("/imagined/strip", image, strict=True)
-        text = rr.TextDocument(self._words(plan, done), media_type=rr.MediaType.MARKDOWN)
-        recording.log("/real/story", text, strict=True)
+        recording.log("/real/frame", rr.Image(real))
+        recording.log("/imagined/frame", rr.Image(rgb(imagined)))
+        task = self._trained.task  # room for the longest plan: the viewer takes no images of different sizes
+        recording.sheet(
+            "/imagined/filmstrip", filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
+        )
+        recording.text("/real/text", self._words(plan, done))
 
     def _words(self, plan: Plan, done: int) -> str:
         names = self._trained.task.action_names
@@ -148,10 +148,10 @@ def _layout(scene: Any, trained: Trained) -> rrb.Blueprint:
         rrb.Spatial2DView(origin="/real/frame", name="What the camera sees (the agent does not)"),
         rrb.Spatial2DView(origin="/imagined/frame", name="What the agent imagined for this moment"),
     )
-    story = rrb.TextDocumentView(origin="/real/story", name="The plan")
-    top = rrb.Horizontal(scene_view(look_target_m(scene)), rrb.Vertical(story, frames), column_shares=[1.1, 1.0])
+    text = rrb.TextDocumentView(origin="/real/text", name="The plan")
+    top = rrb.Horizontal(scene_view(look_target_m(scene)), rrb.Vertical(text, frames), column_shares=[1.1, 1.0])
     strip = rrb.Spatial2DView(
-        origin="/imagined/strip",
+        origin="/imagined/filmstrip",
         name=f"{trained.task.title}: the plan, real above and imagined below",
         background=[255, 255, 255],
     )

@@ -15,8 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from imagine_bench.recording.episodes import recording_file
 from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
+from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.regression.interfaces import RegressionSpec
 
 CHOICES = 6
@@ -53,7 +53,7 @@ def record(
             chosen = int(scores.argmin())
             _at(recording, clock_s, number)
             _show_candidates(recording, data, points, scores, chosen)
-            _say(recording, name, variant, data, choice, chosen, arrived=False)
+            _describe(recording, name, variant, data, choice, chosen, arrived=False)
             motion = scene.movement(data["decision/joints"][0, choice, chosen], _HZ)
             still = dataclasses.replace(motion, time_s=motion.time_s[:1], poses_in_world=motion.poses_in_world[:1])
             log_motion(recording, still, end_s=clock_s, sequences={"choice": number}, only_moved=False)
@@ -62,8 +62,8 @@ def record(
             _at(recording, clock_s, number)
             _show_error(recording, data["decision/reached"][0, choice, chosen], points[chosen])
             error_m = float(data["decision/error"][0, choice, chosen])
-            recording.log("/choice/error", rr.Scalars(error_m), strict=True)
-            _say(recording, name, variant, data, choice, chosen, arrived=True)
+            recording.scalar("/choice/error", error_m)
+            _describe(recording, name, variant, data, choice, chosen, arrived=True)
             clock_s += _STILL_S
     return path
 
@@ -74,16 +74,16 @@ def _layout(variant: str) -> rrb.Blueprint:
         eye_controls=rrb.EyeControls3D(position=[0.1, -1.35, 1.9], look_target=[0.1, 0.05, 0.0], eye_up=[0, 0, 1]),
         background=[232, 236, 240], line_grid=False,
     )  # fmt: skip
-    story = rrb.TextDocumentView(origin="/choice/story", name="What happens")
+    text = rrb.TextDocumentView(origin="/choice/text", name="What happens")
     errors = rrb.TimeSeriesView(origin="/choice/error", name="Error of each choice (m)")
-    layout = rrb.Horizontal(scene, rrb.Vertical(story, errors, row_shares=[2, 1]), column_shares=[1.6, 1.0])
+    layout = rrb.Horizontal(scene, rrb.Vertical(text, errors, row_shares=[2, 1]), column_shares=[1.6, 1.0])
     time = rrb.TimePanel(state="collapsed", timeline="sim_time", fps=25.0)
     return rrb.Blueprint(layout, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
 
 
-def _at(recording: rr.RecordingStream, clock_s: float, number: int) -> None:
-    recording.set_time("sim_time", duration=clock_s)
-    recording.set_time("choice", sequence=number)
+def _at(recording: Recording, clock_s: float, number: int) -> None:
+    recording.stream.set_time("sim_time", duration=clock_s)
+    recording.stream.set_time("choice", sequence=number)
 
 
 def _lifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -92,7 +92,7 @@ def _lifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _show_candidates(
-    recording: rr.RecordingStream,
+    recording: Recording,
     data: Mapping[str, NDArray[Any]],
     points: NDArray[np.float64],
     scores: NDArray[np.float64],
@@ -100,27 +100,27 @@ def _show_candidates(
 ) -> None:
     ranks = scores.argsort().argsort() / (len(scores) - 1)  # 0 the surest
     colors = (_SURE + ranks[:, None] * (_UNSURE - _SURE)).astype(np.uint8)
-    recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors, radii=0.022), strict=True)
+    recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors, radii=0.022))
     angle = np.linspace(0, 2 * np.pi, 33)
     ring = points[chosen] + 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_CHOSEN, radii=0.007), strict=True)
+    recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_CHOSEN, radii=0.007))
     outside_m = data["map/outside_m"]
     in_view = (outside_m < 0.2) & (data["map/points"][:, 0] > 0)
     far = int(np.where(in_view, outside_m, 0).argmax())
     label = f"unreachable: {outside_m[far]:.2f} m outside"
     place = _lifted(data["map/points"][far])
-    recording.log("/choice/outside", rr.Points3D(place, colors=_OUTSIDE, radii=0.022, labels=label), strict=True)
-    recording.log("/choice/miss", rr.Clear(recursive=False), strict=True)
+    recording.log("/choice/outside", rr.Points3D(place, colors=_OUTSIDE, radii=0.022, labels=label))
+    recording.clear("/choice/error_line")
 
 
-def _show_error(recording: rr.RecordingStream, tip_m: NDArray[np.float64], target_m: NDArray[np.float64]) -> None:
+def _show_error(recording: Recording, tip_m: NDArray[np.float64], target_m: NDArray[np.float64]) -> None:
     """A line from where the tip came to rest to where it should be."""
     line = _lifted(np.stack([tip_m, target_m]))
-    recording.log("/choice/miss", rr.LineStrips3D([line], colors=_ERROR, radii=0.009), strict=True)
+    recording.log("/choice/error_line", rr.LineStrips3D([line], colors=_ERROR, radii=0.009))
 
 
-def _say(
-    recording: rr.RecordingStream, name: str, variant: str, data: Mapping[str, NDArray[Any]], choice: int, chosen: int,
+def _describe(
+    recording: Recording, name: str, variant: str, data: Mapping[str, NDArray[Any]], choice: int, chosen: int,
     *, arrived: bool,
 ) -> None:  # fmt: skip
     error = data["decision/error"][0, choice]
@@ -137,5 +137,4 @@ def _say(
             f"{100 * error.mean():.1f} cm on average, the best by {100 * error.min():.1f} cm, the worst by "
             f"{100 * error.max():.1f} cm."
         )
-    document = rr.TextDocument("\n\n".join(words), media_type=rr.MediaType.MARKDOWN)
-    recording.log("/choice/story", document, strict=True)
+    recording.text("/choice/text", "\n\n".join(words))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
+from imagine_bench.recording.stream import Recording
 
 ROOT = "/scene"
 _STILL_M = 1e-6
@@ -40,18 +41,18 @@ def body_path(body: str) -> str:
     return f"{ROOT}/{entity_name(body)}"
 
 
-def log_shapes(recording: rr.RecordingStream, shapes: Sequence[Shape3D]) -> None:
+def log_shapes(recording: Recording, shapes: Sequence[Shape3D]) -> None:
     """Log every shape once, for all times, below its body; a backdrop as wide as a room is left out."""
-    recording.log(ROOT, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+    recording.log(ROOT, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in shapes:
         if extent_m(shape) > _BACKDROP_M:
             continue
         path = f"{body_path(shape.body)}/{entity_name(shape.name)}"
-        recording.log(path, _drawable(shape), static=True, strict=True)
+        recording.log(path, _drawable(shape), static=True)
 
 
 def log_motion(
-    recording: rr.RecordingStream, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool
+    recording: Recording, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool
 ) -> None:
     """Log the bodies' poses over one macro-action.
 
@@ -70,7 +71,7 @@ def log_motion(
         if only_moved and np.abs(poses - poses[0]).max() < _STILL_M:
             continue
         columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:]))
-        recording.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
+        recording.stream.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
 
 
 def macro_duration_s(scene: Any) -> float:

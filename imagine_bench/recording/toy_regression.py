@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from imagine_bench.recording.episodes import recording_file
+from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.regression.interfaces import RegressionSpec
 
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
@@ -43,15 +43,16 @@ def record(
         for variant, data in evaluations.items():
             x = data["x"]
             order = data["training_x"].argsort()
-            _points(
-                recording, f"/{variant}/y/training", data["training_x"][order], data["training_y"][order], _TRAINING
-            )
-            _points(recording, f"/{variant}/y/prediction", x, data["prediction"][0], _PREDICTION)
+            dots = {"training": (data["training_x"][order], data["training_y"][order], _TRAINING)}
+            dots["prediction"] = (x, data["prediction"][0], _PREDICTION)
+            for dot, (places, values, color) in dots.items():
+                look = rr.SeriesPoints(colors=color, marker_sizes=1.5)
+                _curve(recording, f"/{variant}/y/{dot}", look, places, values)
             for kind, color in _KINDS.items():
                 known = data[f"true_{kind}"]
                 truth = known if known.ndim == 1 else known[0]
-                _line(recording, f"/{variant}/{kind}/estimated", x, np.sqrt(data[kind][0]), color)
-                _line(recording, f"/{variant}/{kind}/true", x, np.sqrt(truth), _TRUE)
+                for line, variance, shade in (("estimated", data[kind][0], color), ("true", truth, _TRUE)):
+                    _curve(recording, f"/{variant}/{kind}/{line}", rr.SeriesLines(colors=shade), x, np.sqrt(variance))
     return path
 
 
@@ -73,27 +74,9 @@ def _layout(variants: list[str], name: str) -> rrb.Blueprint:
     return rrb.Blueprint(rrb.Horizontal(*columns), *panels, rrb.TimePanel(state="collapsed", timeline=_TIMELINE))
 
 
-def _times(x: NDArray[np.float64]) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn(_TIMELINE, sequence=np.round(x * _TICKS).astype(np.int64))]
-
-
-def _points(
-    recording: rr.RecordingStream,
-    path: str,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    color: tuple[int, int, int],
+def _curve(
+    recording: Recording, path: str, look: rr.AsComponents, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> None:
-    recording.log(path, rr.SeriesPoints(colors=color, marker_sizes=1.5), static=True, strict=True)
-    recording.send_columns(path, indexes=_times(x), columns=rr.Scalars.columns(scalars=y), strict=True)
-
-
-def _line(
-    recording: rr.RecordingStream,
-    path: str,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    color: tuple[int, int, int],
-) -> None:
-    recording.log(path, rr.SeriesLines(colors=color), static=True, strict=True)
-    recording.send_columns(path, indexes=_times(x), columns=rr.Scalars.columns(scalars=y), strict=True)
+    recording.log(path, look, static=True)
+    times = rr.TimeColumn(_TIMELINE, sequence=np.round(x * _TICKS).astype(np.int64))
+    recording.stream.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=y), strict=True)

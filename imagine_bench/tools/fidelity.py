@@ -1,4 +1,4 @@
-"""Does contact physics do what the rules say? Long random walks beside a twin whose outcomes are perfect."""
+"""Does contact physics do what the rules say? Long random walks beside a perfect execution."""
 
 from __future__ import annotations
 

@@ -20,10 +20,10 @@ from imagine_bench.store.files import make_folder, write_bytes
 
 WIDTH_PX, HEIGHT_PX = 560, 420
 """Size of the view of the whole scene; the agent's frame stands to its right, half as high."""
-_EYE_PX = 210
+_FRAME_PX = 210
 _FPS = 10
 _HOLD = 8
-"""Pictures for which the scene stands still between two macro-actions."""
+"""Images for which the scene stands still between two macro-actions."""
 
 
 def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> Path:
@@ -45,9 +45,9 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
     if out.exists():
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
     make_folder(out.parent)
-    pictures = [Image.fromarray(picture) for picture in _episode(task, seed, appearance)]
-    colors = pictures[0].quantize(128)
-    frames = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
+    images = [Image.fromarray(image) for image in _episode(task, seed, appearance)]
+    colors = images[0].quantize(128)
+    frames = [image.quantize(palette=colors, dither=Image.Dither.NONE) for image in images]
     whole = io.BytesIO()
     frames[0].save(whole, "GIF", save_all=True, append_images=frames[1:], duration=1000 // _FPS, loop=0, optimize=True)
     write_bytes(out, whole.getvalue())
@@ -67,16 +67,16 @@ def _episode(task: str, seed: int, appearance: str) -> Iterator[NDArray[np.uint8
             yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(_HOLD))
             action = spec.rules.optimal_action(tuple(int(value) for value in info["macrostate"]))
             after, _, terminated, truncated, info = env.step(action)
-            yield from (_side_by_side(picture, frame) for picture in scene.film(WIDTH_PX, HEIGHT_PX))
+            yield from (_side_by_side(image, frame) for image in scene.film(WIDTH_PX, HEIGHT_PX))
             frame, over = after, terminated or truncated
         yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(2 * _HOLD))
 
 
 def _side_by_side(scene: NDArray[np.uint8], frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The scene, and to its right the agent's frame of the moment before, enlarged without smoothing."""
-    canvas = np.full((HEIGHT_PX, WIDTH_PX + _EYE_PX + 10, 3), 255, dtype=np.uint8)
+    canvas = np.full((HEIGHT_PX, WIDTH_PX + _FRAME_PX + 10, 3), 255, dtype=np.uint8)
     canvas[:, :WIDTH_PX] = scene
-    eye = np.asarray(Image.fromarray(frame).resize((_EYE_PX, _EYE_PX), Image.Resampling.NEAREST))
-    top = (HEIGHT_PX - _EYE_PX) // 2
-    canvas[top : top + _EYE_PX, WIDTH_PX + 10 :] = eye
+    small = np.asarray(Image.fromarray(frame).resize((_FRAME_PX, _FRAME_PX), Image.Resampling.NEAREST))
+    top = (HEIGHT_PX - _FRAME_PX) // 2
+    canvas[top : top + _FRAME_PX, WIDTH_PX + 10 :] = small
     return canvas

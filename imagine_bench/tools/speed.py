@@ -1,11 +1,12 @@
-"""``make speed``: every speed and fidelity figure that the suite targets, measured now, beside the promise.
+"""``make speed``: every figure of speed and fidelity that the suite has a target for, measured now.
 
-CPU time is quoted wherever wall time would measure the neighbours on a shared machine.
+CPU time is quoted wherever wall time would measure other users of a shared machine.
 """
 
 from __future__ import annotations
 
 import json
+import operator
 import subprocess
 import sys
 import time
@@ -41,15 +42,35 @@ class Figure:
 
     Attributes:
         what: What was measured, with its unit.
-        required: The promise, as text.
+        required: The target, as text.
         measured: The figure, as text.
-        met: Whether the promise holds.
+        met: Whether it meets the target.
     """
 
     what: str
     required: str
     measured: str
     met: bool
+
+
+_SIGNS: dict[str, Callable[[float, float], bool]] = {">=": operator.ge, "<=": operator.le, "<": operator.lt}
+
+
+def _figure(what: str, value: float, sign: str, target: float, form: str, more: str = "") -> Figure:
+    """A figure with one target.
+
+    Args:
+        what: What was measured, with its unit.
+        value: The figure.
+        sign: How it must stand to the target.
+        target: The target.
+        form: Format of the figure.
+        more: Text behind it.
+    """
+    required = f"{target:.1%}" if form.endswith("%") else f"{target:,g}"
+    return Figure(
+        what=what, required=f"{sign} {required}", measured=f"{value:{form}}{more}", met=_SIGNS[sign](value, target)
+    )
 
 
 def measure(turns: int = TURNS) -> Iterator[Figure]:
@@ -60,7 +81,7 @@ def measure(turns: int = TURNS) -> Iterator[Figure]:
     """
     yield from _start_up()
     yield from _memory()
-    yield from _together()
+    yield from _batched()
     yield from _model_updates()
     specs = [registry.task(name) for name in registry.TASKS]
     measured = [(spec, spec.targets) for spec in specs if spec.targets is not None]
@@ -80,7 +101,7 @@ def speed_report(out: Path, turns: int = TURNS, show: Callable[[str], None] = pr
         show: Takes one line of text.
 
     Returns:
-        Whether every promise held.
+        Whether every target was met.
 
     Raises:
         InvalidValueError: Too few macro-actions to time, or a folder to write to.
@@ -133,10 +154,8 @@ print(json.dumps({{"import": imported, "reset": time.perf_counter() - start}}))
 """
     runs = [_child(code) for _ in range(5)]
     imported, first_reset = (min(run[key] for run in runs) for key in ("import", "reset"))
-    yield Figure(what="import imagine_bench, s", required="<= 0.5", measured=f"{imported:.2f}", met=imported <= 0.5)
-    yield Figure(
-        what="import + make + first reset, s", required="<= 2", measured=f"{first_reset:.2f}", met=first_reset <= 2
-    )
+    yield _figure("import imagine_bench, s", imported, "<=", 0.5, ".2f")
+    yield _figure("import + make + first reset, s", first_reset, "<=", 2, ".2f")
 
 
 def _memory() -> Iterator[Figure]:
@@ -155,46 +174,33 @@ print(json.dumps({{"rss": rss_mb(), "growth": rss_mb() - before}}))
     if not Path("/proc/self/status").exists():
         return
     memory = _child(code)
-    yield Figure(
-        what="memory of one env, MB", required="<= 300", measured=f"{memory['rss']:.0f}", met=memory["rss"] <= 300
-    )
-    yield Figure(
-        what="its growth over 2,000 resets, MB", required="<= 2", measured=f"{memory['growth']:.1f}",
-        met=memory["growth"] <= 2,
-    )  # fmt: skip
+    yield _figure("memory of one env, MB", memory["rss"], "<=", 300, ".0f")
+    yield _figure("its growth over 2,000 resets, MB", memory["growth"], "<=", 2, ".1f")
 
 
-def _together() -> Iterator[Figure]:
+def _batched() -> Iterator[Figure]:
     """What chapter 4 computes as one batch, against the same one after another."""
     ratios = {}
     for rows in _BATCHES:
         one_pass_s, loop_s = registry.load(_WEIGHT_SAMPLES)(rows, 50, 5)
         ratios[rows] = one_pass_s / loop_s
     worst = max(ratios, key=lambda rows: ratios[rows])
-    yield Figure(
-        what=f"50 weight samples in one pass, share of a loop's CPU time, batches of 1 to {_BATCHES[-1]:,}",
-        required="<= 1.05",
-        measured=f"{ratios[1]:.2f} at 1, {ratios[64]:.2f} at 64, worst {ratios[worst]:.2f} at {worst:,}",
-        met=ratios[worst] <= 1.05,
+    what = f"50 weight samples in one pass, share of a loop's CPU time, worst batch of 1 to {_BATCHES[-1]:,}"
+    yield _figure(
+        what, ratios[worst], "<=", 1.05, ".2f", f" at {worst:,} ({ratios[1]:.2f} at 1, {ratios[64]:.2f} at 64)"
     )
-    together_s, alone_s = registry.load(_TRAINING)(10, 250, 3, 4)
-    yield Figure(
-        what="training 10 networks of chapter 4 as one batch, times faster than one after another", required=">= 1.2",
-        measured=f"{alone_s / together_s:.2f}", met=alone_s / together_s >= 1.2,
-    )  # fmt: skip
+    batch_s, one_by_one_s = registry.load(_TRAINING)(10, 250, 3, 4)
+    what = "training 10 networks of chapter 4 as one batch, times faster than one after another"
+    yield _figure(what, one_by_one_s / batch_s, ">=", 1.2, ".2f")
 
 
 def _model_updates() -> Iterator[Figure]:
     """The world model's update, N_E of which are nearly all that a real step costs, beside an expert's plain torch."""
     for hyperparameters, required in (("published", 1.2), ("fast", 0.9)):
         speed = registry.load(_MODEL_UPDATE)(hyperparameters)
-        ratio = speed.plain_ms / speed.own_ms
-        yield Figure(
-            what=f"a model update ({hyperparameters} settings), times faster than plain torch",
-            required=f">= {required}",
-            measured=f"{ratio:.2f}: {speed.own_ms:.1f} CPU ms in {speed.precision} against {speed.plain_ms:.1f}",
-            met=ratio >= required,
-        )
+        what = f"a model update ({hyperparameters} settings), times faster than plain torch"
+        more = f": {speed.own_ms:.1f} CPU ms in {speed.precision} against {speed.plain_ms:.1f}"
+        yield _figure(what, speed.plain_ms / speed.own_ms, ">=", required, ".2f", more)
 
 
 def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
@@ -213,58 +219,39 @@ def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
 
     thousand_steps()
     rate = 1_000 / _best_cpu_s(thousand_steps, 9)
-    yield Figure(
-        what=f"{spec.id}: kinematic macro-actions with frame, through gym.make, per CPU s",
-        required=f">= {targets.kinematic_per_cpu_s:,.0f}", measured=f"{rate:,.0f}",
-        met=rate >= targets.kinematic_per_cpu_s,
-    )  # fmt: skip
+    what = f"{spec.id}: kinematic macro-actions with frame, through gym.make, per CPU s"
+    yield _figure(what, rate, ">=", targets.kinematic_per_cpu_s, ",.0f")
     frame_ms = _best_cpu_s(lambda: [scene.agent_view() for _ in range(1_000)], 9)
     env.close()
-    yield Figure(
-        what=f"{spec.id}: 64x64 frame, hot, CPU ms",
-        required="<= 0.15",
-        measured=f"{frame_ms:.3f}",
-        met=frame_ms <= 0.15,
-    )
+    yield _figure(f"{spec.id}: 64x64 frame, hot, CPU ms", frame_ms, "<=", 0.15, ".3f")
 
 
 def _encoders(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     folder = resources.files("imagine_bench.assets") / "encoders"
     for appearance, required in targets.encoders.items():
         card = json.loads((folder / f"{spec.encoder}-{appearance}.json").read_text())
-        accuracy, cpu_s = card["probe"]["mlp"], card["cpu_s"]["total"]
-        frames = card["recipe"]["held_out_frames"]
-        yield Figure(
-            what=f"{spec.id}: bundled encoder {appearance}: probe on {frames:,} held-out frames; training CPU s "
-            "(from its card)",
-            required=f">= {required:.1%}; <= 120", measured=f"{accuracy:.2%}; {cpu_s:.0f}",
-            met=accuracy >= required and cpu_s <= 120,
-        )  # fmt: skip
+        what = (
+            f"{spec.id}: bundled encoder {appearance}: probe on {card['recipe']['held_out_frames']:,} held-out frames"
+        )
+        yield _figure(what, card["probe"]["mlp"], ">=", required, ".2%")
+        what = f"{spec.id}: bundled encoder {appearance}: training, CPU s (from its card)"
+        yield _figure(what, card["cpu_s"]["total"], "<=", 120, ".0f")
 
 
 def _physics(spec: TaskSpec, targets: PerformanceTargets, turns: int) -> Iterator[Figure]:
     found = measure_fidelity(spec, targets, turns)
-    share = found.as_ruled / found.actions
-    yield Figure(
-        what=f"{spec.id}: macro-actions exactly as the rules say, of {turns:,}",
-        required=f">= {targets.as_ruled:.1%}", measured=f"{share:.2%}", met=share >= targets.as_ruled,
-    )  # fmt: skip
-    yield Figure(
-        what=f"{spec.id}: other objects moved, worst, mm", required=f"< {targets.other_objects_mm:g}",
-        measured=f"{found.other_objects_mm:.3f}", met=found.other_objects_mm < targets.other_objects_mm,
-    )  # fmt: skip
+    what = f"{spec.id}: macro-actions exactly as the rules say, of {turns:,}"
+    yield _figure(what, found.as_ruled / found.actions, ">=", targets.as_ruled, ".2%")
+    what = f"{spec.id}: other objects moved, worst, mm"
+    yield _figure(what, found.other_objects_mm, "<", targets.other_objects_mm, ".3f")
     for what, errors, allowed in (
         ("position error, p99, mm", found.error_mm, targets.error_mm),
         ("yaw error, p99, degrees", found.error_deg, targets.error_deg),
     ):
         if allowed is not None:
-            p99 = float(np.percentile(errors, 99))
-            yield Figure(what=f"{spec.id}: {what}", required=f"< {allowed:g}", measured=f"{p99:.2f}", met=p99 < allowed)
+            yield _figure(f"{spec.id}: {what}", float(np.percentile(errors, 99)), "<", allowed, ".2f")
     # The first block warms up.
     blocks_s = [sum(found.cpu_s[first : first + _BLOCK]) for first in range(_BLOCK, turns - _BLOCK + 1, _BLOCK)]
     rate, mean_rate = _BLOCK / min(blocks_s), _BLOCK * len(blocks_s) / sum(blocks_s)
-    yield Figure(
-        what=f"{spec.id}: mink + physics + frame, macro-actions per CPU s, best {_BLOCK} (mean)",
-        required=f">= {targets.physics_per_cpu_s:g}", measured=f"{rate:.0f} ({mean_rate:.0f})",
-        met=rate >= targets.physics_per_cpu_s,
-    )  # fmt: skip
+    what = f"{spec.id}: mink + physics + frame, macro-actions per CPU s, best {_BLOCK} (mean)"
+    yield _figure(what, rate, ">=", targets.physics_per_cpu_s, ".0f", f" ({mean_rate:.0f})")

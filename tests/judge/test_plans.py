@@ -221,7 +221,7 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(tmp_path: Path, mo
         timelines.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
         rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
     steps = sum(plan.done for plan in carried_out(Dreamer(choose=TASK.rules.optimal_action), 2))
-    for path_ in ("/real/frame", "/imagined/frame", "/imagined/strip", "/real/story"):
+    for path_ in ("/real/frame", "/imagined/frame", "/imagined/filmstrip", "/real/text"):
         assert timelines[path_] >= {"sim_time", "env_step", "plan"} and rows[path_] == steps + 2
     assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
     assert timelines["/scene/right_l3"] >= {"sim_time", "env_step", "plan"}

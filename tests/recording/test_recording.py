@@ -21,15 +21,15 @@ from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.judge.imagination_quality import compare_rollout
-from imagine_bench.recording import episodes, q_table, record_run, recording_file
+from imagine_bench.recording import episodes, open_in_viewer, q_table, record_run, recording_file, stream
 from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
 
-REAL = {"/real/frame", "/real/story", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
-IMAGINED = {"/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
+REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
+IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
 BY_DEPTH = {
     f"/imagined/episode_{episode}/{leaf}"
     for episode in (1, 2)
-    for leaf in ("frame", "real_frame", "prediction/reward", "prediction/p_terminal", "uncertainty/epistemic")
+    for leaf in ("frame", "real_frame", "prediction/reward", "prediction/p_terminated", "uncertainty/epistemic")
 }
 VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 
@@ -83,7 +83,7 @@ def cleared(path: Path, entity: str) -> list[int]:
 def test_at_an_episode_s_end_nothing_more_is_expected(imagined: Path) -> None:
     ends = cleared(imagined, "/real/q_table")
     assert len(ends) == 2 and ends[-1] == max(times(imagined, "/real/frame", "env_step"))
-    for entity in ("/imagined/strip", "/imagined/uncertainty/modal"):
+    for entity in ("/imagined/filmstrip", "/imagined/uncertainty/modal"):
         assert cleared(imagined, entity) == ends
 
 
@@ -112,7 +112,7 @@ class _HandsOver(FakeImaginer):
         return np.arange(4, dtype=np.float32)
 
 
-def test_where_chance_plays_several_courses_are_shown_and_elsewhere_not(imagined: Path, tmp_path: Path) -> None:
+def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
     options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
     path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
@@ -216,14 +216,14 @@ def test_unknown_names_are_named(tmp_path: Path) -> None:
 
 def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ArtefactError, match=r"No recording .*none\.rrd"):
-        episodes.open_in_viewer(tmp_path / "none.rrd")
+        open_in_viewer(tmp_path / "none.rrd")
     there = tmp_path / "there.rrd"
     there.write_bytes(b"")
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(SetupError, match=r"No display here .* run 'rerun there.rrd'"):
-        episodes.open_in_viewer(there)
+        open_in_viewer(there)
 
 
 def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,9 +231,9 @@ def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypa
     there.write_bytes(b"")
     monkeypatch.setenv("DISPLAY", ":99")
     failed = subprocess.CompletedProcess[str]([], returncode=1)
-    monkeypatch.setattr(episodes.subprocess, "run", lambda *_, **__: failed)
+    monkeypatch.setattr(stream.subprocess, "run", lambda *_, **__: failed)
     with pytest.raises(SetupError, match=r"the viewer failed; copy it .* or run 'rerun --serve-web"):
-        episodes.open_in_viewer(there)
+        open_in_viewer(there)
 
 
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
@@ -279,7 +279,7 @@ def test_every_kind_of_shape_is_drawn_and_others_refused(tmp_path: Path) -> None
     found = contents(tmp_path / "shapes.rrd")
     assert set(found) >= {f"/scene/body/{kind}" for kind in (*kinds, "mesh")}
     with pytest.raises(InvalidValueError, match="is of kind 'cone'"), rr.RecordingStream("test") as file:
-        log_shapes(file, [shape("cone")])
+        log_shapes(stream.Recording(file), [shape("cone")])
 
 
 def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:

@@ -252,9 +252,9 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
     assert (report / "report.md").stat().st_size > 1000
     recording = folder / "mc_dropout" / "seed_0" / "recording.rrd"
     named = contents(recording)
-    for part in ("candidates", "chosen", "outside", "miss", "error", "story"):
+    for part in ("candidates", "chosen", "outside", "error_line", "error", "text"):
         assert named[f"/choice/{part}"] >= {"sim_time", "choice"}, part
-    assert min(times(recording, "/choice/story", "choice")) == 1, "counted as its words do"
+    assert min(times(recording, "/choice/text", "choice")) == 1, "counted as its words do"
     assert any(path.startswith("/scene") for path in named)
     assert main(words) == 0  # nothing is missing: the same table again, from the files
     notice, *again = capsys.readouterr().out.splitlines()

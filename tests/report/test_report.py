@@ -163,7 +163,7 @@ def test_the_gain_s_plot_draws_the_table_and_the_thesis(result: BenchResult, fol
     assert not (write_report(bench_result(tmp_path, protocol=without)).parent / "gain.png").exists()
 
 
-def test_areas_in_the_page_are_those_in_the_summary_and_in_the_markdown(folder: Path, page: Cells) -> None:
+def test_areas_agree_in_page_summary_and_markdown(folder: Path, page: Cells) -> None:
     summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv") if row["area"]}
     shown = {
         (data["data-agent"], data["data-area"]): re.findall(r"\d+\.\d", text)
@@ -342,7 +342,7 @@ def test_learning_cost_counts_every_step(result: BenchResult) -> None:
     assert math.isnan(collect(result).timing["random"].learner_cpu_s)
 
 
-def test_the_one_test_of_an_agent_that_does_not_learn_is_counted_once(result: BenchResult) -> None:
+def test_an_agent_that_does_not_learn_is_counted_once(result: BenchResult) -> None:
     timing, runs = collect(result).timing, result.of("random")
     assert timing["random"].faults == sum(run.checkpoints[0].faults for run in runs)
     assert timing["random"].eval_cpu_s == pytest.approx(np.mean([run.checkpoints[0].eval_cpu_s for run in runs]))
@@ -431,6 +431,6 @@ def test_no_two_registered_agents_share_a_color() -> None:
     assert plots.color("an agent that nobody registered").startswith("#")
 
 
-def test_boundless_doubt_is_shown_and_what_nobody_knows_is_left_out() -> None:
+def test_infinite_uncertainty_stays_and_unknown_is_left_out() -> None:
     table = np.array([[1.0, np.inf, np.nan, np.nan], [3.0, 2.0, 4.0, np.nan]])
     np.testing.assert_array_equal(_nan_mean(table), [2.0, np.inf, 4.0, np.nan])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 
 from imagine_bench import registry
 from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.filmstrips import changes, sampled_filmstrips
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
@@ -108,7 +110,23 @@ def test_page_and_markdown_show_figure_numbers_and_courses(result: BenchResult, 
     assert "One start, several futures" in page
 
 
-def test_the_thesis_is_quoted_for_chapter_3_without_a_standard_deviation(folder: Path) -> None:
+def test_the_values_of_futures_are_not_clipped(result: BenchResult) -> None:
+    """Each value that changes is written in full: where all change, the image gets more lines."""
+    spec = registry.task("pick_place")
+    (compared,) = result.of("imagination_only")[0].imagined
+    few = sampled_filmstrips((compared,) * 2, spec)
+    start = np.array([0, 0, 0, 0])
+    other = np.array([len(values) - 1 for values in spec.macrostate_values])
+    rollout = dataclasses.replace(compared.rollout, macrostates=np.stack([other, start]))
+    many = sampled_filmstrips((dataclasses.replace(compared, start_macrostate=start, rollout=rollout),) * 2, spec)
+    words = textwrap.wrap(changes(start, other, spec), width=20)
+    assert len(words) > 4 and many.shape[0] > few.shape[0] and many.shape[1] == few.shape[1]
+    row = (many.shape[0] - 24) // 2
+    last_line = many[12 + row - 14 - 12 - 14 : 12 + row - 14, 150:]  # above the gap to the second row
+    assert (last_line != 255).any()
+
+
+def test_chapter_3_is_quoted_without_a_standard_deviation(folder: Path) -> None:
     page = (folder / "index.html").read_text()
     assert "<small>thesis 98.0</small>" in page
     assert "<small>thesis 78.0</small>" in page

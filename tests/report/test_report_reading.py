@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_results import LEVELS, bench_result
-from imagine_bench.bench.protocol import Protocol
 from report_pages import check_report, narrowest_px, read_tables
 
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, text, write_report
 from imagine_bench.report.data import ReportData, collect

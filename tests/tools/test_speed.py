@@ -2,8 +2,10 @@
 
 import json
 
+import pytest
+
 from imagine_bench import registry
-from imagine_bench.tools.speed import speed_report
+from imagine_bench.tools.speed import _figure, speed_report
 
 
 def test_figures_are_measured_and_kept(tmp_path):
@@ -20,6 +22,15 @@ def test_figures_are_measured_and_kept(tmp_path):
         wanted = ("macro-actions exactly", "other objects", "position error", "yaw error", "bundled")
         exact = [name for name in figures if name.startswith(tuple(f"{spec.id}: {words}" for words in wanted))]
         errors = [allowed for allowed in (spec.targets.error_mm, spec.targets.error_deg) if allowed is not None]
-        assert len(exact) == 2 + len(errors) + len(spec.targets.encoders)
+        assert len(exact) == 2 + len(errors) + 2 * len(spec.targets.encoders)
         for name in exact:
             assert figures[name]["met"], figures[name]
+
+
+@pytest.mark.parametrize(
+    ("sign", "met"), [(">=", (False, True, True)), ("<=", (True, True, False)), ("<", (True, False, False))]
+)
+def test_a_figure_meets_its_target_or_not(sign: str, met: tuple[bool, ...]) -> None:
+    found = [_figure("what", value, sign, 0.5, ".2f") for value in (0.4, 0.5, 0.6)]
+    assert tuple(figure.met for figure in found) == met
+    assert (found[0].required, found[0].measured) == (f"{sign} 0.5", "0.40")
