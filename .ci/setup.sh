@@ -77,7 +77,7 @@ install_torch() {
 gl_problem() {
     "$venv/bin/python" - 2>&1 <<'PYTHON'
 import sys
-from imagine_bench.environment import gl_renderer
+from imagine_bench.machine import gl_renderer
 from imagine_bench.errors import SetupError
 try:
     gl_renderer()

@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from imagine_bench.cohort import answer_each, together
+from imagine_bench.bench.cohort import answer_each, together
 from imagine_bench.errors import DivergedError
 
-from . import joint
-from .flat_adam import FlatAdam
-from .layers import MemberMLP, Parameters
-from .memory import Batch
+from .networks import joint
+from .networks.flat_adam import FlatAdam
+from .networks.mlp import MemberMLP, Parameters
+from .replay import Batch
 from .settings import ControllerSettings
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from imagine_bench.interfaces import AgentContext
 
+from .encoders.perception import load_perception, prepare_torch
 from .learner import Learner
-from .perception import load_perception, prepare_torch
 from .presets import settings_of
 
 

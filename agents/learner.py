@@ -13,11 +13,11 @@ from imagine_bench.seeding import SeedTree
 
 from . import snapshot
 from .controller import Controller, epsilon
-from .imagination import Imagination
-from .memory import ImaginedMemory, RealMemory
+from .encoders.perception import Perception
+from .imagination.rollouts import Imagination
 from .meters import Meters
-from .perception import Perception
 from .presets import flatten
+from .replay import ImaginedMemory, RealMemory
 from .settings import Settings
 
 _TIMES = ("time/controller_s", "time/model_s", "time/imagination_s")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from imagine_bench.cohort import cpu_time_s
+from imagine_bench.bench.cohort import cpu_time_s
 
 
 class Meters:

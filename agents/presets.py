@@ -14,14 +14,14 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.interfaces import AgentContext
 
-from .assessment import INPUTS
-from .chapter_3 import CHAPTER_3
-from .chapter_5 import CHAPTER_5
-from .family import Family
-from .precision import PRECISIONS, settle
+from .config_groups import Family
+from .imagination.chapter_3 import CHAPTER_3
+from .imagination.chapter_5 import CHAPTER_5
+from .imagination.reward_termination import INPUTS
+from .imagination.uncertainty import REDUCTIONS
+from .networks.precision import PRECISIONS, settle
 from .ranges import COUNT, FINITE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SHARE, between, require_ranges
 from .settings import START_STATES, Settings, WorldModelSettings
-from .uncertainty import REDUCTIONS
 
 FAMILIES: dict[str, Family] = {"chapter_3": CHAPTER_3, "chapter_5": CHAPTER_5}
 """What a TaskSpec may name as its settings."""

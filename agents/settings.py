@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-START_STATES = ("current", "remembered")
+START_STATES = ("current", "replayed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class WorldModelSettings:
             An encoder whose posteriors are narrower than the looks of one macrostate vary leaves networks to learn the
             few pictures they saw by heart; a larger spread keeps them from it.
         balance: How much batches make up for rare outcomes: a transition is drawn in proportion to n ** -balance, with
-            n the number of remembered ones of the same reward and end. The thesis draws all alike, 0. A good policy
+            n the number of replayed ones of the same reward and end. The thesis draws all alike, 0. A good policy
             fails rarely, and a model that has forgotten what fails imagines that nothing does.
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
@@ -105,7 +105,7 @@ class ImaginationSettings:
         start_episode: First training episode that imagines, I_start.
         end_episode: First training episode that imagines no more; its updates are made on real transitions instead, of
             which there are enough by then. None: imagination never ends (thesis).
-        start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"remembered"``,
+        start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``,
             states drawn from the real memory.
         rehearsal_episodes: Imagined episodes of a controller that is trained in imagination alone (thesis 3.2.2).
         breadth: Rollouts a real step, I_B.

@@ -23,7 +23,7 @@ class ImaginedRollout:
 
     Attributes:
         actions: Macro-actions imagined. Shape (D,), int64.
-        frames: Decoded latents as pictures of the whole view in [0, 1], grey (D, H', W') or RGB (D, H', W', 3).
+        frames: Decoded latents as pictures of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3).
         start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
         rewards: Predicted rewards. Shape (D,).
         p_terminated: Predicted probability that the episode ended there. Shape (D,).
@@ -57,10 +57,10 @@ class ValueReader(Protocol):
 
 
 @runtime_checkable
-class Rehearser(Protocol):
+class ModelOnlyTrainer(Protocol):
     """An agent that practises by itself, without the world, before it is tested."""
 
-    def rehearse(self) -> bool:
+    def train_in_model(self) -> bool:
         """Practise a little on what has been learned so far, or say that there is nothing left to practise.
 
         The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that an
@@ -76,7 +76,7 @@ OnEpisode = Callable[[bool, int], bool]
 
 
 @runtime_checkable
-class SelfTrainer(Protocol):
+class ExternalTrainer(Protocol):
     """An agent whose training loop is its own, as a library's is; the bench only watches and tests it.
 
     It cannot be stopped and taken up again: an interrupted run of it starts anew.
@@ -95,10 +95,10 @@ class SelfTrainer(Protocol):
 
 
 @runtime_checkable
-class Transferable(Protocol):
+class TransferLearner(Protocol):
     """An agent that can take what it knows of a world into another task in the same world."""
 
-    def carry_over(self) -> None:
+    def reset_for_new_task(self) -> None:
         """Keep what was learned of how the world moves; what was rewarded and what ended episodes is a hint at most.
 
         The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
@@ -116,7 +116,7 @@ class Answer:
 
 
 @runtime_checkable
-class Questioner(Protocol):
+class QueryingAgent(Protocol):
     """An agent that can ask a teacher what actions which it only imagines would bring."""
 
     def question(self, observation: Observation) -> NDArray[np.int64] | None:
@@ -129,7 +129,7 @@ class Questioner(Protocol):
             answer concerns the last one alone.
         """
 
-    def learn_answer(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
         """Take in the answer to :meth:`question`; None says that it is a matter of chance, so that there is none."""
 
 
@@ -152,10 +152,10 @@ class Imaginer(Protocol):
 
 
 @runtime_checkable
-class Forecaster(Protocol):
+class MapPredictor(Protocol):
     """An agent whose model names what it holds likeliest, apart from what it draws when it imagines."""
 
-    def forecast(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """The likeliest result of one macro-action from each of N real frames; changes nothing in the agent.
 
         Args:
@@ -169,10 +169,10 @@ class Forecaster(Protocol):
 
 
 @runtime_checkable
-class Rememberer(Protocol):
+class ReplayReader(Protocol):
     """An agent that can say which transitions it learns from."""
 
-    def remembered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Where it acted, as an evaluation-only probe reads it, and what it did, for each real transition it remembers.
 
         Returns:

@@ -13,23 +13,23 @@ from typing import Annotated, Any
 import tyro
 
 from imagine_bench import __version__, registry
-from imagine_bench.archive import is_archive
-from imagine_bench.bench import bench, plan
-from imagine_bench.doctor import examine
-from imagine_bench.encoders import bundled
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.bench.launchers import LAUNCHERS, launcher
+from imagine_bench.bench.protocol import digest
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_known
-from imagine_bench.files import require_writable
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
-from imagine_bench.kinds import KINDS, kind_of
-from imagine_bench.launchers import LAUNCHERS, launcher
-from imagine_bench.protocol import digest
-from imagine_bench.store import newest_bench, newest_recording, read_protocol, require_either
+from imagine_bench.store.archive import is_archive
+from imagine_bench.store.bench_folder import newest_bench, newest_recording, read_protocol, require_either
+from imagine_bench.store.encoders import bundled
+from imagine_bench.store.files import require_writable
+from imagine_bench.task_types import TASK_TYPES, task_type
+from imagine_bench.tools.doctor import examine
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
-_RETRAIN = "imagine_bench.agents.encoder_cli:retrain"
-_TOGETHER = "imagine_bench.together:load_together"
-_ARCHIVED = "imagine_bench.archive:load_archive"
+_RETRAIN = "imagine_bench.agents.encoders.cli:retrain"
+_TOGETHER = "imagine_bench.store.merge:load_merged"
+_ARCHIVED = "imagine_bench.store.archive:load_archive"
 _ABREAST = "(default: equal shares for local workers; with ray 1)"
 _ADDING_UP = ("--set", "--beside", "--variants")
 _LISTS = (*_ADDING_UP, "--agents", "--seeds", "--budgets", "--after")
@@ -60,7 +60,7 @@ class Bench:
     execution: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: clean)")] = None
-    """How much light, colours and poses vary: clean, mild or strong."""
+    """How much light, colors and poses vary: clean, mild or strong."""
     variants: Annotated[tuple[str, ...], _OF_PRESET] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
     networks: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_PRESETS_OWN)] = None
@@ -154,7 +154,7 @@ class Plan:
 
     def __call__(self) -> None:
         """Find, plan, report."""
-        from imagine_bench.quality import plan_report  # noqa: PLC0415 - matplotlib's fonts and pillow load slowly
+        from imagine_bench.judge.quality import plan_report  # noqa: PLC0415 - matplotlib's fonts and pillow load slowly
 
         print(
             plan_report(
@@ -192,7 +192,7 @@ class Generalise(_OfBench):
 
     def __call__(self) -> None:
         """Ask and report."""
-        from imagine_bench.quality import generalisation_report  # noqa: PLC0415 - as above
+        from imagine_bench.judge.quality import generalisation_report  # noqa: PLC0415 - as above
 
         print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
 
@@ -203,7 +203,7 @@ class Policy(_OfBench):
 
     def __call__(self) -> None:
         """Ask and follow."""
-        from imagine_bench.quality import policy_report  # noqa: PLC0415 - as above
+        from imagine_bench.judge.quality import policy_report  # noqa: PLC0415 - as above
 
         print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
 
@@ -227,9 +227,9 @@ class StudyCommand:
 
     def __call__(self) -> None:
         """Run, compare, write."""
+        from imagine_bench.bench.studies import STUDIES  # noqa: PLC0415 - as above
+        from imagine_bench.bench.study import run_study  # noqa: PLC0415 - as above
         from imagine_bench.report.study import study_table, write_study  # noqa: PLC0415 - matplotlib loads slowly
-        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - as above
-        from imagine_bench.study import run_study  # noqa: PLC0415 - as above
 
         study = STUDIES[require_known("study", self.name, STUDIES)].only(self.variants)
         where = launcher(self.launcher, self.workers)
@@ -302,12 +302,12 @@ class List:
 
     def __call__(self) -> None:
         """List."""
-        from imagine_bench.studies import STUDIES  # noqa: PLC0415 - no other command but study needs them
+        from imagine_bench.bench.studies import STUDIES  # noqa: PLC0415 - no other command but study needs them
 
         for title, names in {
-            **{f"{name} tasks": kind.tasks for name, kind in KINDS.items()},
-            **{f"{name} learners": kind.learners() for name, kind in KINDS.items()},
-            **{f"{name} presets": registry.load(kind.presets) for name, kind in KINDS.items()},
+            **{f"{name} tasks": kind.tasks for name, kind in TASK_TYPES.items()},
+            **{f"{name} learners": kind.learners() for name, kind in TASK_TYPES.items()},
+            **{f"{name} presets": registry.load(kind.presets) for name, kind in TASK_TYPES.items()},
             "studies": STUDIES,
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
@@ -332,7 +332,7 @@ class Film:
 
     def __call__(self) -> None:
         """Film."""
-        from imagine_bench.film import film  # noqa: PLC0415 - numpy and pillow only when filming
+        from imagine_bench.tools.film import film  # noqa: PLC0415 - numpy and pillow only when filming
 
         print(film(self.task, self.out, seed=self.seed, appearance=self.appearance))
 
@@ -348,7 +348,7 @@ class Speed:
 
     def __call__(self) -> None:
         """Measure."""
-        from imagine_bench.speed import speed_report  # noqa: PLC0415 - nothing else needs it
+        from imagine_bench.tools.speed import speed_report  # noqa: PLC0415 - nothing else needs it
 
         if not speed_report(self.out, self.turns):
             sys.exit(1)
@@ -457,13 +457,13 @@ def _only(task: str | None, given: Path | None) -> tuple[str, ...]:
     require_either(given, task)
     if task is None:
         return ()
-    kind_of(task)  # knows every name
+    task_type(task)  # knows every name
     return (task,)
 
 
 def _show(folder: Path, result: Any = None) -> None:
     """Write a bench's report, or that of another result of its kind, and print its table and where everything lies."""
-    kind = kind_of(read_protocol(folder).task)
+    kind = task_type(read_protocol(folder).task)
     result = result or registry.load(_ARCHIVED if is_archive(folder) else kind.load_so_far)(folder)
     print(registry.load(kind.summary_table)(result))  # first, as it needs no place to write
     page = registry.load(kind.write_report)(result)

@@ -129,7 +129,7 @@ class RenderMacrostates(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Promises:
+class PerformanceTargets:
     """What ``make speed`` holds a task in contact physics to.
 
     Attributes:
@@ -177,8 +177,8 @@ class TaskSpec:
         reference: Name of the thesis' table in :mod:`imagine_bench.reference`, or None.
         settings: Family of settings that learners take: the thesis' chapter that the task is from.
         presets: What each protocol preset changes for this task: fields of the protocol by preset.
-        mastery: Success rate, in (0, 1], at which the task counts as learned.
-        promises: What ``make speed`` measures it against; None for a task whose scene another one measures.
+        success_threshold: Success rate, in (0, 1], at which the task counts as learned.
+        targets: What ``make speed`` measures it against; None for a task whose scene another one measures.
     """
 
     id: str
@@ -197,8 +197,8 @@ class TaskSpec:
     reference: str | None = None
     settings: str = "chapter_5"
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    mastery: float = 0.95
-    promises: Promises | None = None
+    success_threshold: float = 0.95
+    targets: PerformanceTargets | None = None
 
     @property
     def n_actions(self) -> int:

@@ -1,7 +1,7 @@
 """What a task may declare about how its frames are read. Numpy only, so that both sides share it.
 
-The thesis makes the arrow puzzle's frames grey and cuts them into three vertical strips, one cube each, fed as
-three channels (section 5.2.2); those of the task with a human stay whole and in colour (section 3.2.1).
+The thesis makes the arrow puzzle's frames gray and cuts them into three vertical strips, one cube each, fed as
+three channels (section 5.2.2); those of the task with a human stay whole and in color (section 3.2.1).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Preprocess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 
 def gray_strips(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Cut frames into three grey strips: (N, 64, 64, 3) uint8 to (N, 3, 64, 22) float32 in [0, 1]."""
+    """Cut frames into three gray strips: (N, 64, 64, 3) uint8 to (N, 3, 64, 22) float32 in [0, 1]."""
     gray = (frames.astype(np.float32) @ _LUMA) / 255.0  # [N, 64, 64]
     return np.stack([gray[:, :, start : start + STRIP_WIDTH] for start in _STRIP_STARTS], axis=1)
 

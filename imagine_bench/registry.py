@@ -42,7 +42,7 @@ class AgentEntry:
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
         settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
-        trains_itself: Whether it is a :class:`.capabilities.SelfTrainer`, whose run cannot rest before its end.
+        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
         title: For headings, legends and tables; by default the registered name.
         description: One sentence for a reader of the report.
     """
@@ -53,40 +53,40 @@ class AgentEntry:
     encoder_kind: str = "latents"
     settings: str = "imagine_bench.agents.presets"
     privileged: bool = False
-    trains_itself: bool = False
+    external_training_loop: bool = False
     title: str = ""
     description: str = "A registered agent."
 
 
 TASKS: dict[str, TaskEntry] = {
     "arrow_puzzle": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle:SPEC",
+        spec="imagine_bench.tasks.arrow_puzzle.spec:SPEC",
         env_id="imagine_bench/ArrowPuzzle-v0",
-        env="imagine_bench.tasks.arrow_puzzle:make_env",
+        env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
         horizon=10,
     ),
     "arrow_puzzle_hard": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle:HARD_SPEC",
+        spec="imagine_bench.tasks.arrow_puzzle.spec:HARD_SPEC",
         env_id="imagine_bench/ArrowPuzzleHard-v0",
-        env="imagine_bench.tasks.arrow_puzzle:make_hard_env",
+        env="imagine_bench.tasks.arrow_puzzle.spec:make_hard_env",
         horizon=10,
     ),
     "arrow_puzzle_toward": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle:TOWARD_SPEC",
+        spec="imagine_bench.tasks.arrow_puzzle.spec:TOWARD_SPEC",
         env_id="imagine_bench/ArrowPuzzleToward-v0",
-        env="imagine_bench.tasks.arrow_puzzle:make_toward_env",
+        env="imagine_bench.tasks.arrow_puzzle.spec:make_toward_env",
         horizon=10,
     ),
     "arrow_puzzle_clockwise": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle:CLOCKWISE_SPEC",
+        spec="imagine_bench.tasks.arrow_puzzle.spec:CLOCKWISE_SPEC",
         env_id="imagine_bench/ArrowPuzzleClockwise-v0",
-        env="imagine_bench.tasks.arrow_puzzle:make_clockwise_env",
+        env="imagine_bench.tasks.arrow_puzzle.spec:make_clockwise_env",
         horizon=10,
     ),
     "pick_place": TaskEntry(
-        spec="imagine_bench.tasks.pick_place:SPEC",
+        spec="imagine_bench.tasks.pick_place.spec:SPEC",
         env_id="imagine_bench/PickPlace-v0",
-        env="imagine_bench.tasks.pick_place:make_env",
+        env="imagine_bench.tasks.pick_place.spec:make_env",
         horizon=50,
     ),
 }
@@ -97,32 +97,32 @@ AGENTS: dict[str, AgentEntry] = {
         make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
     ),
     "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
-    "imagination": AgentEntry(make="imagine_bench.agents.imagination_agents:make"),
-    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_agents:make_uncertainty"),
-    "imagine": AgentEntry(
-        make="imagine_bench.agents.imagine.agent:make",
+    "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
+    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
+    "factored": AgentEntry(
+        make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
-        settings="imagine_bench.agents.imagine.settings",
+        settings="imagine_bench.agents.factored.settings",
     ),
     "sb3_dqn": AgentEntry(
-        make="imagine_bench.agents.peers:make_dqn",
+        make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.peer_settings",
-        trains_itself=True,
+        settings="imagine_bench.agents.library.settings",
+        external_training_loop=True,
     ),
     "sb3_qrdqn": AgentEntry(
-        make="imagine_bench.agents.peers:make_qrdqn",
+        make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.peer_settings",
-        trains_itself=True,
+        settings="imagine_bench.agents.library.settings",
+        external_training_loop=True,
     ),
     "sb3_dqn_latents": AgentEntry(
-        make="imagine_bench.agents.peers:make_dqn",
-        settings="imagine_bench.agents.peer_settings",
-        trains_itself=True,
+        make="imagine_bench.agents.library.sb3:make_dqn",
+        settings="imagine_bench.agents.library.settings",
+        external_training_loop=True,
     ),
-    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination_only:make"),
-    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination_only:make_uncertainty"),
+    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
+    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.model_only:make_uncertainty"),
 }
 
 
@@ -161,17 +161,17 @@ class RegressorEntry:
 
 REGRESSIONS: dict[str, RegressionEntry] = {
     "toy_regression": RegressionEntry(spec="imagine_bench.tasks.toy_regression:SPEC"),
-    "robot_ik": RegressionEntry(spec="imagine_bench.tasks.robot_ik:SPEC"),
+    "robot_ik": RegressionEntry(spec="imagine_bench.tasks.robot_ik.spec:SPEC"),
 }
 
 REGRESSORS: dict[str, RegressorEntry] = {
     "mc_dropout": RegressorEntry(
-        make="imagine_bench.agents.regressors:make_mc_dropout",
+        make="imagine_bench.agents.regressors.regressor:make_mc_dropout",
         title="MC dropout",
         description="One network whose hidden units are dropped at random, again and again: the thesis' Bayesian MDN.",
     ),
     "ensemble": RegressorEntry(
-        make="imagine_bench.agents.regressors:make_ensemble",
+        make="imagine_bench.agents.regressors.regressor:make_ensemble",
         title="deep ensemble",
         description="Several networks that began and trained differently; where they disagree, they do not know.",
     ),

@@ -62,14 +62,14 @@ class SeedTree:
         return int(self.sequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def tunes(seed: int) -> bool:
+def is_tuning_seed(seed: int) -> bool:
     """Whether a run of this seed is for choosing settings."""
     return seed >= TUNING_SEEDS
 
 
-def exam(seed: int) -> Purpose:
-    """What a run of this seed is tested on: a run that tunes never meets an evaluation seed, and the reverse."""
-    return "tuning" if tunes(seed) else "evaluation"
+def evaluation_split(seed: int) -> Purpose:
+    """What a run of this seed is tested on: a run that is_tuning_seed never meets an evaluation seed, and the reverse."""
+    return "tuning" if is_tuning_seed(seed) else "evaluation"
 
 
 def episode_seed(purpose: Purpose, seed: int, episode: int) -> int:

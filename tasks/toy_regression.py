@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.regression import SCORES, Assess, Dataset, Floats, RegressionSpec
+from imagine_bench.regression import SCORES, Dataset, Floats, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 DOMAIN = (-30.0, 30.0)
@@ -95,7 +95,7 @@ def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
     return nearest / noise_sigma(variant, x)
 
 
-def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
     """The curves of figure 4.1 on a common grid, with the truth beside them.
 
     Returns:
@@ -104,7 +104,7 @@ def evaluate(variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[
         of the first network.
     """
     x = np.linspace(*TEST_DOMAIN, GRID)
-    said = assess(np.broadcast_to(x[None, :, None], (len(seeds), GRID, 1)), "figure_4_1")
+    said = predict(np.broadcast_to(x[None, :, None], (len(seeds), GRID, 1)), "figure_4_1")
     data = training(variant, seeds[0].child("data").generator())
     return {
         "x": x,
@@ -135,7 +135,7 @@ SPEC = RegressionSpec(
     error_name="distance to the nearest branch (standard deviations of the noise)",
     wrong_above=3.0,
     evaluate=evaluate,
-    sections="imagine_bench.report.toy_regression:sections",
+    sections="imagine_bench.regression.report_toy_regression:sections",
     recorder="imagine_bench.recording.toy_regression:record",
     reference=None,
 )

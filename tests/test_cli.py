@@ -13,16 +13,16 @@ import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
 
 from imagine_bench import registry
+from imagine_bench.bench.launchers import LAUNCHERS, LocalPool
+from imagine_bench.bench.studies import STUDIES
 from imagine_bench.cli import main, parse_settings
-from imagine_bench.encoders import bundled
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
-from imagine_bench.kinds import KINDS
-from imagine_bench.launchers import LAUNCHERS, LocalPool
-from imagine_bench.store import newest_bench
-from imagine_bench.studies import STUDIES
+from imagine_bench.store.bench_folder import newest_bench
+from imagine_bench.store.encoders import bundled
+from imagine_bench.task_types import TASK_TYPES
 
-_HERE = Path(__file__).parent
+_HERE = Path(__file__).parent / "fakes"
 
 
 def bench_words(out: Path, *more: str) -> list[str]:
@@ -126,7 +126,7 @@ def test_speed_without_gl_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsy
     def none() -> str:
         raise SetupError("No OpenGL for headless rendering: install libegl1.")
 
-    monkeypatch.setattr("imagine_bench.speed.gl_renderer", none)
+    monkeypatch.setattr("imagine_bench.tools.speed.gl_renderer", none)
     assert main(["speed"]) == 2
     assert capsys.readouterr() == ("", "imagine-bench: No OpenGL for headless rendering: install libegl1.\n")
 
@@ -199,7 +199,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     out = capsys.readouterr().out
     words = set(re.split(r"[\s,]+", out))
-    for kind in KINDS.values():
+    for kind in TASK_TYPES.values():
         assert words >= {*kind.tasks, *kind.learners(), *registry.load(kind.presets)}
     assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
     assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}

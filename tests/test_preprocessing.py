@@ -9,14 +9,14 @@ from imagine_bench.preprocessing import gray_strips, join_strips, preprocess, sm
 
 def test_strips_hold_the_columns_of_their_cube():
     frames = np.zeros((1, 64, 64, 3), dtype=np.uint8)
-    frames[:, :, :, :] = np.arange(64, dtype=np.uint8)[None, None, :, None]  # grey level = column
+    frames[:, :, :, :] = np.arange(64, dtype=np.uint8)[None, None, :, None]  # gray level = column
     strips = gray_strips(frames)
     assert strips.shape == (1, 3, 64, 22) and strips.dtype == np.float32
     for strip, start in zip(strips[0], (0, 21, 42), strict=True):
         np.testing.assert_allclose(strip[0] * 255, np.arange(start, start + 22), atol=1e-3)
 
 
-def test_joined_strips_are_the_grey_frame():
+def test_joined_strips_are_the_gray_frame():
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     gray = frames @ np.array([0.299, 0.587, 0.114]) / 255
     np.testing.assert_allclose(join_strips(gray_strips(frames)), gray, atol=1e-6)

@@ -32,7 +32,7 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, se
         target_m: What the 3D view looks at. Shape (3,).
         values: Whether the agent has Q-values.
         imagines: Whether the agent imagines.
-        several: Whether it imagines several courses from each frame.
+        several: Whether it imagines several sampled_rollouts from each frame.
     """
     scene = scene_view(target_m)
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
@@ -74,7 +74,7 @@ def _imagined_now() -> rrb.Horizontal:
 
 def _courses() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
-        origin="/imagined/courses",
+        origin="/imagined/sampled_rollouts",
         name="Several futures from the current frame",
         background=[255, 255, 255],
     )

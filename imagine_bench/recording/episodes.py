@@ -22,17 +22,17 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ValueReader
-from imagine_bench.comparison import compare_rollout
-from imagine_bench.course_pictures import courses_sheet
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.files import make_folder
-from imagine_bench.imagination_quality import courses_from, is_random
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
-from imagine_bench.pictures import png, rgb, rollout_strip
+from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.judge.filmstrips import png, rgb, rollout_strip
+from imagine_bench.judge.imagination_quality import courses_from, is_random
+from imagine_bench.judge.sampled_filmstrips import courses_sheet
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
-from imagine_bench.results import ComparedRollout
 from imagine_bench.seeding import SeedTree, episode_seed
+from imagine_bench.store.files import make_folder
+from imagine_bench.store.results import ComparedRollout
 
 MOTION_HZ = 20.0
 IMAGINED_DEPTH = 6
@@ -235,7 +235,7 @@ class _Story:
         stale = ["/real/q_table"] if isinstance(self._agent, ValueReader) else []
         if isinstance(self._agent, Imaginer):
             stale += ["/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in _KINDS)]
-            stale += ["/imagined/courses"] if is_random(self._spec.rules) else []
+            stale += ["/imagined/sampled_rollouts"] if is_random(self._spec.rules) else []
         for path in stale:
             self._recording.log(path, rr.Clear(recursive=False), strict=True)
 
@@ -252,17 +252,19 @@ class _Story:
         self._recording.log("/imagined/strip", rr.EncodedImage(contents=strip, media_type="image/png"), strict=True)
         self._uncertainty_bars(compared)
         if is_random(self._spec.rules):
-            self._several(self._agent, frame, macrostate, SeedTree(self._seed).child("courses", episode, step))
+            self._several(self._agent, frame, macrostate, SeedTree(self._seed).child("sampled_rollouts", episode, step))
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
 
     def _several(self, agent: Imaginer, frame: Frame, macrostate: NDArray[np.int64], seeds: SeedTree) -> None:
-        """Several imagined courses from here, where what happens next is partly chance."""
-        courses = courses_from(
+        """Several imagined sampled_rollouts from here, where what happens next is partly chance."""
+        sampled_rollouts = courses_from(
             agent, self._spec, frame=frame, macrostate=macrostate, appearance=self._appearance, seeds=seeds
         )
-        sheet = png(courses_sheet(courses, self._spec))
-        self._recording.log("/imagined/courses", rr.EncodedImage(contents=sheet, media_type="image/png"), strict=True)
+        sheet = png(courses_sheet(sampled_rollouts, self._spec))
+        self._recording.log(
+            "/imagined/sampled_rollouts", rr.EncodedImage(contents=sheet, media_type="image/png"), strict=True
+        )
 
     def _uncertainty_bars(self, compared: ComparedRollout) -> None:
         """Three bars, side by side, at each depth; none after the rollout's end, so that the axis stays the same."""

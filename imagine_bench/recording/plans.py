@@ -15,22 +15,22 @@ import gymnasium
 import rerun as rr
 import rerun.blueprint as rrb
 
-from imagine_bench.files import make_folder
 from imagine_bench.interfaces import SceneReader
-from imagine_bench.pictures import png, rgb, rollout_strip
-from imagine_bench.plans import Plan, carry_out, make_env
+from imagine_bench.judge.filmstrips import png, rgb, rollout_strip
+from imagine_bench.judge.plans import Plan, carry_out, make_env
 from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ, recording_file
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
-from imagine_bench.results import ComparedRollout
-from imagine_bench.trained import Trained
+from imagine_bench.store.files import make_folder
+from imagine_bench.store.results import ComparedRollout
+from imagine_bench.store.trained import Trained
 
 _LOOK_S = 2.0
 """How long the scene stands still while the plan is shown, before and after the arm moves."""
 
 
 def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None, path: Path) -> Path:
-    """Record the first ``count`` plans of :func:`imagine_bench.plans.make_plans`, carried out once more.
+    """Record the first ``count`` plans of :func:`imagine_bench.judge.plans.make_plans`, carried out once more.
 
     Args:
         trained: An agent that imagines.

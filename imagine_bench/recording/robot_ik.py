@@ -1,4 +1,4 @@
-"""The arm choosing and reaching: targets coloured by uncertainty, the chosen one marked, the error drawn.
+"""The arm choosing and reaching: targets colored by uncertainty, the chosen one marked, the error drawn.
 
 Timelines: ``sim_time`` (the arm moves), ``choice`` (one a decision). Entities: ``/scene/...``, ``/choice/...``.
 """
@@ -129,7 +129,7 @@ def _say(
         f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint angles "
         "lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it reaches for "
         f"the one in the ring.\n\nIts uncertainty there is {scores[chosen]:.3g} rad², the largest of the 20 is "
-        f"{scores.max():.3g} rad². The grey place lies outside of what the arm can reach and is never asked for."
+        f"{scores.max():.3g} rad². The gray place lies outside of what the arm can reach and is never asked for."
     ]
     if arrived:
         words.append(

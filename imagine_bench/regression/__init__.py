@@ -50,7 +50,7 @@ class Mixtures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Assessment:
+class Prediction:
     """What E networks say about their inputs, and how sure they are.
 
     Attributes:
@@ -77,7 +77,7 @@ class Assessment:
     predictive: Mixtures
 
 
-SCORES: dict[str, Callable[[Assessment], Floats]] = {
+SCORES: dict[str, Callable[[Prediction], Floats]] = {
     "epistemic": lambda a: a.epistemic.sum(axis=-1),
     "aleatoric": lambda a: a.aleatoric.sum(axis=-1),
     "modal": lambda a: a.modal.sum(axis=-1),
@@ -87,7 +87,7 @@ SCORES: dict[str, Callable[[Assessment], Floats]] = {
     "drawn_component": lambda a: a.drawn,
     "surprise": lambda a: a.surprise,
 }
-"""One number a row from an assessment, (E, N): variances summed over the outputs. The higher, the less sure."""
+"""One number a row from an prediction, (E, N): variances summed over the outputs. The higher, the less sure."""
 
 
 class Regressor(Protocol):
@@ -111,7 +111,7 @@ class Regressor(Protocol):
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call, by slashed name."""
 
-    def assess(self, inputs: Floats, rng: np.random.Generator) -> Assessment:
+    def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict and say how sure that is.
 
         Args:
@@ -152,20 +152,20 @@ class RegressorContext:
     device: str = "cpu"
 
 
-Assess = Callable[[Floats, str], Assessment]
+Predict = Callable[[Floats, str], Prediction]
 """Inputs (E, N, X) and a name, which stands for the random numbers, to what the networks say about them."""
 
 
 class Evaluate(Protocol):
     """A task's own measurements of trained networks."""
 
-    def __call__(self, variant: str, assess: Assess, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
         """Everything the task's figures and tables are made of, by name; the first axis is the network where there
         is one.
 
         Args:
             variant: What the networks were trained on.
-            assess: Asks them.
+            predict: Asks them.
             seeds: One node a network, for test inputs.
         """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imagine_bench.calibration import (
+from imagine_bench.judge.calibration import (
     LEVELS,
     auroc,
     coverage,
@@ -50,7 +50,7 @@ def calibrate(
     """
     tests = [task.testing(variant, node.child("test", variant).generator(), points) for node in networks]
     inputs, targets = np.stack([t.inputs for t in tests]), np.stack([t.targets for t in tests])
-    said = regressor.assess(inputs, rng)
+    said = regressor.predict(inputs, rng)
     error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, said.prediction, strict=True)])
     scores = {name: score(said) for name, score in SCORES.items()}
     transform = probability_transform(said.predictive, targets)

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.bench.protocol import ProtocolData, digest, require_seeds
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.protocol import ProtocolData, digest, require_seeds
 
-_SETTINGS = "imagine_bench.agents.regressor_settings:resolve_all"
-_CHECK_DEVICE = "imagine_bench.agents.perception:prepare_torch"
+_SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
+_CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class RegressionProtocol(ProtocolData):
         test_points: Unseen points of each network, for errors and calibration.
         recorded: Whether runs leave a recording.
         overrides: Settings that replace the preset's, as sorted (name, value) pairs.
-        settings_digest: As of :class:`imagine_bench.protocol.Protocol`.
+        settings_digest: As of :class:`imagine_bench.bench.protocol.Protocol`.
         device: ``"cpu"`` or ``"cuda"``.
     """
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench import run_folder
 from imagine_bench.errors import ArtefactError
-from imagine_bench.files import csv_text, write_bytes
 from imagine_bench.regression.protocol import RegressionProtocol
-from imagine_bench.results import require_one_setting
+from imagine_bench.store import run_folder
+from imagine_bench.store.files import csv_text, write_bytes
+from imagine_bench.store.results import require_one_setting
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
 
@@ -61,7 +61,7 @@ class RegressionResult:
         runs: One a regressor and seed.
         environment: Command, commit, versions, machine; JSON-like.
         folder: Where the bench's files lie.
-        wall_s: Wall seconds of the bench, over all its sittings.
+        wall_s: Wall seconds of the bench, over all its sessions.
 
     Raises:
         ArtefactError: A run is missing or doubled, or two runs of a regressor had different settings.

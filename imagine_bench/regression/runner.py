@@ -11,16 +11,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-from imagine_bench import registry, run_folder
-from imagine_bench.checkpointing import Snapshot, load_newest, save_snapshot
-from imagine_bench.cohort import cpu_time_s
+from imagine_bench import registry
+from imagine_bench.bench.cohort import cpu_time_s
+from imagine_bench.bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.errors import DivergedError
-from imagine_bench.files import lock, make_folder
-from imagine_bench.regression import Assessment, Dataset, Floats, Regressor, RegressorContext
+from imagine_bench.regression import Dataset, Floats, Prediction, Regressor, RegressorContext
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import Arrays, RegressionRun, Row, finish, load_run, write_rows
-from imagine_bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store import run_folder
+from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
+from imagine_bench.store.files import lock, make_folder
 
 _SLICES = 100
 """Parts that a variant's training is told in."""
@@ -130,10 +131,10 @@ class _Run:
             rng=self.seeds.child("calibration", variant).generator(),
         )  # fmt: skip
 
-        def assess(inputs: Floats, name: str) -> Assessment:
-            return regressor.assess(inputs, self.seeds.child("assess", variant, name).generator())
+        def predict(inputs: Floats, name: str) -> Prediction:
+            return regressor.predict(inputs, self.seeds.child("predict", variant, name).generator())
 
-        evaluation = self.task.evaluate(variant, assess, self.networks)
+        evaluation = self.task.evaluate(variant, predict, self.networks)
         measure_cpu_s = cpu_time_s() - start_s
         shared: Row = {**regressor.diagnostics()}  # of all networks together; the CPU seconds are a network's share
         shared["train_cpu_s"] = self.train_cpu_s / self.protocol.networks

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.files import csv_text
 from imagine_bench.interfaces import RuleFacts, TaskSpec
-from imagine_bench.results import BenchResult, Futures, OpenLoop, RunResult
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import csv_text
+from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
 BASE_AGENT = "dqn"
 """What gains are measured against, as in the thesis."""
@@ -91,10 +91,10 @@ class FuturesSummary:
         samples: Futures of each pair.
         total_variation: Distance of imagined and exact distributions of macrostates.
         by_chance: The same over the pairs after which several macrostates are possible; the others dilute it.
-        going_on: The same where the episode goes on until this macro-action, weighted by how likely that is.
+        survival_probability: The same where the episode goes on until this macro-action, weighted by how likely that is.
         floor: What as many samples of the exact distribution would show.
         missing: Possible outcomes that are not imagined, all pairs together.
-        invented: Imagined outcomes that are impossible, all pairs together.
+        hallucinated: Imagined outcomes that are impossible, all pairs together.
         reward_error: Absolute error of the expected reward.
         termination_error: Absolute error of the probability that the episode is over.
         by_budget: Total variation at the first and at the last depth, by real episodes.
@@ -104,10 +104,10 @@ class FuturesSummary:
     samples: int
     total_variation: np.ndarray
     by_chance: np.ndarray
-    going_on: np.ndarray
+    survival_probability: np.ndarray
     floor: np.ndarray
     missing: np.ndarray
-    invented: np.ndarray
+    hallucinated: np.ndarray
     reward_error: np.ndarray
     termination_error: np.ndarray
     by_budget: dict[int, tuple[float, float]]
@@ -117,7 +117,7 @@ class FuturesSummary:
 class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
 
-    ``reached`` holds for each seed the first budget from which on success never falls below the task's ``mastery``, or
+    ``reached`` holds for each seed the first budget from which on success never falls below the task's ``success_threshold``, or
     None.
     ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
     budget, divided by the budget: the mean success until then, with its interval over seeds.
@@ -167,7 +167,7 @@ def collect(result: BenchResult) -> ReportData:
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
-        reached={agent: _reached(result.of(agent), spec.mastery) for agent in learners},
+        reached={agent: _reached(result.of(agent), spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
@@ -227,7 +227,7 @@ def summary_csv(data: ReportData) -> str:
 def futures_csv(data: ReportData) -> str:
     """One row an agent, seed, budget, depth, macrostate and macro-action of the futures that were sampled."""
     spec, errors = data.spec, ("reward_error", "termination_error")
-    measures = ("samples", "total_variation", "floor", "missing", "invented", *errors, "going_on")
+    measures = ("samples", "total_variation", "floor", "missing", "hallucinated", *errors, "survival_probability")
     rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
     for agent in data.futures:
         for run in data.result.of(agent):
@@ -326,7 +326,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
     def total(name: str) -> np.ndarray:
         return np.mean([getattr(each, name).sum(axis=1) for each in found], axis=0)  # [D]
 
-    weight = np.stack([each.going_on for each in found])  # [runs, D, P]
+    weight = np.stack([each.survival_probability for each in found])  # [runs, D, P]
     distance = np.stack([each.total_variation for each in found])
     uncertain = np.stack([each.floor for each in found]) > 0.0  # no sample of a certain outcome can deviate from it
     by_budget: dict[int, list[tuple[float, float]]] = {}
@@ -340,10 +340,10 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
         samples=int(found[0].samples),
         total_variation=mean("total_variation"),
         by_chance=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
-        going_on=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
+        survival_probability=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
         floor=mean("floor"),
         missing=total("missing"),
-        invented=total("invented"),
+        hallucinated=total("hallucinated"),
         reward_error=mean("reward_error"),
         termination_error=mean("termination_error"),
         by_budget={budget: tuple(np.mean(pairs, axis=0).tolist()) for budget, pairs in by_budget.items()},
@@ -359,10 +359,12 @@ def _nan_mean(table: np.ndarray) -> np.ndarray:
     return mean
 
 
-def _reached(runs: tuple[RunResult, ...], mastery: float) -> tuple[int | None, ...]:
+def _reached(runs: tuple[RunResult, ...], success_threshold: float) -> tuple[int | None, ...]:
     def first(run: RunResult) -> int | None:
         rows = run.checkpoints
-        return statistics.first_lasting([row.episodes for row in rows], [row.success_rate for row in rows], mastery)
+        return statistics.first_lasting(
+            [row.episodes for row in rows], [row.success_rate for row in rows], success_threshold
+        )
 
     return tuple(first(run) for run in runs)
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imagine_bench import encoders, registry
-from imagine_bench.files import read_json
-from imagine_bench.results import BenchResult
+from imagine_bench import registry
+from imagine_bench.store import encoders
+from imagine_bench.store.files import read_json
+from imagine_bench.store.results import BenchResult
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference
-from imagine_bench.files import csv_text, make_folder, with_null, write_bytes, write_json
-from imagine_bench.generalisation import Answers, Generalisation, Probing, consequence
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.report.words import agent_words, few_words, mean_text, origin, percent
+from imagine_bench.judge.generalisation import Answers, Generalisation, Probing, consequence
+from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import csv_text, make_folder, with_null, write_bytes, write_json
 
 _ROWS = {
     "unseen": "next macrostate right, out of terminal macrostates (never seen), %",

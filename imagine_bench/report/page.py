@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.course_pictures import courses_sheet
-from imagine_bench.files import make_folder, write_bytes
-from imagine_bench.pictures import first_cut, png, rollout_strip
-from imagine_bench.report import plots, words
+from imagine_bench.judge.filmstrips import first_cut, png, rollout_strip
+from imagine_bench.judge.sampled_filmstrips import courses_sheet
+from imagine_bench.report import plots
+from imagine_bench.report import text as words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
 from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.sections import Picture
 from imagine_bench.report.template import render
-from imagine_bench.report.words import agent_words, percent, score_text
-from imagine_bench.results import BenchResult, ComparedRollout
+from imagine_bench.report.text import agent_words, percent, score_text
+from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.results import BenchResult, ComparedRollout
 
 SHOWN_ROLLOUTS = 3
 """Rollouts shown of each imagining agent: the first ones of its first seed."""
@@ -38,18 +39,18 @@ def write_report(result: BenchResult) -> Path:
     folder = make_folder(result.folder / "report")
     data = collect(result)
     drawn = plots.all_plots(data)
-    strips, courses = _strips(data), _courses(data)
+    strips, sampled_rollouts = _strips(data), _courses(data)
     seen_through = encoder_views(result)
     shown = [(each, each.picture.read_bytes()) for each in seen_through if each.picture]
     context = {
         **_words(data),
         "plots": {plot.name: plot for plot in drawn},
         "strips": strips,
-        "courses": courses,
+        "sampled_rollouts": sampled_rollouts,
         "encoders": seen_through,
         "encoder_pictures": {each.identity: base64.b64encode(picture).decode() for each, picture in shown},
     }
-    pictures: list[plots.Plot | Picture] = [*drawn, *strips, *courses]
+    pictures: list[plots.Plot | Picture] = [*drawn, *strips, *sampled_rollouts]
     files = {f"{each.name}.png": each.png for each in pictures}
     files |= {each.file: picture for each, picture in shown}
     files["results.csv"] = results_csv(result).encode()
@@ -201,14 +202,16 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
 
 
 def _courses(data: ReportData) -> list[Picture]:
-    """One sheet an agent: several imagined courses of one beginning, of its first seed."""
+    """One sheet an agent: several imagined sampled_rollouts of one beginning, of its first seed."""
     sheets = []
     for agent in data.result.protocol.agents:
         run = data.result.of(agent)[0]
-        if run.courses:
+        if run.sampled_rollouts:
             title = agent_words(agent).title
-            caption = f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.courses)} times."
-            sheet = png(courses_sheet(run.courses, data.spec))
+            caption = (
+                f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
+            )
+            sheet = png(courses_sheet(run.sampled_rollouts, data.spec))
             alt = f"Only the first picture is real. {caption}"
             sheets.append(Picture(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
     return sheets

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.files import csv_text, make_folder, with_null, write_bytes, write_json, writing
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.pictures import png, rollout_strip
-from imagine_bench.plans import Plan
-from imagine_bench.report.words import percent
+from imagine_bench.judge.filmstrips import png, rollout_strip
+from imagine_bench.judge.plans import Plan
+from imagine_bench.report.text import percent
+from imagine_bench.store.files import csv_text, make_folder, with_null, write_bytes, write_json, writing
 
 _COLUMNS = (
     *("plan", "start", "shortest", "planned", "done", "solved", "optimal", "refused", "as_imagined", "faults"),

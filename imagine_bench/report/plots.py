@@ -1,4 +1,4 @@
-"""The plots of a report, in one style: colour-blind-safe, labelled directly, readable on light and dark pages."""
+"""The plots of a report, in one style: color-blind-safe, labelled directly, readable on light and dark pages."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData
-from imagine_bench.report.words import agent_words
+from imagine_bench.report.text import agent_words
 
-_INK = "#2b2b2f"  # in the SVG this becomes the page's own text colour
-# Okabe and Ito's palette, greys and Tol's muted colours, in the order in which agents are registered.
+_INK = "#2b2b2f"  # in the SVG this becomes the page's own text color
+# Okabe and Ito's palette, grays and Tol's muted colors, in the order in which agents are registered.
 _COLORS = (
     "#8c8c8c", "#b8860b", "#0072b2", "#d55e00", "#009e73", "#882255",
     "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
@@ -68,7 +68,7 @@ class Plot:
 
     Attributes:
         name: File name without ending.
-        svg: Inline SVG whose text and axes take the page's colour.
+        svg: Inline SVG whose text and axes take the page's color.
         png: The same on white, 2x.
         alt: What a reader who does not see it should know.
     """
@@ -91,13 +91,13 @@ def all_plots(data: ReportData) -> list[Plot]:
         alt = "Open-loop quality of imagination by depth: correct share, errors, uncertainties."
         plots.append(_render("open_loop", open_loop_figure, data, alt))
     if data.futures:
-        alt = "Imagined against exact distributions of outcomes: total variation, missing and invented outcomes."
+        alt = "Imagined against exact distributions of outcomes: total variation, missing and hallucinated outcomes."
         plots.append(_render("futures", futures_figure, data, alt))
     return plots
 
 
 def color(agent: str) -> str:
-    """The agent's colour, the same in every plot."""
+    """The agent's color, the same in every plot."""
     known = list(AGENTS)
     return _COLORS[(known.index(agent) if agent in known else sum(agent.encode())) % len(_COLORS)]
 
@@ -184,7 +184,7 @@ def open_loop_figure(data: ReportData) -> Figure:
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    measure = "variance of latents" + ("\n(“imagine”: probability)" if "imagine" in data.open_loop else "")
+    measure = "variance of latents" + ("\n(“imagine”: probability)" if "factored" in data.open_loop else "")
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
@@ -193,7 +193,7 @@ def open_loop_figure(data: ReportData) -> Figure:
 
 
 def futures_figure(data: ReportData) -> Figure:
-    """Four panels: total variation by depth and by real episodes, missing and invented outcomes by depth."""
+    """Four panels: total variation by depth and by real episodes, missing and hallucinated outcomes by depth."""
     figure = Figure(figsize=(9.2, 6.6), layout="constrained")
     panels: list[Axes] = list(figure.subplots(2, 2).ravel())
     for agent, found in data.futures.items():
@@ -207,7 +207,7 @@ def futures_figure(data: ReportData) -> Figure:
         deepest = [last for _, last in found.by_budget.values()]
         panels[1].plot(budgets, deepest, linestyle="--", **style)
         panels[2].plot(depth, found.missing / found.pairs, label=title, **style)
-        panels[3].plot(depth, found.invented / found.pairs, label=title, **style)
+        panels[3].plot(depth, found.hallucinated / found.pairs, label=title, **style)
     floor = next(iter(data.futures.values())).floor
     panels[0].plot([], [], linestyle="--", color=_INK, label="where several are possible")
     panels[0].plot(np.arange(1, len(floor) + 1), floor, label="samples of the truth", **_REFERENCE_LINE)
@@ -247,7 +247,7 @@ def _thesis_points(axes: Axes, data: ReportData) -> None:
 
 
 def _success_legend(axes: Axes, data: ReportData) -> None:
-    """What the kinds of line mean; which agent a colour is, the right margin says."""
+    """What the kinds of line mean; which agent a color is, the right margin says."""
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     if data.thesis:
         axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **_THESIS_LINE)
@@ -287,7 +287,7 @@ def _render(name: str, draw: Callable[[ReportData], Figure], data: ReportData, a
 
 
 def _inline(svg: str, name: str, alt: str) -> str:
-    """Strip what a page does not want (prologue, metadata, fixed size) and let text take the page's colour."""
+    """Strip what a page does not want (prologue, metadata, fixed size) and let text take the page's color."""
     body = svg[svg.index("<svg") :]
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", body, count=1)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.policy import FRAMES, Ends, optimal_length
-from imagine_bench.report.words import agent_words, few_words, mean_text, origin, percent
+from imagine_bench.judge.policy import FRAMES, Ends, optimal_length
+from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
 
 _SHARES = {
     "success": "solved",

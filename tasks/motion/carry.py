@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from .. import attitude
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import THINGS, Thing, standing_m
+from . import orientation as attitude
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, UnreachableTargetError

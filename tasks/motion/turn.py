@@ -10,8 +10,8 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError
 
-from .. import attitude
 from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
+from . import orientation as attitude
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
 from .ik import ArmIK, UnreachableTargetError

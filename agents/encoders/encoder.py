@@ -1,0 +1,279 @@
+"""The encoder as an artefact: one file with network, evaluation-only probe and card; frames to latents and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.interfaces import Frame
+from imagine_bench.preprocessing import PREPROCESSING, join_strips, preprocess
+
+from .factors import PartsCoder
+from .network import Coder
+from .probe import Probe
+from .recipes import Recipe
+from .vae import Vae, build_vae
+
+FORMAT = "imagine_bench.encoder/1"
+PROBE_HIDDEN = 256
+"""Units of each hidden layer of the stored probe."""
+_CHUNK = 512  # frames encoded at once, to bound memory
+_FRAME_SHAPE = (64, 64, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderCard:
+    """Where an encoder comes from and what it can do.
+
+    Attributes:
+        task: Id of the task whose frames it was trained on.
+        appearance: Their appearance level.
+        recipe: Every setting of its making.
+        preprocessing: Name in :mod:`imagine_bench.preprocessing`.
+        latent_size: Latents Z.
+        macrostate_names: The coordinates its probe reads. Length M.
+        cardinalities: Values of each. Length M.
+        seed: Root of the seed tree it was made from.
+        command: Makes it again.
+        data: What the frames were, in words.
+        versions: Of the libraries that made it.
+        cpu_s: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``.
+        kl_nats: KL from the prior on held-out frames, mean a frame.
+        reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
+        probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
+            ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
+        code_sizes: Where latents are one-hot codes of parts: the number of values of each part; else empty.
+    """
+
+    task: str
+    appearance: str
+    recipe: Recipe
+    preprocessing: str
+    latent_size: int
+    macrostate_names: tuple[str, ...]
+    cardinalities: tuple[int, ...]
+    seed: int
+    command: str
+    data: str
+    versions: dict[str, str]
+    cpu_s: dict[str, float]
+    kl_nats: float
+    reconstruction: float
+    probe: dict[str, float]
+    code_sizes: tuple[int, ...] = ()
+
+    def to_json(self) -> str:
+        """The card as indented JSON."""
+        return json.dumps({"format": FORMAT, **asdict(self)}, indent=2)
+
+    @classmethod
+    def from_json(cls, text: str) -> EncoderCard:
+        """Undo :meth:`to_json`.
+
+        Raises:
+            InvalidValueError: It is not an encoder's card of this format.
+        """
+        try:
+            values: dict[str, Any] = json.loads(text)
+            if values.pop("format") != FORMAT:
+                raise InvalidValueError("its format is another one")
+            recipe = values.pop("recipe")
+            recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
+            names = ("macrostate_names", "cardinalities", "code_sizes")
+            tuples: dict[str, Any] = {key: tuple(values.pop(key)) for key in names if key in values}
+            card = cls(recipe=recipe, **tuples, **values)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise InvalidValueError(f"Not an {FORMAT} card: {error}.") from error
+        if card.preprocessing not in PREPROCESSING:
+            raise InvalidValueError(f"Its preprocessing {card.preprocessing!r} is unknown.")
+        return card
+
+
+class Encoder:
+    """Frames to latents and back, with no gradient and no randomness.
+
+    Args:
+        coder: The trained network.
+        probe: The evaluation-only reader of the macrostate.
+        card: Its origin.
+        device: A torch device name.
+    """
+
+    def __init__(self, coder: Coder, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
+        self.card = card
+        self.latent_size = card.latent_size
+        self.device = torch.device(device)
+        self._coder = coder.to(self.device).requires_grad_(False).eval()
+        self._probe = probe.to(self.device).requires_grad_(False).eval()
+        self._preprocess = preprocess(card.preprocessing)
+
+    @torch.no_grad()
+    def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
+        """The latents of frames.
+
+        Args:
+            frames: Shape (N, 64, 64, 3), uint8.
+
+        Returns:
+            Posterior means and standard deviations, float32 on the encoder's device. Each of shape (N, Z).
+
+        Raises:
+            InvalidValueError: Frames of another shape or type.
+        """
+        if frames.dtype != np.uint8 or frames.shape[1:] != _FRAME_SHAPE:
+            raise InvalidValueError(
+                f"The encoder got frames of type {frames.dtype} and shape {frames.shape}; "
+                "give uint8 of shape (N, 64, 64, 3)."
+            )
+        parts = [self._encode_chunk(frames[i : i + _CHUNK]) for i in range(0, len(frames), _CHUNK)]
+        if len(parts) == 1:
+            return parts[0]
+        empty = torch.empty((0, self.latent_size), device=self.device)
+        mu, sigma = zip((empty, empty), *parts, strict=True)
+        return torch.cat(mu), torch.cat(sigma)
+
+    def _encode_chunk(self, frames: Frame) -> tuple[Tensor, Tensor]:
+        pictures = torch.from_numpy(self._preprocess(frames)).to(self.device)
+        mu, log_variance = self._coder.posterior(pictures)
+        return mu, (0.5 * log_variance).exp()
+
+    def codes(self, frame: Frame) -> tuple[int, ...]:
+        """The value of each part of one frame (64, 64, 3), where latents are codes; P integers.
+
+        Raises:
+            InvalidValueError: Its latents are continuous.
+        """
+        if not self.card.code_sizes:
+            raise InvalidValueError(
+                f"This agent reads codes of parts, and the encoder {self.card.recipe.name!r} of {self.card.task} gives "
+                "continuous latents; give one made with `imagine-bench encoder --recipe codes`."
+            )
+        hot = self.encode(frame[None])[0][0]
+        return tuple(int(part.argmax()) for part in hot.split(self.card.code_sizes))
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> NDArray[np.float32]:
+        """One picture of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
+        _, height, width = picture_shape(self.card.preprocessing)
+        return view(self._coder.picture(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
+
+    def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
+        """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
+        return self._probe.read(latents.to(self.device))
+
+    def save(self, path: Path) -> None:
+        """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``).
+
+        Raises:
+            ArtefactError: Either file exists already; it is left untouched.
+        """
+        card_path = path.with_suffix(".json")
+        refuse_existing(path, card_path)
+        tensors = {
+            f"{name}.{key}": value.half().contiguous().cpu()
+            for name, module in (("vae", self._coder), ("probe", self._probe))
+            for key, value in module.state_dict().items()
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with card_path.open("x") as file:
+            file.write(self.card.to_json() + "\n")
+        with path.open("xb") as file:
+            file.write(save(tensors, metadata={"card": self.card.to_json()}))
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> Encoder:
+        """Read an artefact; the file is only ever read.
+
+        Raises:
+            ArtefactError: It is missing, damaged or not an encoder; the message names the file.
+        """
+        if not path.is_file():
+            raise ArtefactError(f"No encoder at {path}; make one with `imagine-bench encoder`.")
+        try:
+            with safe_open(path, framework="pt") as file:
+                card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
+                tensors = {key: file.get_tensor(key).float() for key in file.keys()}
+            coder = empty_coder(card)
+            if coder.latent_size != card.latent_size:
+                raise InvalidValueError(f"its card says {card.latent_size} latents, its network {coder.latent_size}")
+            probe = empty_probe(coder.latent_size, card.cardinalities)
+            _fill(coder, tensors, "vae.")
+            _fill(probe, tensors, "probe.")
+        except (OSError, SafetensorError, RuntimeError, TypeError, ValueError, ImagineBenchError) as error:
+            reason = str(error).splitlines()[0].rstrip(".")
+            raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
+        return cls(coder, probe, card, device)
+
+
+def bundled_encoder(name: str) -> Path:
+    """Where the encoder that comes with the package under ``name`` (``"arrow_puzzle-mild"``) is, if it is there."""
+    return Path(str(resources.files("imagine_bench.assets"))) / "encoders" / f"{name}.safetensors"
+
+
+def refuse_existing(*paths: Path) -> None:
+    """Stop before anything is overwritten.
+
+    Raises:
+        ArtefactError: One of ``paths`` exists.
+    """
+    for path in paths:
+        if path.exists():
+            raise ArtefactError(f"{path} exists already and is never overwritten; choose another folder or remove it.")
+
+
+def picture_shape(preprocessing: str) -> tuple[int, int, int]:
+    """(C, H, W) of what a preprocessing gives."""
+    shape = preprocess(preprocessing)(np.zeros((1, *_FRAME_SHAPE), dtype=np.uint8)).shape
+    return shape[1], shape[2], shape[3]
+
+
+def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
+    """One image of the whole view from preprocessed pictures: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
+    if preprocessing == "gray_strips":
+        return join_strips(pictures)
+    return np.ascontiguousarray(np.moveaxis(pictures, 1, -1), dtype=np.float32)
+
+
+def empty_coder(card: EncoderCard) -> Coder:
+    """The network that a card describes, on the meta device."""
+    if card.recipe.kind == "latents":
+        return empty_vae(card.recipe, card.preprocessing)
+    with torch.device("meta"):
+        return PartsCoder(card.code_sizes, *picture_shape(card.preprocessing))
+
+
+def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:
+    """The VAE of a recipe on the meta device: shapes without weights, and no random numbers drawn."""
+    with torch.device("meta"):
+        return build_vae(recipe, *picture_shape(preprocessing))
+
+
+def empty_probe(latent_size: int, cardinalities: tuple[int, ...], hidden: int = PROBE_HIDDEN) -> Probe:
+    """A probe on the meta device."""
+    with torch.device("meta"):
+        return Probe(latent_size, cardinalities, hidden)
+
+
+def _fill(network: nn.Module, tensors: dict[str, Tensor], prefix: str) -> None:
+    """Give an empty network its weights.
+
+    Raises:
+        RuntimeError: Names or shapes do not fit.
+        InvalidValueError: A weight is not finite.
+    """
+    weights = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+    network.load_state_dict(weights, strict=True, assign=True)
+    for name, value in weights.items():
+        if not value.isfinite().all():
+            raise InvalidValueError(f"weight {prefix}{name} is not finite")

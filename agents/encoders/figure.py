@@ -1,0 +1,95 @@
+"""One picture of what an encoder keeps: real views, their reconstructions, and what the probe reads from them."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.preprocessing import preprocess
+
+from .encoder import Encoder, view
+from .probe import Latents
+
+COLUMNS = 8
+_CELL = 192  # pixels, edge of a picture
+_GAP = 8  # pixels
+_HEADING = 80  # pixels
+_LABEL = 150  # pixels, left of the rows
+_CAPTION = 60  # pixels, below the rows
+_CAPTION_LETTERS = 26  # in a line of it
+_INK, _MUTED, _WRONG, _PAPER = (20, 20, 20), (110, 110, 110), (190, 20, 20), (255, 255, 255)
+
+
+def sample_sheet(
+    encoder: Encoder, spec: TaskSpec, frames: Frame, macrostates: NDArray[np.int64], generator: torch.Generator
+) -> Image.Image:
+    """A sheet with one column a frame: camera, network input, reconstruction from mean and from sampled latents.
+
+    Args:
+        encoder: Whose reconstructions are shown.
+        spec: Names the values of the macrostate.
+        frames: At most :data:`COLUMNS` of them are shown. Shape (N, 64, 64, 3).
+        macrostates: The truth, to mark misreadings. Shape (N, M).
+        generator: Draws the sampled latents.
+    """
+    frames, macrostates = frames[:COLUMNS], macrostates[:COLUMNS]
+    mu, sigma = encoder.encode(frames)
+    latents = Latents(mu=mu, sigma=sigma)
+    rows: dict[str, NDArray[Any]] = {
+        "camera": frames,
+        "encoder's view": view(preprocess(encoder.card.preprocessing)(frames), encoder.card.preprocessing),
+        "decoded mean": encoder.decode(latents.mu),
+        "decoded sample": encoder.decode(latents.sample(generator)),
+    }
+    read = encoder.read_macrostate(latents.mu)
+    cell = _CELL + _GAP
+    sheet = Image.new("RGB", (_LABEL + cell * len(frames), _HEADING + cell * len(rows) + _CAPTION), _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    _write_heading(draw, encoder)
+    for row, (label, pictures) in enumerate(rows.items()):
+        top = _HEADING + row * cell
+        draw.text((_GAP, top + cell / 2), label, fill=_MUTED, font=_font(16))
+        for column, picture in enumerate(pictures):
+            sheet.paste(_enlarged(picture), (_LABEL + column * cell, top))
+    for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
+        words = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
+        names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
+        color = _INK if (right == found).all() else _WRONG
+        draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=color, font=_font(14))
+    return sheet
+
+
+def _write_heading(draw: ImageDraw.ImageDraw, encoder: Encoder) -> None:
+    card = encoder.card
+    title = f"{card.task}, appearance {card.appearance}, recipe {card.recipe.name}: {card.latent_size} latents"
+    numbers = (
+        f"whole macrostate read right on {card.recipe.held_out_frames} fresh frames: {card.probe['mlp']:.2%} "
+        f"(sampled latents {card.probe['mlp_sampled']:.2%}, linear reader {card.probe['linear']:.2%}) · "
+        f"KL {card.kl_nats:.1f} nats · {card.cpu_s['total']:.0f} CPU s."
+    )
+    reading = f"Below each column what the probe reads ({' · '.join(card.macrostate_names)}), red where it is wrong."
+    draw.text((_GAP, _GAP), title, fill=_INK, font=_font(20))
+    draw.text((_GAP, _GAP + 27), numbers, fill=_MUTED, font=_font(14))
+    draw.text((_GAP, _GAP + 46), reading, fill=_MUTED, font=_font(14))
+
+
+def _short(name: str) -> str:
+    """The last word of a value's name."""
+    return name.replace("_", " ").split()[-1]
+
+
+def _enlarged(picture: NDArray[Any]) -> Image.Image:
+    if picture.dtype != np.uint8:
+        picture = np.rint(picture * 255.0).astype(np.uint8)
+    image = Image.fromarray(picture).convert("RGB")
+    return image.resize((_CELL, _CELL), Image.Resampling.NEAREST)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)

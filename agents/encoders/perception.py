@@ -1,0 +1,79 @@
+"""Frames to latents for one learner: the encoder, and a memory of the last two frames it saw."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import Tensor
+
+from imagine_bench.errors import InvalidValueError, SetupError, require_known
+from imagine_bench.interfaces import DEVICES, AgentContext, Frame
+
+from ..networks.allocator import keep_freed_memory
+from .encoder import Encoder
+
+_KEPT = 2
+
+
+class Perception:
+    """Encodes single frames; a frame that is both the end of one transition and the start of the next costs once.
+
+    Args:
+        encoder: Frames to posteriors.
+    """
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.encoder = encoder
+        self._recent: OrderedDict[bytes, tuple[Tensor, Tensor]] = OrderedDict()
+
+    @property
+    def latent_size(self) -> int:
+        """Z."""
+        return self.encoder.latent_size
+
+    def posterior(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of a frame's latents, each of shape (Z,)."""
+        key = frame.tobytes()
+        if key not in self._recent:
+            mu, sigma = self.encoder.encode(frame[None])
+            self._recent[key] = (mu[0], sigma[0])
+            if len(self._recent) > _KEPT:
+                self._recent.popitem(last=False)
+        return self._recent[key]
+
+
+def prepare_torch(device: str) -> torch.device:
+    """Set torch up for small networks: one thread, freed memory kept, and denormals flushed.
+
+    Denormals make Adam's moments 10 times slower on some processors. In a cohort, as in every bench, joint updates run
+    on a stack of their own, whose register this does not set: :func:`agents.networks.joint.gradients` does.
+
+    Raises:
+        UnknownNameError: No such device name.
+        SetupError: The machine has no such device.
+    """
+    require_known("device", device, DEVICES)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise SetupError("Device 'cuda' was asked for, but torch finds no NVIDIA GPU here; use device 'cpu'.")
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    keep_freed_memory()
+    return torch.device(device)
+
+
+def load_perception(context: AgentContext) -> Perception:
+    """The perception of an agent.
+
+    Raises:
+        InvalidValueError: The context names no encoder, or one that reads frames otherwise than the task declares.
+    """
+    if context.encoder is None:
+        raise InvalidValueError("This agent sees latents; give it the path of an encoder.")
+    encoder = Encoder.load(context.encoder, context.device)
+    if encoder.card.preprocessing != context.preprocessing:
+        raise InvalidValueError(
+            f"Encoder {context.encoder.name!r} reads frames as {encoder.card.preprocessing!r}, "
+            f"the task declares {context.preprocessing!r}; choose an encoder of this task."
+        )
+    return Perception(encoder)

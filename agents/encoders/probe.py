@@ -1,0 +1,100 @@
+"""An evaluation-only reader of the macrostate from latents. It sees labels; no agent learns from it or acts on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..networks.weights import initialise
+
+_BATCH = 256
+_LEARNING_RATE = 3e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latents:
+    """Posterior means and standard deviations of N frames. Each of shape (N, Z)."""
+
+    mu: Tensor
+    sigma: Tensor
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """One draw of every frame's latents. Shape (N, Z)."""
+        noise = torch.randn(self.mu.shape, generator=generator)
+        return self.mu + self.sigma * noise.to(self.mu.device)
+
+
+class Probe(nn.Module):
+    """A classifier for every coordinate of the macrostate on shared features.
+
+    Args:
+        latent_size: Latents Z.
+        cardinalities: Values of each of the M coordinates.
+        hidden: Units of each of two hidden layers; 0 makes it linear.
+    """
+
+    centre: Tensor
+    scale: Tensor
+
+    def __init__(self, latent_size: int, cardinalities: Sequence[int], hidden: int) -> None:
+        super().__init__()
+        self.cardinalities = tuple(cardinalities)
+        self.register_buffer("centre", torch.zeros(latent_size))
+        self.register_buffer("scale", torch.ones(latent_size))
+        outputs = sum(cardinalities)
+        if hidden:
+            layers = [nn.Linear(latent_size, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()]
+            self.layers: nn.Module = nn.Sequential(*layers, nn.Linear(hidden, outputs))
+        else:
+            self.layers = nn.Linear(latent_size, outputs)
+
+    def logits(self, latents: Tensor) -> tuple[Tensor, ...]:
+        """Unnormalised log probabilities of each coordinate's values. M tensors of shape (N, cardinality)."""
+        joined: Tensor = self.layers((latents - self.centre) / self.scale)  # [N, sum of cardinalities]
+        return torch.split(joined, list(self.cardinalities), dim=1)
+
+    @torch.no_grad()
+    def read(self, latents: Tensor) -> NDArray[np.int64]:
+        """The most likely macrostates of ``latents`` (N, Z). Shape (N, M)."""
+        macrostates = torch.stack([part.argmax(dim=1) for part in self.logits(latents)], dim=1)
+        return macrostates.cpu().numpy()
+
+
+def train_probe(
+    probe: Probe, latents: Latents, macrostates: NDArray[np.int64], *, steps: int, generator: torch.Generator
+) -> None:
+    """Fit ``probe`` by cross-entropy to freshly sampled latents, so that it reads imagined ones as well.
+
+    Args:
+        probe: Changed in place, on the CPU.
+        latents: Of N training frames.
+        macrostates: Their labels. Shape (N, M).
+        steps: Gradient steps.
+        generator: Draws weights, batches and latent noise.
+    """
+    initialise(probe, generator)
+    probe.centre.copy_(latents.mu.mean(dim=0))
+    probe.scale.copy_((latents.mu.var(dim=0) + latents.sigma.square().mean(dim=0)).sqrt().clamp_min(1e-6))
+    labels = torch.from_numpy(macrostates)
+    optimiser = torch.optim.Adam(probe.parameters(), lr=_LEARNING_RATE, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, T_max=steps)
+    for _ in range(steps):
+        rows = torch.randint(len(labels), (_BATCH,), generator=generator)
+        sampled = Latents(mu=latents.mu[rows], sigma=latents.sigma[rows]).sample(generator)
+        parts = zip(probe.logits(sampled), labels[rows].T, strict=True)
+        loss = torch.stack([functional.cross_entropy(logits, right) for logits, right in parts]).sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+
+
+def accuracy(probe: Probe, latents: Tensor, macrostates: NDArray[np.int64]) -> float:
+    """Fraction of ``latents`` (N, Z) whose whole macrostate (N, M) is read right."""
+    return float((probe.read(latents) == macrostates).all(axis=1).mean())

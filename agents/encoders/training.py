@@ -1,0 +1,268 @@
+"""Make an encoder: render frames, train the VAE or discover the parts, fit the evaluation-only probe, measure.
+
+Every measurement is on fresh frames.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imagine_bench.errors import DivergedError, require_known
+from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec
+from imagine_bench.preprocessing import preprocess
+from imagine_bench.seeding import SeedTree
+
+from ..networks.weights import initialise
+from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
+from .factors import PartsCoder, discover
+from .network import Coder
+from .probe import Latents, Probe, accuracy, train_probe
+from .recipes import Recipe, recipe_named
+from .vae import MlpVae, Vae
+
+Progress = Callable[[str, float], None]
+"""Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
+
+_CHUNK = 500  # frames rendered at once, to bound memory
+_CHECK_EVERY = 50  # steps between looks for NaN
+_RISE = 0.02  # fraction of the steps over which the learning rate rises
+_LIBRARIES = ("torch", "numpy", "mujoco")
+_Network = TypeVar("_Network", bound=torch.nn.Module)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSet:
+    """Labelled frames, preprocessed, with 8 bits a value to quarter the memory.
+
+    Attributes:
+        pictures: Shape (N, C, H, W), uint8.
+        macrostates: Shape (N, M).
+    """
+
+    pictures: Tensor
+    macrostates: NDArray[np.int64]
+
+    def batch(self, rows: Tensor) -> Tensor:
+        """The pictures of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""
+        return self.pictures[rows].float() / 255.0
+
+
+def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
+    """Frames of macrostates drawn uniformly from all that the rules know. Shapes (n, 64, 64, 3) and (n, M)."""
+    states = np.array(spec.rules.states, dtype=np.int64)
+    macrostates = states[rng.integers(len(states), size=n)]
+    return spec.render_macrostates(macrostates, appearance, rng), macrostates
+
+
+def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator, progress: Progress) -> FrameSet:
+    """Render ``n`` labelled frames of uniformly drawn macrostates."""
+    prepare = preprocess(spec.preprocessing)
+    pictures: list[Tensor] = []
+    labels: list[NDArray[np.int64]] = []
+    for start in range(0, n, _CHUNK):
+        frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
+        pictures.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
+        labels.append(macrostates)
+        progress("frames", min(start + _CHUNK, n) / n)
+    return FrameSet(pictures=torch.cat(pictures), macrostates=np.concatenate(labels))
+
+
+def beta_at(recipe: Recipe, step: int) -> float:
+    """The KL weight of a gradient step: rises linearly from 0, then constant."""
+    warmup = recipe.kl_warmup * recipe.steps
+    return recipe.beta * min(1.0, step / warmup) if warmup else recipe.beta
+
+
+def learning_rate_at(recipe: Recipe, step: int) -> float:
+    """The learning rate of a gradient step."""
+    if not recipe.cosine:
+        return recipe.learning_rate
+    done = step / recipe.steps
+    return recipe.learning_rate * min(1.0, (done + 1e-3) / _RISE) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+def train_vae(vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress) -> None:
+    """Minimise the beta-VAE loss with Adam, in place.
+
+    Raises:
+        DivergedError: The loss is not finite any more; the message names the step.
+    """
+    optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
+    n, order = len(data.pictures), torch.empty(0, dtype=torch.int64)
+    for step in range(recipe.steps):
+        while len(order) < recipe.batch:
+            order = torch.cat([order, torch.randperm(n, generator=generator)])
+        rows, order = order[: recipe.batch], order[recipe.batch :]
+        noise = torch.randn((len(rows), vae.latent_size), generator=generator)
+        elbo = vae.elbo(data.batch(rows), noise, beta_at(recipe, step))
+        optimiser.param_groups[0]["lr"] = learning_rate_at(recipe, step)
+        optimiser.zero_grad()
+        elbo.loss.backward()
+        optimiser.step()
+        if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not elbo.loss.isfinite():
+            raise DivergedError(f"The encoder's loss became {elbo.loss.item()} at step {step} of {recipe.steps}.")
+        progress("training", (step + 1) / recipe.steps)
+
+
+def train_encoder(
+    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, progress: Progress | None = None
+) -> Encoder:
+    """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
+
+    Args:
+        spec: The task, which renders the frames.
+        recipe: A name among the task's ``RECIPES``, or settings of one's own.
+        appearance: Appearance level of every frame.
+        seed: Root of the seed tree; training frames come from its ``encoder_training`` branch and held-out ones from
+            its ``encoder_probe`` branch.
+        progress: Told how far it is.
+
+    Raises:
+        UnknownNameError: An unknown recipe or appearance.
+        DivergedError: The loss became NaN or infinite.
+        InvalidValueError: A recipe of codes found no part with two values in so few or such like frames.
+    """
+    recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
+    require_known("appearance", appearance, APPEARANCES)
+    progress = progress or (lambda stage, done: None)
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    seeds = SeedTree(seed)
+    train_seeds, probe_seeds = (
+        seeds.child(name, spec.id, appearance) for name in ("encoder_training", "encoder_probe")
+    )
+    clock = _Clock()
+
+    data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress)
+    held_out = frame_set(spec, appearance, recipe.held_out_frames, probe_seeds.generator(), progress)
+    clock.lap("frames")
+    generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
+    coder: Coder
+    if recipe.kind == "codes":
+        coder = _rounded_to_half(discover(data.batch(torch.arange(recipe.frames)), generator))
+    else:
+        coder = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
+    clock.lap("training")
+    cardinalities = tuple(len(values) for values in spec.macrostate_values)
+    latents = latents_of(coder, data)
+    probe, linear = (
+        _trained_probe(coder.latent_size, hidden, cardinalities, latents, data, recipe, generator)
+        for hidden in (PROBE_HIDDEN, 0)
+    )
+    clock.lap("probe")
+    progress("probe", 1.0)
+    noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
+    measured = _measure(coder, probe, linear, held_out, noise)
+    sizes = coder.code_sizes if isinstance(coder, PartsCoder) else ()
+    measured |= {"latent_size": coder.latent_size, "code_sizes": sizes, "cpu_s": clock.seconds()}
+    return Encoder(coder, probe, _card(spec, recipe, appearance, seed, **measured))
+
+
+def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured: Any) -> EncoderCard:
+    return EncoderCard(
+        task=spec.id,
+        appearance=appearance,
+        recipe=recipe,
+        preprocessing=spec.preprocessing,
+        macrostate_names=spec.macrostate_names,
+        cardinalities=tuple(len(values) for values in spec.macrostate_values),
+        seed=seed,
+        command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
+        f"--recipe {recipe.name} --seed {seed}",
+        data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
+        versions={name: version(name) for name in _LIBRARIES},
+        **measured,
+    )
+
+
+class _Clock:
+    """CPU seconds of consecutive stages."""
+
+    def __init__(self) -> None:
+        self._last, self._laps = time.process_time(), dict[str, float]()
+
+    def lap(self, stage: str) -> None:
+        now = time.process_time()
+        self._laps[stage], self._last = now - self._last, now
+
+    def seconds(self) -> dict[str, float]:
+        laps = {**self._laps, "total": sum(self._laps.values())}
+        return {stage: round(seconds, 1) for stage, seconds in laps.items()}
+
+
+def _trained_vae(
+    recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress
+) -> Vae:
+    vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
+    initialise(vae, generator)
+    if isinstance(vae, MlpVae):
+        vae.remember_looks(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
+    train_vae(vae, data, recipe, generator, progress)
+    return _rounded_to_half(vae)
+
+
+def _trained_probe(
+    latent_size: int,
+    hidden: int,
+    cardinalities: tuple[int, ...],
+    latents: Latents,
+    data: FrameSet,
+    recipe: Recipe,
+    generator: torch.Generator,
+) -> Probe:
+    probe = empty_probe(latent_size, cardinalities, hidden).to_empty(device="cpu")
+    train_probe(probe, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
+    return _rounded_to_half(probe)
+
+
+def _rounded_to_half(network: _Network) -> _Network:
+    """Keep only what the artefact stores, so that what is measured is what is loaded."""
+    with torch.no_grad():
+        for value in network.state_dict().values():
+            value.copy_(value.half())
+    return network
+
+
+@torch.no_grad()
+def latents_of(coder: Coder, data: FrameSet) -> Latents:
+    """The latents of every frame."""
+    parts = [coder.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK)]
+    mu, log_variance = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Latents(mu=mu, sigma=(0.5 * log_variance).exp())
+
+
+def _measure(
+    coder: Coder, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
+) -> dict[str, Any]:
+    """What the card says of an encoder on frames that no training saw."""
+    latents, right = latents_of(coder, held_out), held_out.macrostates
+    kl = coder.information(latents.mu, 2.0 * latents.sigma.log())
+    return {
+        "kl_nats": round(kl.mean().item(), 3),
+        "reconstruction": _squared_error(coder, held_out, latents),
+        "probe": {
+            "linear": accuracy(linear, latents.mu, right),
+            "mlp": accuracy(probe, latents.mu, right),
+            "mlp_sampled": accuracy(probe, latents.sample(generator), right),
+        },
+    }
+
+
+@torch.no_grad()
+def _squared_error(coder: Coder, data: FrameSet, latents: Latents) -> float:
+    """Squared error of the mean latents' pictures, mean a pixel."""
+    total = 0.0
+    for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK):
+        pictures = data.batch(rows)
+        total += (coder.mean(latents.mu[rows]) - coder.target(pictures)).square().sum().item()
+    return total / coder.target(data.batch(torch.arange(1))).numel() / len(data.pictures)

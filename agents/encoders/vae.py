@@ -1,0 +1,236 @@
+"""Variational autoencoders: pictures to a Gaussian over latents, and back (thesis 2.1.4 and 5.2.2).
+
+Shapes: ``N`` pictures, ``C`` channels, ``H x W`` pixels, ``Z`` latents of the whole picture. All randomness is
+the noise that the caller passes in.
+"""
+
+from __future__ import annotations
+
+import abc
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imagine_bench.errors import require_known
+
+from .network import Coder
+from .recipes import ARCHITECTURES, Recipe
+
+_LEAST_CONTRAST = 0.005  # of full scale; parts about as flat as this are amplified less
+_SIDE = 64  # pixels; input and output of the Ha & Schmidhuber network
+
+
+class Elbo(NamedTuple):
+    """The terms of a VAE's loss, in nats a picture, averaged over a batch. Each of shape ()."""
+
+    loss: Tensor
+    reconstruction: Tensor
+    kl: Tensor
+
+
+def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(N(mu, sigma^2) || N(0, 1)) summed over latents: -1/2 sum(1 + log sigma^2 - mu^2 - sigma^2).
+
+    The thesis prints it with the wrong sign and without 1/2 (equations 2.7, 3.1 and 5.1), an erratum.
+
+    Args:
+        mu: Means. Shape (N, Z).
+        log_variance: Logarithms of the variances. Shape (N, Z).
+
+    Returns:
+        Nats. Shape (N,).
+    """
+    return -0.5 * (1.0 + log_variance - mu.square() - log_variance.exp()).sum(dim=1)  # [N]
+
+
+class Vae(Coder):
+    """What the two architectures share."""
+
+    @abc.abstractmethod
+    def generate(self, latents: Tensor) -> Tensor:
+        """Parameters of the pixels' distribution given ``latents`` (N, Z), as :meth:`log_loss` takes them."""
+
+    def mean(self, latents: Tensor) -> Tensor:
+        """The expected picture given ``latents`` (N, Z), in the units of :meth:`target`."""
+        return self.generate(latents)
+
+    @abc.abstractmethod
+    def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
+        """-log p(target | latents) up to a constant, a SUM over pixels. Shape (N,)."""
+
+    def information(self, mu: Tensor, log_variance: Tensor) -> Tensor:
+        """KL from the standard normal."""
+        return kl_from_standard_normal(mu, log_variance)
+
+    def elbo(self, pictures: Tensor, noise: Tensor, beta: float) -> Elbo:
+        """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of a batch.
+
+        Args:
+            pictures: Shape (N, C, H, W), in [0, 1].
+            noise: Standard normal, for the reparametrisation. Shape (N, Z).
+            beta: Weight of the KL term.
+        """
+        mu, log_variance = self.posterior(pictures)  # [N, Z]
+        latents = mu + (0.5 * log_variance).exp() * noise  # [N, Z]
+        reconstruction = self.log_loss(self.generate(latents), self.target(pictures)).mean()
+        kl = kl_from_standard_normal(mu, log_variance).mean()
+        return Elbo(reconstruction + beta * kl, reconstruction, kl)
+
+
+def standardise(parts: Tensor) -> Tensor:
+    """Give every row mean 0 and standard deviation 1, so that light matters less.
+
+    Args:
+        parts: Shape (..., P), in [0, 1].
+    """
+    # One fused operation, since a single frame must be quick.
+    return functional.layer_norm(parts, parts.shape[-1:], eps=_LEAST_CONTRAST**2)
+
+
+class MlpVae(Vae):
+    """One small network that reads a picture whole, or each of its channels on its own.
+
+    Channels that are strips hold one cube each: sharing the weights triples the data and lets no cube crowd out
+    another. The latents of part p are ``[p * L, (p + 1) * L)``.
+
+    Args:
+        recipe: Widths, latents a part and pixel noise.
+        channels: Channels C.
+        height: Pixels of a channel.
+        width: Pixels of a channel.
+        parts: C where every channel is read on its own, 1 where all are read together.
+    """
+
+    brightness: Tensor
+    contrast: Tensor
+
+    def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, parts: int) -> None:
+        super().__init__()
+        self.latent_size = parts * recipe.latents
+        self._parts = parts
+        self._picture = (channels, height, width)
+        self._precision = recipe.pixel_std**-2
+        sizes = (channels // parts * height * width, *recipe.widths)
+        self.encoder = _mlp(*sizes, 2 * recipe.latents)
+        self.decoder = _mlp(recipe.latents, *reversed(sizes))
+        # The looks a person expects: the mean brightness and contrast of the training pictures.
+        self.register_buffer("brightness", torch.tensor(0.5))
+        self.register_buffer("contrast", torch.tensor(0.2))
+
+    def _split(self, pictures: Tensor) -> Tensor:
+        """Standardised parts, a row each. Shape (N * parts, pixels)."""
+        return standardise(pictures.reshape(len(pictures) * self._parts, -1))
+
+    def target(self, pictures: Tensor) -> Tensor:
+        """Pictures whose parts are standardised."""
+        return self._split(pictures).reshape(pictures.shape)
+
+    def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """Each part encoded on its own, their latents side by side. Two tensors of shape (N, Z)."""
+        mu, log_variance = self.encoder(self._split(pictures)).chunk(2, dim=1)  # [N * parts, L]
+        return mu.reshape(len(pictures), self.latent_size), log_variance.reshape(len(pictures), self.latent_size)
+
+    def generate(self, latents: Tensor) -> Tensor:
+        """Means of the standardised pixels. Shape (N, C, H, W)."""
+        apart = latents.reshape(len(latents) * self._parts, self.latent_size // self._parts)
+        parts: Tensor = self.decoder(apart)  # [N * parts, pixels]
+        return parts.reshape(len(latents), *self._picture)
+
+    def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
+        """Gaussian pixels of a fixed standard deviation."""
+        return 0.5 * self._precision * (generated - target).square().sum(dim=(1, 2, 3))  # [N]
+
+    def remember_looks(self, pictures: Tensor) -> None:
+        """Take brightness and contrast for :meth:`picture` from training pictures (N, C, H, W)."""
+        parts = pictures.reshape(len(pictures) * self._parts, -1)
+        self.brightness.copy_(pictures.mean())
+        self.contrast.copy_(parts.std(dim=1, correction=0).mean())
+
+    def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
+        """At the mean brightness and contrast of the training pictures: latents do not hold the light."""
+        return (self.brightness + self.contrast * self.generate(latents)).clamp(0.0, 1.0)
+
+
+class HaSchmidhuberVae(Vae):
+    """The convolutional VAE of Ha & Schmidhuber 2018 (World Models, A.1), one joint latent (thesis 5.2.2).
+
+    Strips are resampled to 64 x 64 and enter as channels.
+
+    Args:
+        recipe: Gives the number of latents.
+        channels: Channels C in and out.
+    """
+
+    def __init__(self, recipe: Recipe, channels: int) -> None:
+        super().__init__()
+        self.latent_size = recipe.latents
+        depths = (channels, 32, 64, 128, 256)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(depths):
+            layers += [nn.Conv2d(before, after, kernel_size=4, stride=2), nn.ReLU()]
+        self.encoder = nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 2 * recipe.latents))
+        self.decoder = nn.Sequential(
+            nn.Linear(recipe.latents, 1024),
+            nn.Unflatten(1, (1024, 1, 1)),
+            nn.ConvTranspose2d(1024, 128, kernel_size=5, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(128, 64, kernel_size=5, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(64, 32, kernel_size=6, stride=2),
+            nn.ReLU(),
+            nn.ConvTranspose2d(32, channels, kernel_size=6, stride=2),
+        )
+
+    def target(self, pictures: Tensor) -> Tensor:
+        """Pictures resampled to 64 x 64."""
+        return _resize(pictures, _SIDE, _SIDE)
+
+    def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """All channels encoded jointly. Two tensors of shape (N, Z)."""
+        mu, log_variance = self.encoder(self.target(pictures)).chunk(2, dim=1)
+        return mu, log_variance
+
+    def generate(self, latents: Tensor) -> Tensor:
+        """Logits of the pixels; the sigmoid of the output layer is in the loss and in :meth:`mean`."""
+        generated: Tensor = self.decoder(latents)
+        return generated
+
+    def mean(self, latents: Tensor) -> Tensor:
+        """Probabilities of the pixels. Shape (N, C, 64, 64)."""
+        return self.generate(latents).sigmoid()
+
+    def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
+        """Bernoulli pixels: cross-entropy (thesis 2.1.4)."""
+        return functional.binary_cross_entropy_with_logits(generated, target, reduction="none").sum(dim=(1, 2, 3))
+
+    def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
+        """Resampled to the size of the strips."""
+        return _resize(self.mean(latents), height, width)
+
+
+def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
+    """The VAE of a recipe for pictures of shape (C, H, W), with whatever weights torch initialises it to.
+
+    Raises:
+        UnknownNameError: The recipe names an unknown architecture.
+    """
+    if require_known("encoder architecture", recipe.architecture, ARCHITECTURES) == "ha_schmidhuber":
+        return HaSchmidhuberVae(recipe, channels)
+    return MlpVae(recipe, channels, height, width, parts=channels if recipe.architecture == "strips" else 1)
+
+
+def _mlp(*sizes: int) -> nn.Sequential:
+    """Linear layers with ReLU between them."""
+    layers: list[nn.Module] = []
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _resize(pictures: Tensor, height: int, width: int) -> Tensor:
+    if pictures.shape[2:] == (height, width):
+        return pictures
+    return functional.interpolate(pictures, size=(height, width), mode="bilinear", align_corners=False)

@@ -1,0 +1,1 @@
+"""The thesis' imagination learner: mixture world model, rollouts, epistemic filter."""

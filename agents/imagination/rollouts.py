@@ -1,0 +1,267 @@
+"""Imagination: the world model in closed loop, and the epistemic filter on what it says (thesis 5.2.2).
+
+From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
+dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
+Dynamics may be sure of a place where nobody has been and no reward was ever seen, so the filter can also read how much
+T weight samples of the reward network disagree there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imagine_bench.errors import DivergedError, InvalidValueError
+from imagine_bench.seeding import SeedTree
+
+from .. import snapshot
+from ..controller import Controller
+from ..networks.mlp import Masks, dropout_bits
+from ..replay import Batch, ImaginedMemory, RealMemory
+from ..settings import Settings
+from . import mixture as mdn
+from .mixture import Mixture
+from .uncertainty import decompose, reduction
+from .world_model import ModelLosses, WorldModel
+
+TERMINAL = 0.5
+"""Predicted probability above which a rollout ends."""
+_BEYOND = 1e6
+"""A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
+is in the norm of the gradient of a controller that learns from it, which must not overflow."""
+_CALIBRATION = 64
+"""Real transitions whose epistemic variance a moving threshold is read from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Weight samples that all steps of a call share.
+
+    Attributes:
+        dynamics: Masks of the dynamics, (E, T, H); None drops nothing.
+        reward: Masks of the reward network, (1, T, H); None where the filter does not read it.
+    """
+
+    dynamics: Masks | None
+    reward: Masks | None
+
+
+@dataclass(frozen=True, slots=True)
+class Imagined:
+    """One imagined step of N rollouts.
+
+    Attributes:
+        next_z: Shape (N, Z), within +-1e6; where that is reached, the closed loop has run away.
+        reward: Predicted reward. Shape (N,).
+        p_terminated: Predicted probability that the episode ends there. Shape (N,).
+        samples: What each weight sample of each member predicted, with leading axes (E T, N).
+        reward_std: Standard deviation of the reward over its network's weight samples, in units of reward; None where
+            the filter does not read it. Shape (N,).
+    """
+
+    next_z: Tensor
+    reward: Tensor
+    p_terminated: Tensor
+    samples: Mixture
+    reward_std: Tensor | None
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How much one call imagined: rollouts begun, transitions predicted, transitions kept."""
+
+    rollouts: int
+    predicted: int
+    accepted: int
+
+
+class Imagination:
+    """A world model, what it imagines, and the filter between the two.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: All hyperparameters of the learner.
+        filtered: Whether epistemic uncertainty above a threshold discards a transition and the rest of its rollout.
+        seeds: This imagination's node of the seed tree.
+        device: Where networks and memory lie.
+
+    Raises:
+        InvalidValueError: A filter is asked for, but no weight sample would differ from another.
+    """
+
+    def __init__(
+        self,
+        latent_size: int,
+        n_actions: int,
+        settings: Settings,
+        *,
+        filtered: bool,
+        seeds: SeedTree,
+        device: torch.device,
+    ) -> None:
+        samples = settings.imagination.weight_samples if dropout_bits(settings.model.dropout) else 1
+        if filtered and samples * settings.model.members == 1:
+            raise InvalidValueError(
+                "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
+                "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
+                "above 1, or model.members above 1, or choose the agent without the filter."
+            )
+        self._reads_reward = filtered and settings.imagination.reward_threshold is not None
+        if self._reads_reward and samples == 1:
+            raise InvalidValueError(
+                "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
+                "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
+                "imagination.weight_samples above 1, or imagination.reward_threshold to null."
+            )
+        self.settings, self.filtered = settings.imagination, filtered
+        self._generators = {
+            name: torch.Generator(device).manual_seed(seeds.child(name).integer())
+            for name in ("weights", "replay", "dropout", "rollouts")
+        }
+        self.model = WorldModel(latent_size, n_actions, settings.model, self._generators["weights"])
+        self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
+        self._reduce = reduction(self.settings.reduction)
+        self.threshold = self.settings.threshold
+
+    def reset_for_new_task(self) -> None:
+        """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
+        known, model = self.model.dynamics.state_dict(), self.model
+        self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self._generators["weights"])
+        self.model.dynamics.load_state_dict(known)
+        self.memory.clear()
+        self.threshold = self.settings.threshold
+
+    def learn(self, real: RealMemory) -> list[ModelLosses]:
+        """``N_E`` model updates from the real memory, all drawn in one go; the losses of each."""
+        settings = self.model.settings
+        updates, size = settings.updates_per_step, settings.batch_size
+        drawn = real.sample(
+            updates * size, self._generators["replay"], spread=settings.spread, balance=settings.balance
+        )
+        parts = zip(*(getattr(drawn, field.name).split(size) for field in fields(Batch)), strict=True)
+        return [self.model.update(Batch(*part), self._generators["dropout"]) for part in parts]
+
+    def draw_weights(self, generator: torch.Generator) -> Weights:
+        """T weight samples of what the filter reads."""
+        count = self.settings.weight_samples
+        dynamics = self.model.draw_weights(count, generator)
+        return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self._reads_reward else None)
+
+    def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then draw z'.
+
+        Raises:
+            DivergedError: What the model predicts is NaN.
+        """
+        model = self.model
+        samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
+        predicted = mdn.average(samples, model.members)
+        _require_numbers(predicted.log_weights)
+        next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-_BEYOND, _BEYOND)
+        _require_numbers(next_z)
+        reward, p_terminated = model.assess(z, action, next_z)
+        doubt = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
+        return Imagined(next_z, reward, p_terminated, samples, doubt)
+
+    def likeliest(self, z: Tensor, action: Tensor, weights: Weights) -> Tensor:
+        """What :meth:`step` would draw least surprisingly: the mean of the likeliest component. Shape (N, Z)."""
+        return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
+
+    def score(self, variances: Tensor) -> Tensor:
+        """Reduce variances (..., Z) as the filter does; one that overflowed is doubt without bound. Shape (...)."""
+        return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
+
+    def keeps(self, step: Imagined) -> Tensor:
+        """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
+
+        A variance that is drawn whole and fed back can grow without bound, within some five imagined steps.
+        """
+        keep = step.next_z.abs().amax(dim=-1) < _BEYOND
+        if not self.filtered:
+            return keep
+        keep &= self.score(decompose(step.samples).epistemic) <= self.threshold
+        if self.settings.reward_threshold is not None and step.reward_std is not None:
+            keep &= step.reward_std <= self.settings.reward_threshold
+        if self.settings.termination_threshold is not None:
+            keep &= torch.minimum(step.p_terminated, 1.0 - step.p_terminated) <= self.settings.termination_threshold
+        return keep
+
+    def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
+        """Imagine ``I_B`` rollouts and store what the filter keeps.
+
+        A rollout ends where the model says that the episode does, or with its first discarded transition.
+
+        Args:
+            controller: Chooses the actions, epsilon-greedily.
+            current: The state the robot just acted in. Shape (Z,).
+            real: What really happened so far.
+            epsilon: Probability of a random action; that of the settings counts where it is larger.
+        """
+        settings, generator = self.settings, self._generators["rollouts"]
+        weights = self.draw_weights(self._generators["dropout"])
+        self.move_threshold(real, weights, self._generators["replay"])
+        z, predicted, accepted = self._starts(current, real), 0, 0
+        for _ in range(settings.depth):
+            action = self.act(controller, z, max(epsilon, settings.exploration), generator)
+            step = self.step(z, action, weights, generator)
+            terminated = step.p_terminated > TERMINAL
+            keep = self.keeps(step)
+            kept = int(keep.sum())
+            predicted, accepted = predicted + len(z), accepted + kept
+            if kept:
+                batch = Batch(z, action, step.reward, step.next_z, terminated.float())
+                self.memory.add(Batch(*(getattr(batch, field.name)[keep] for field in fields(Batch))))
+            z = step.next_z[keep & ~terminated]
+            if len(z) == 0:
+                break
+        return Counts(settings.breadth, predicted, accepted)
+
+    def _starts(self, current: Tensor, real: RealMemory) -> Tensor:
+        """Where this step's rollouts begin. Shape (I_B, Z)."""
+        if self.settings.start_states == "current":
+            return current.expand(self.settings.breadth, -1)
+        return real.sample(self.settings.breadth, self._generators["replay"]).z
+
+    def move_threshold(self, real: RealMemory, weights: Weights, generator: torch.Generator) -> None:
+        """Let the threshold follow the model's doubt about what really happened, where the settings want that."""
+        quantile = self.settings.threshold_quantile
+        if self.filtered and quantile is not None:
+            known = real.sample(_CALIBRATION, generator)
+            doubts = self.score(decompose(self.model.predict(known.z, known.action, weights.dynamics)).epistemic)
+            self.threshold = float(doubts.quantile(quantile))
+
+    @staticmethod
+    def act(controller: Controller, z: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
+        """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
+        greedy = controller.values(z).argmax(dim=-1)
+        size = greedy.shape
+        random = torch.randint(controller.n_actions, size, generator=generator, device=generator.device)
+        explores = torch.rand(size, generator=generator, device=generator.device) < epsilon
+        return torch.where(explores, random, greedy)
+
+    def arrays(self) -> snapshot.Arrays:
+        """Copies of weights, moments, memory and generators."""
+        generators = {name: snapshot.generator_array(generator) for name, generator in self._generators.items()}
+        return {
+            **snapshot.prefixed("model", self.model.optimiser.arrays()),
+            **snapshot.prefixed("memory", self.memory.arrays()),
+            **snapshot.prefixed("generator", generators),
+            "threshold": np.array(self.threshold),
+        }
+
+    def load(self, arrays: snapshot.Arrays, added: int) -> None:
+        """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
+        self.model.optimiser.load(snapshot.below("model", arrays))
+        self.memory.load(snapshot.below("memory", arrays), added)
+        self.threshold = float(arrays["threshold"])
+        for name, generator in self._generators.items():
+            snapshot.load_generator(generator, arrays[f"generator/{name}"])
+
+
+def _require_numbers(imagined: Tensor) -> None:
+    if bool(imagined.isnan().any()):
+        raise DivergedError("What the world model imagines is no longer a number. Lower model.learning_rate.")

@@ -1,0 +1,1 @@
+"""Agents from other people's libraries, trained by their own loops."""

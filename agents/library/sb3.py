@@ -1,0 +1,143 @@
+"""Agents from a library, as any user would train them: Stable-Baselines3 (Raffin et al. 2021) through Gymnasium.
+
+The library's own loop plays and learns; it sees the environment's frames, or our latents of them, and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.capabilities import OnEpisode
+from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
+
+from ..encoders.encoder import Encoder
+from ..encoders.perception import load_perception, prepare_torch
+from .latent_observation import LatentObservation
+from .settings import PeerSettings, resolve
+
+_SEEDS = 2**31
+"""The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
+
+
+class LibraryAgent:
+    """One learner of the library, for one run.
+
+    Args:
+        algorithm: Its class, such as ``stable_baselines3.DQN``.
+        settings: Its keywords.
+        seed: Of everything random in the library, which draws from torch's and numpy's global generators.
+        device: A torch device name.
+        encoder: Frames to latents; None for one that sees the pixels.
+    """
+
+    def __init__(
+        self, algorithm: Any, settings: PeerSettings, *, seed: int, device: str, encoder: Encoder | None
+    ) -> None:
+        self.settings = settings
+        self._algorithm, self._device, self._encoder = algorithm, device, encoder
+        self._seed = seed % _SEEDS
+        self._model: Any = None
+
+    def train(self, env: gymnasium.Env[Any, Any], *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
+        """Train in the library's own loop; see :class:`imagine_bench.capabilities.ExternalTrainer`."""
+        from .training_loop import learn  # noqa: PLC0415 - needs the library
+
+        keywords = dataclasses.asdict(self.settings.sb3)
+        explores = keywords.pop("exploration_steps")
+        steps = max(episodes * horizon, explores)  # on_episode ends training; exploration depends on the step alone
+        self._model = self._algorithm(
+            "CnnPolicy" if self._encoder is None else "MlpPolicy",
+            env if self._encoder is None else LatentObservation(env, self._encoder),
+            exploration_fraction=explores / steps,
+            seed=self._seed,
+            device=self._device,
+            **keywords,
+        )
+        learn(self._model, steps, on_episode)
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """The library's greedy action.
+
+        Raises:
+            ArtefactError: It was not trained.
+        """
+        if self._model is None:
+            raise ArtefactError("This agent trains itself; it has no policy before it is trained.")
+        return int(self._model.predict(self._seen(observation.frame), deterministic=not explore)[0])
+
+    def _seen(self, frame: Frame) -> NDArray[Any]:
+        if self._encoder is None:
+            return frame
+        latents: NDArray[Any] = self._encoder.encode(frame[None])[0][0].cpu().numpy()
+        return latents
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Learn nothing: the library learns in its own loop."""
+
+    def diagnostics(self) -> dict[str, float]:
+        """What the library logged last, and its exploration probability."""
+        logged = {} if self._model is None else dict(self._model.logger.name_to_value)
+        values = {"loss/bellman": logged.get("train/loss"), "epsilon": getattr(self._model, "exploration_rate", None)}
+        return {name: float(value) for name, value in values.items() if value is not None}
+
+    def state(self) -> AgentState:
+        """The policy's weights: enough to look at, not to train on from."""
+        if self._model is None:
+            return AgentState(arrays={}, values={})
+        weights = {name: np.array(value.cpu()) for name, value in self._model.policy.state_dict().items()}
+        return AgentState(arrays=weights, values={})
+
+    def restore(self, state: AgentState) -> None:
+        """Refuse.
+
+        Raises:
+            ArtefactError: Always: the library cannot go on from here bit for bit.
+        """
+        raise ArtefactError("An agent of Stable-Baselines3 cannot be taken up again; run its bench anew.")
+
+
+def _make(context: AgentContext, target: str) -> LibraryAgent:
+    prepare_torch(context.device)
+    return LibraryAgent(
+        _algorithm(target),
+        resolve(context.preset, context.overrides, context.settings),
+        seed=context.seeds.child("library").integer(),
+        device=context.device,
+        encoder=None if context.encoder is None else load_perception(context).encoder,
+    )
+
+
+def _algorithm(target: str) -> Any:
+    module, _, name = target.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ImportError as error:
+        raise SetupError(
+            f"This agent needs the library {module}, which is not installed ({error}). Install it with "
+            "pip install 'imagine-bench[peers]'."
+        ) from error
+
+
+def make_dqn(context: AgentContext) -> LibraryAgent:
+    """The ``sb3_dqn`` agents: DQN (Mnih et al. 2015), on pixels, or on latents where there is an encoder.
+
+    Raises:
+        SetupError: The library is not installed.
+    """
+    return _make(context, "stable_baselines3:DQN")
+
+
+def make_qrdqn(context: AgentContext) -> LibraryAgent:
+    """The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018).
+
+    Raises:
+        SetupError: The library is not installed.
+    """
+    return _make(context, "sb3_contrib:QRDQN")

@@ -1,0 +1,1 @@
+"""The regressors of chapter 4: Bayesian mixture density networks."""

@@ -1,0 +1,150 @@
+"""The Bayesian mixture density network (Bishop 1994; thesis 4.4): any inputs, any outputs, weights that are uncertain.
+
+Many networks of one shape train as one batched computation; each has its own generators, so a network is the
+same, up to rounding, whether it trains alone or among others. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs,
+``D`` outputs, ``K`` components, ``T`` weight samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imagine_bench.errors import DivergedError
+
+from ..imagination import mixture as mdn
+from ..imagination.mixture import Mixture
+from ..networks.member_adam import MemberAdam
+from ..networks.mlp import MemberMLP
+from ..networks.normed_mlp import NormedMLP
+from ..networks.precision import hidden_dtype
+from ..networks.weight_samples import sample_outputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDNSettings:
+    """A Bayesian mixture density network; the defaults are the thesis' (4.5.1).
+
+    Attributes:
+        hidden: Units a hidden layer.
+        components: Gaussians in the mixture, K.
+        dropout: Probability of dropping a unit of a hidden layer that another one follows; [0, 1).
+        weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
+            ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
+            leave the data as ``w`` shrinks, and a third of the first layer die.
+        learning_rate: Of Adam.
+        gradient_clip: Largest gradient norm of each network.
+        sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
+        sigma_ceiling: Largest, in the same units.
+        precision: Products between hidden layers while training: float32, bfloat16, or auto for what the device does
+            fast.
+    """
+
+    hidden: tuple[int, ...] = (256, 256, 256)
+    components: int = 10
+    dropout: float = 0.2
+    weight_decay: float = 0.02
+    learning_rate: float = 1e-3
+    gradient_clip: float = 10.0
+    sigma_floor: float = 1e-3
+    sigma_ceiling: float = 10.0
+    precision: str = "float32"
+
+
+class BayesianMDN:
+    """E mixture density networks, trained side by side.
+
+    Args:
+        n_inputs: X.
+        n_outputs: D.
+        settings: Sizes and rates.
+        generators: One a network: its initial weights, then its dropout masks.
+    """
+
+    def __init__(
+        self, n_inputs: int, n_outputs: int, settings: MDNSettings, generators: Sequence[torch.Generator]
+    ) -> None:
+        self.n_outputs, self.settings, self._generators = n_outputs, settings, generators
+        sizes = (n_inputs, *settings.hidden, mdn.output_size(settings.components, n_outputs))
+        precision = hidden_dtype(settings.precision, generators[0].device.type)
+        self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
+        hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
+        self.optimiser = MemberAdam(
+            self.network, hidden, learning_rate=settings.learning_rate,
+            weight_decay=settings.weight_decay, gradient_clip=settings.gradient_clip,
+        )  # fmt: skip
+
+    def _mixture(self, outputs: Tensor) -> Mixture:
+        settings = self.settings
+        floor, ceiling = math.log(settings.sigma_floor), math.log(settings.sigma_ceiling)
+        return mdn.from_outputs(outputs, settings.components, self.n_outputs, floor, ceiling)
+
+    def update(self, x: Tensor, y: Tensor) -> Tensor:
+        """One step of Adam on the mean negative log-likelihood of each network's own batch (equation 4.28).
+
+        Args:
+            x: Shape (E, N, X).
+            y: Shape (E, N, D).
+
+        Returns:
+            The losses before the step, in nats. Shape (E,).
+
+        Raises:
+            DivergedError: A loss or gradient is NaN or infinite; weights and statistics are left as they were.
+        """
+        masks = self.network.draw_masks(x.shape[1], self._generators)
+        outputs = self.network(x.mT.contiguous(), masks).mT  # [E, N, out]
+        losses = -mdn.log_likelihood(self._mixture(outputs), y).mean(dim=1)  # [E]
+        if not bool(losses.isfinite().all()):
+            wrong = [index for index, loss in enumerate(losses.tolist()) if not math.isfinite(loss)]
+            raise DivergedError(
+                f"The likelihood of network {wrong[0]} of {len(losses)} is no longer finite "
+                f"({losses[wrong[0]].item()}). Lower learning_rate or raise sigma_floor."
+            )
+        self.optimiser.step(losses.sum())
+        self.network.note()
+        return losses.detach()
+
+    def trained(self) -> TrainedMDN:
+        """The networks as they predict now."""
+        return TrainedMDN(self.network.folded(), self)
+
+    def read(self, outputs: Tensor) -> Mixture:
+        """Network outputs (..., out) as mixtures."""
+        return self._mixture(outputs)
+
+
+class TrainedMDN:
+    """What predicts: the networks with their standardisation folded in. It learns nothing any more.
+
+    Args:
+        network: E members.
+        model: Reads its outputs.
+    """
+
+    def __init__(self, network: MemberMLP, model: BayesianMDN) -> None:
+        self.network, self._model = network, model
+
+    def member(self, first: int, count: int = 1) -> MemberMLP:
+        """Networks ``first`` to ``first + count`` by themselves."""
+        whole = self.network
+        blank = torch.Generator(device=whole.weights[0].device)
+        part = MemberMLP(whole.sizes, members=count, dropout=whole.dropout, generator=blank)
+        with torch.no_grad():
+            for theirs, ours in zip(whole.parameters(), part.parameters(), strict=True):
+                ours.copy_(theirs[first : first + count])
+        return part
+
+    @torch.no_grad()
+    def weight_samples(self, network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None) -> Mixture:
+        """Mixtures (T, N) for rows (N, X) under the masks of one network, or of an ensemble's members without."""
+        return self._model.read(sample_outputs(network, x, masks))
+
+
+def rescaled(mixture: Mixture, shift: Tensor, scale: Tensor) -> Mixture:
+    """The mixture of ``shift + scale * y``. Shift and scale (D,), scale above 0."""
+    return replace(mixture, means=mixture.means * scale + shift, log_sigmas=mixture.log_sigmas + scale.log())

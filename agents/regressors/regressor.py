@@ -1,0 +1,248 @@
+"""The regressors of chapter 4: Bayesian mixture density networks whose weight samples are dropout masks or members.
+
+E networks, each on its own data, train as one batched computation; of an ensemble every network is M members on the
+same data. Inputs are standardised by the network itself; targets are scaled to unit variance for training, and
+mixtures scaled back, so that one set of rates fits metres, radians and any other unit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.regression import Dataset, Floats, Mixtures, Prediction, RegressorContext
+
+from ..encoders.perception import prepare_torch
+from ..imagination import mixture as mdn
+from ..imagination.mixture import Mixture
+from ..imagination.uncertainty import decompose, drawn_variance, surprise
+from ..networks.mlp import dropout_mask
+from ..networks.precision import settle
+from ..snapshot import generator_array, jsonable, load_generator, require_fit
+from .bayesian_mdn import BayesianMDN, TrainedMDN, rescaled
+from .settings import RegressorSettings, resolve
+from .stationarity import jensen_shannon
+
+_ROWS = 256
+"""Rows assessed at a time: T mixtures of each are in memory."""
+
+
+class MixtureRegressor:
+    """E Bayesian mixture density networks.
+
+    Args:
+        context: Their data and seeds.
+        settings: Sizes, rates, epochs.
+
+    Raises:
+        InvalidValueError: Data of unequal sizes, of wrong shapes, or not finite.
+    """
+
+    def __init__(self, context: RegressorContext, settings: RegressorSettings) -> None:
+        _require_data(context)
+        settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
+        self.settings, self.networks = settings, len(context.datasets)
+        self._device = prepare_torch(context.device)
+        inputs = np.stack([data.inputs for data in context.datasets])
+        targets = np.stack([data.targets for data in context.datasets])
+        self._shift = self._tensor(targets.mean(axis=1))  # [E, D]
+        self._scale = self._tensor(np.maximum(targets.std(axis=1), 1e-6))
+        self._x = self._tensor(inputs)
+        self._y = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
+        nodes = [seeds.child("member", m) for seeds in context.seeds for m in range(settings.members)]
+        self._weights_and_masks = [self._generator(node.child("network").integer()) for node in nodes]
+        self._order = [self._generator(node.child("batches").integer()) for node in nodes]
+        self._samples = [seeds.child("weight_samples") for seeds in context.seeds]
+        self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._weights_and_masks)
+        self._epoch = 0
+        self._losses: list[float] = []
+        self._trained: TrainedMDN | None = None
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+        return self._epoch
+
+    @property
+    def epochs(self) -> int:
+        """Epochs to do."""
+        return self.settings.epochs
+
+    def train(self, epochs: int) -> None:
+        """Train for so many more epochs: in each, every member sees each of its rows once, in an order of its own."""
+        self._trained = None
+        rows = self._x.shape[1]
+        batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
+        owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
+        for _ in range(epochs):
+            self._model.optimiser.set_learning_rate(self._rate())
+            orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._order])
+            losses = []
+            for batch in orders.tensor_split(batches, dim=1):
+                losses.append(self._model.update(self._x[owner, batch], self._y[owner, batch]))
+            self._losses.append(float(torch.stack(losses).mean()))
+            self._epoch += 1
+
+    def _rate(self) -> float:
+        """The learning rate of the coming epoch."""
+        final, gone = self.settings.final_rate, min(1.0, self._epoch / self.settings.epochs)
+        return self.settings.learning_rate * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * gone)))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Mean negative log-likelihood of the standardised targets while training, since the last call."""
+        losses, self._losses = self._losses, []
+        return {"loss/likelihood": float(np.mean(losses))} if losses else {}
+
+    def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
+        """Predict and say how sure that is; see :class:`imagine_bench.regression.Regressor`."""
+        self._require_inputs(inputs)
+        generator = self._generator(int(rng.integers(2**62)))
+        return _joined([
+            _joined([self._assess_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
+            for e in range(self.networks)
+        ])  # fmt: skip
+
+    def pooled(self, inputs: Floats) -> Mixtures:
+        """All weight samples' mixtures side by side, equally likely."""
+        self._require_inputs(inputs)
+        every = []
+        for e in range(self.networks):
+            samples = self._weight_samples(e, self._tensor(inputs[e]))
+            every.append(_numpy(mdn.average(samples, len(samples.means))))
+        return Mixtures(
+            **{name: np.stack([getattr(m, name) for m in every]) for name in ("weights", "means", "sigmas")}
+        )
+
+    def state(self) -> AgentState:
+        """Weights, moments, running statistics, generators, epochs."""
+        arrays = {f"optimiser/{name}": array for name, array in self._model.optimiser.arrays().items()}
+        arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
+        for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
+            arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
+        values = {
+            "settings": dataclasses.asdict(self.settings), "epoch": self._epoch,
+            "batches": self._model.network.batches, "losses": self._losses,
+        }  # fmt: skip
+        return AgentState(arrays=arrays, values=jsonable(values))
+
+    def restore(self, state: AgentState) -> None:
+        """Continue from ``state``, bit for bit.
+
+        Raises:
+            ArtefactError: The snapshot does not fit.
+        """
+        require_fit(state, self.state(), equal=("settings",))
+        arrays, names = state.arrays, ("value", "exp_avg", "exp_avg_sq", "step")
+        self._model.optimiser.load({name: arrays[f"optimiser/{name}"] for name in names})
+        for name, buffer in self._model.network.named_buffers():
+            buffer.copy_(torch.tensor(arrays[f"statistics/{name}"]))
+        for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
+            for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
+                load_generator(generator, array)
+        self._epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
+        self._losses, self._trained = list(state.values["losses"]), None
+
+    def _tensor(self, values: Floats) -> Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=self._device)
+
+    def _generator(self, seed: int) -> torch.Generator:
+        return torch.Generator(device=self._device).manual_seed(seed)
+
+    def _pieces(self, inputs: Floats) -> list[Tensor]:
+        return [self._tensor(inputs[start : start + _ROWS]) for start in range(0, len(inputs), _ROWS)]
+
+    def _weight_samples(self, network: int, x: Tensor) -> Mixture:
+        """Mixtures (T, N) in the units of the targets; a network's weight samples are always the same ones."""
+        if self._trained is None:
+            self._trained = self._model.trained()
+        settings = self.settings
+        part, masks = self._trained.member(network * settings.members, settings.members), None
+        if settings.dropout > 0.0:
+            generator = self._generator(self._samples[network].integer())
+            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
+            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
+        samples = self._trained.weight_samples(part, x, masks)
+        return rescaled(samples, self._shift[network], self._scale[network])
+
+    def _assess_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
+        samples = self._weight_samples(network, x)
+        parts = decompose(samples)
+        predictive = mdn.average(samples, self.settings.members)
+        prediction = mdn.sample(predictive, 1.0, generator)
+        drawn = drawn_variance(samples, predictive, prediction, self.settings.members)
+        return Prediction(
+            prediction=prediction.double().cpu().numpy(),
+            drawn=drawn.double().cpu().numpy(),
+            surprise=surprise(samples, prediction).double().cpu().numpy(),
+            mean=mdn.mean(samples).mean(dim=0).double().cpu().numpy(),
+            epistemic=parts.epistemic.double().cpu().numpy(),
+            aleatoric=parts.aleatoric.double().cpu().numpy(),
+            modal=parts.modal.double().cpu().numpy(),
+            stationarity=jensen_shannon(samples, self.settings.divergence_draws, generator).double().cpu().numpy(),
+            predictive=_numpy(predictive),
+        )
+
+    def _require_inputs(self, inputs: Floats) -> None:
+        wanted = (self.networks, "N", self._x.shape[-1])
+        shape = np.shape(inputs)
+        fits = len(shape) == 3 and (shape[0], shape[2]) == (wanted[0], wanted[2]) and shape[1] > 0
+        if not (fits and np.isfinite(inputs).all()):
+            raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, N at least 1, not {shape}.")
+
+
+def _require_data(context: RegressorContext) -> None:
+    datasets = context.datasets
+    if not datasets or len(datasets) != len(context.seeds):
+        raise InvalidValueError(
+            f"A regressor needs at least one dataset and a seed for each, not {len(datasets)} and {len(context.seeds)}."
+        )
+    first = _shapes(datasets[0])
+    if [len(shape) for shape in first] != [2, 2] or first[0][0] != first[1][0] or first[0][0] < 2:
+        raise InvalidValueError(f"Dataset 0 must have inputs (N, X) and targets (N, D), N at least 2, not {first}.")
+    for index, data in enumerate(datasets):
+        if _shapes(data) != first:
+            raise InvalidValueError(
+                f"Dataset {index} has inputs and targets of shapes {_shapes(data)}; all must have those of the first, "
+                f"{first}."
+            )
+        if not (np.isfinite(data.inputs).all() and np.isfinite(data.targets).all()):
+            raise InvalidValueError(f"Dataset {index} holds values that are not finite.")
+
+
+def _shapes(data: Dataset) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return np.shape(data.inputs), np.shape(data.targets)
+
+
+def _numpy(mixture: Mixture) -> Mixtures:
+    parts = (mixture.log_weights.exp(), mixture.means, mixture.log_sigmas.exp())
+    return Mixtures(**dict(zip(("weights", "means", "sigmas"), (p.double().cpu().numpy() for p in parts), strict=True)))
+
+
+def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
+    """Assessments joined along rows, or stacked as networks where no axis is given."""
+    join = np.stack if axis is None else np.concatenate
+
+    def field(owner: Sequence[object], name: str) -> Floats:
+        return join([getattr(part, name) for part in owner], axis=axis or 0)
+
+    names = [f.name for f in dataclasses.fields(Prediction) if f.name != "predictive"]
+    mixtures = [part.predictive for part in parts]
+    predictive = Mixtures(**{name: field(mixtures, name) for name in ("weights", "means", "sigmas")})
+    return Prediction(predictive=predictive, **{name: field(parts, name) for name in names})
+
+
+def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:
+    """The ``mc_dropout`` regressor: one network a dataset, its weight samples are dropout masks (thesis 4.5)."""
+    return MixtureRegressor(context, resolve(context.preset, context.overrides, ensemble=False))
+
+
+def make_ensemble(context: RegressorContext) -> MixtureRegressor:
+    """The ``ensemble`` regressor: M networks a dataset without dropout, each of them a weight sample."""
+    return MixtureRegressor(context, resolve(context.preset, context.overrides, ensemble=True))

@@ -1,0 +1,1 @@
+"""How fast the learners compute, beside plain PyTorch."""

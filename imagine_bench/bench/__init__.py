@@ -1,0 +1,1 @@
+"""Run a comparison: protocol, runner, evaluation, launchers, studies."""

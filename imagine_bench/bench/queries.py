@@ -1,0 +1,113 @@
+"""What others teach a learner: episodes that a demonstrator plays, and answers to its questions.
+
+Neither shows a macrostate: a demonstration is seen as frames, an answer is a reward and whether the episode would end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.bench.evaluation import Info
+from imagine_bench.bench.protocol import Protocol
+from imagine_bench.bench.runs import RunSpec
+from imagine_bench.capabilities import Answer, ExternalTrainer, QueryingAgent, TransferLearner
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Agent, Observation, Rules, Transition
+
+
+def require_able(agent: object, name: str, protocol: Protocol) -> None:
+    """Check that a learner can do what a protocol asks of it.
+
+    Raises:
+        InvalidValueError: It cannot carry anything over to the next task, cannot watch, or cannot ask.
+    """
+    if protocol.demonstrations and isinstance(agent, ExternalTrainer):
+        raise InvalidValueError(
+            f"Agent {name!r} trains in a loop of its own and cannot watch; leave --demonstrations out, or that agent."
+        )
+    if protocol.after and not isinstance(agent, TransferLearner):
+        raise InvalidValueError(
+            f"Agent {name!r} has no model of the world to carry over from {', '.join(protocol.after)}; leave --after "
+            "out, or give agents that have one, such as imagine or imagination."
+        )
+    if protocol.questions and not isinstance(agent, QueryingAgent):
+        raise InvalidValueError(
+            f"Agent {name!r} cannot ask a teacher; leave --questions out, or give an agent that can, such as imagine."
+        )
+
+
+def demonstrator(spec: RunSpec) -> Agent:
+    """The reference agent that plays the demonstrated episodes of a run; it has to be shown macrostates."""
+    return registry.make_agent(registry.DEMONSTRATOR, dataclasses.replace(spec, agent=registry.DEMONSTRATOR).context())
+
+
+def as_seen(transition: Transition) -> Transition:
+    """A demonstrated transition as a learner may see it: without macrostates."""
+    return dataclasses.replace(
+        transition,
+        observation=dataclasses.replace(transition.observation, macrostate=None),
+        next_observation=dataclasses.replace(transition.next_observation, macrostate=None),
+    )
+
+
+class LabelOracle:
+    """Answers what actions would bring, from the rules and the true macrostate, where the rules leave no doubt.
+
+    Args:
+        rules: Of the task.
+    """
+
+    def __init__(self, rules: Rules) -> None:
+        self._rules = rules
+
+    def answer(self, macrostate: tuple[int, ...], actions: NDArray[np.int64]) -> Answer | None:
+        """What the last of ``actions`` (D,) from ``macrostate`` would bring.
+
+        The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
+        may happen is looked at; None where that differs in reward or end: a matter of chance has no answer.
+
+        Raises:
+            InvalidValueError: No action, or one that does not exist.
+        """
+        planned = [int(action) for action in actions]
+        if not planned or not all(0 <= action < self._rules.n_actions for action in planned):
+            raise InvalidValueError(
+                f"Asked about the actions {planned}; give at least one, each from 0 to {self._rules.n_actions - 1}."
+            )
+        possible = {macrostate}
+        for action in planned[:-1]:
+            possible = {each.macrostate for state in possible for each in self._rules.outcomes(state, action)}
+        answers = {
+            Answer(outcome.reward, outcome.terminated)
+            for state in possible
+            for outcome in self._rules.outcomes(state, planned[-1])
+        }
+        return answers.pop() if len(answers) == 1 else None
+
+
+class QueryBudget:
+    """The questions of one episode: a learner's, as many as are allowed, before each of its macro-actions.
+
+    Args:
+        learner: Who asks.
+        teacher: Who answers.
+        questions: How many are allowed.
+    """
+
+    def __init__(self, learner: QueryingAgent, teacher: LabelOracle, questions: int) -> None:
+        self._learner, self._teacher, self._left = learner, teacher, questions
+        self.asked = 0
+
+    def __call__(self, observation: Observation, info: Info) -> None:
+        """Let the learner ask at a real frame until it has nothing to ask or may not any more."""
+        while self._left > 0:
+            actions = self._learner.question(observation)
+            if actions is None:
+                return
+            macrostate = tuple(int(value) for value in info["macrostate"])
+            self._learner.learn_label(observation, actions, self._teacher.answer(macrostate, actions))
+            self._left, self.asked = self._left - 1, self.asked + 1

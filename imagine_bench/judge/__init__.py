@@ -1,0 +1,1 @@
+"""Hold what agents imagine, plan and predict against the exact truth of the rules."""

@@ -1,0 +1,206 @@
+"""Plans: a whole sequence of macro-actions imagined from one camera frame, then carried out without looking again.
+
+The greedy controller acts in the closed-loop model until the model says that the episode is over (thesis 5.2.3,
+"Generating Plans"). The arm then does what was planned; the frames it passes are kept for people to compare, and the
+agent never sees them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Frame, Rules
+from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
+from imagine_bench.store.results import ComparedRollout
+from imagine_bench.store.trained import Trained
+
+State = tuple[int, ...]
+OnStep = Callable[[int], None]
+"""Told after each macro-action how many of the plan are done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """One plan and what became of it.
+
+    Attributes:
+        number: Its start, from 0; the same for every agent.
+        start: The macrostate it starts from.
+        compared: What was imagined beside what the camera then saw, cut where the episode ended.
+        refused: Why it was not carried out, or an empty string.
+        solved: Whether the task was solved when the plan was done.
+        shortest: The fewest macro-actions that can solve it from there, by the rules.
+        faults: Macro-actions whose physics disagreed with the rules.
+    """
+
+    number: int
+    start: State
+    compared: ComparedRollout
+    refused: str
+    solved: bool
+    shortest: int
+    faults: int
+
+    @property
+    def length(self) -> int:
+        """Macro-actions planned."""
+        return len(self.compared.rollout.actions)
+
+    @property
+    def done(self) -> int:
+        """Macro-actions carried out."""
+        return 0 if self.refused else len(self.compared.real_frames)
+
+    @property
+    def optimal(self) -> bool:
+        """Whether it solved the task in the fewest macro-actions possible."""
+        return self.solved and self.done == self.shortest
+
+    @property
+    def as_imagined(self) -> NDArray[np.bool_]:
+        """Whether each macro-action that was carried out led where it was imagined to. Shape (done,)."""
+        read = self.compared.rollout.macrostates[: self.done]
+        return np.asarray((read == self.compared.real_macrostates[: self.done]).all(axis=-1), dtype=np.bool_)
+
+    @property
+    def outcome(self) -> str:
+        """In a few words, what became of it."""
+        if self.refused:
+            return f"refused: {self.refused}"
+        if self.solved:
+            return "solved" if self.optimal else f"solved, {self.done - self.shortest} longer than needed"
+        if self.compared.real_terminated[-1]:
+            return f"failed at macro-action {self.done}"
+        return "over before anything was solved"
+
+
+def make_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None = None) -> Iterator[Plan]:
+    """Plan from ``count`` starts and carry each plan out.
+
+    The starts have seeds of their own, the same for every agent: no run ever trained, tested or tuned on them.
+
+    Args:
+        trained: An agent that imagines; it is not changed.
+        count: Plans.
+        execution: ``"physics"`` or ``"kinematic"``.
+        max_epistemic: A plan with an imagined step of more epistemic uncertainty is refused, reduced as the agent's
+            filter does; None leaves the verdict to the agent's own filter, if it has one.
+
+    Raises:
+        InvalidValueError: Fewer than one plan, or an agent that does not imagine.
+    """
+    if count < 1:
+        raise InvalidValueError(f"{count} plans show nothing; give at least 1.")
+    with closing(make_env(trained, execution)) as env:
+        for number in range(count):
+            yield carry_out(env, trained, number, max_epistemic=max_epistemic)
+
+
+def make_env(trained: Trained, execution: str) -> gymnasium.Env[Any, Any]:
+    """The environment that plans are carried out in, at the appearance the agent was trained at."""
+    entry = registry.task_entry(trained.spec.protocol.task)
+    appearance = trained.spec.protocol.appearance
+    return gymnasium.make(entry.env_id, execution=execution, appearance=appearance, disable_env_checker=True)
+
+
+def carry_out(
+    env: gymnasium.Env[Any, Any],
+    trained: Trained,
+    number: int,
+    *,
+    max_epistemic: float | None = None,
+    on_step: OnStep | None = None,
+    on_plan: Callable[[Frame, ImaginedRollout], None] | None = None,
+) -> Plan:
+    """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
+    frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
+    start = _state(info)
+    rng = SeedTree(trained.spec.seed).child("planning", number).generator()
+    rollout = trained.imaginer.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)
+    refused = _refusal(rollout, max_epistemic)
+    if on_plan is not None:
+        on_plan(frame, rollout)
+    frames, states, rewards, ends, faults, solved = [], [], [], [], 0, False
+    for step, action in enumerate([] if refused else rollout.actions, start=1):
+        seen, reward, terminated, truncated, info = env.step(int(action))
+        frames.append(seen)
+        states.append(_state(info))
+        rewards.append(float(reward))
+        ends.append(bool(terminated))
+        faults += bool(info["fault"])
+        solved = bool(info["is_success"])
+        if on_step is not None:
+            on_step(step)
+        if terminated or truncated:
+            break
+    done = len(frames)
+    compared = ComparedRollout(
+        start_frame=frame.copy(),
+        start_macrostate=np.array(start, dtype=np.int64),
+        rollout=rollout,
+        real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
+        real_macrostates=np.array(states, dtype=np.int64).reshape(done, len(start)),
+        real_rewards=np.array(rewards, dtype=np.float64),
+        real_terminated=np.array(ends, dtype=np.bool_),
+    )
+    return Plan(
+        number=number,
+        start=start,
+        compared=compared,
+        refused=refused,
+        solved=solved,
+        shortest=fewest_actions(trained.task.rules, start),
+        faults=faults,
+    )
+
+
+def fewest_actions(rules: Rules, start: State) -> int:
+    """The fewest macro-actions after which the rules can give a success; exact where the rules are deterministic.
+
+    Raises:
+        InvalidValueError: No success can be reached from ``start``.
+    """
+    reached, seen, steps = {start}, {start}, 0
+    while reached:
+        steps += 1
+        outcomes = [o for state in reached for action in range(rules.n_actions) for o in rules.outcomes(state, action)]
+        if any(outcome.success for outcome in outcomes):
+            return steps
+        reached = {outcome.macrostate for outcome in outcomes if not outcome.terminated} - seen
+        seen |= reached
+    raise InvalidValueError(f"The rules allow no success from {start}.")
+
+
+def require_threshold(max_epistemic: float | None) -> None:
+    """Raise InvalidValueError for an epistemic uncertainty that nothing could stay below, NaN included."""
+    if max_epistemic is not None and not max_epistemic >= 0.0:
+        raise InvalidValueError(f"Plans of more epistemic uncertainty than {max_epistemic}: give at least 0.")
+
+
+def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
+    """Why a plan must not be carried out, or an empty string."""
+    doubt = rollout.epistemic
+    if max_epistemic is not None:
+        if float(doubt.max()) <= max_epistemic:
+            return ""
+        step = int((doubt > max_epistemic).argmax())
+        return f"epistemic uncertainty {doubt[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
+    if not rollout.accepted.all():
+        step = int((~rollout.accepted).argmax())
+        uncertainty = f"epistemic uncertainty of the state {doubt[step]:.2g}"
+        return f"the agent's filter discards macro-action {step + 1} ({uncertainty})"
+    return ""
+
+
+def _state(info: dict[str, Any]) -> State:
+    return tuple(int(value) for value in info["macrostate"])

@@ -1,0 +1,171 @@
+"""The report of a regression bench: the task's own sections, calibration, costs; one page, Markdown, CSV and PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from imagine_bench import registry
+from imagine_bench.judge.calibration import LEVELS
+from imagine_bench.regression import SCORES
+from imagine_bench.regression.calibration import CRPS_POINTS
+from imagine_bench.regression.results import RegressionResult, rows_csv
+from imagine_bench.report.page import aligned, facts, flat
+from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
+from imagine_bench.report.template import render
+from imagine_bench.store.files import csv_text, make_folder, write_bytes
+
+_SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+
+
+def write_report(result: RegressionResult) -> Path:
+    """Write ``result.folder / "report"``: index.html, report.md, results.csv, one CSV a table, and the pictures.
+
+    Returns:
+        The path of index.html.
+
+    Raises:
+        SetupError: The folder cannot be written.
+    """
+    folder = make_folder(result.folder / "report")
+    sections = collect(result)
+    context = {
+        "result": result,
+        "spec": registry.regression(result.protocol.task),
+        "protocol": result.protocol,
+        "regressors": {agent: registry.regressor_entry(agent) for agent in result.protocol.agents},
+        "sections": sections,
+        "answers": [answer for section in sections for answer in section.answers],
+        "facts": facts(result),
+        "settings": {agent: flat("", result.of(agent)[0].settings) for agent in result.protocol.agents},
+        "recordings": [str(run.recording.relative_to(result.folder)) for run in result.runs if run.recording],
+    }
+    files = {f"{drawn.name}.png": drawn.png for section in sections for drawn in section.pictures}
+    tables = [table for section in sections for table in section.tables]
+    files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]).encode() for table in tables}
+    rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
+    files["results.csv"] = rows_csv(rows).encode()
+    files["report.md"] = render("regression.md.j2", context).encode()
+    files["index.html"] = render("regression.html.j2", context).encode()
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+    return folder / "index.html"
+
+
+def summary_table(result: RegressionResult) -> str:
+    """The task's first table, if there is one, and the short answer, as plain text."""
+    own = _own(result)
+    table = [line for first in own[0].tables[:1] for line in aligned([list(first.header), *map(list, first.rows)])]
+    answers = [answer for section in own for answer in section.answers]
+    return "\n".join([own[0].title, "", *table, *([""] if table else []), *answers])
+
+
+def collect(result: RegressionResult) -> list[Section]:
+    """Every section: the task's own, then what all regression tasks have."""
+    return [*_own(result), _calibration(result), _costs(result)]
+
+
+def _own(result: RegressionResult) -> list[Section]:
+    sections: list[Section] = registry.load(registry.regression(result.protocol.task).sections)(result)
+    return sections
+
+
+def _calibration(result: RegressionResult) -> Section:
+    spec, protocol = registry.regression(result.protocol.task), result.protocol
+    rows, detectors = [], []
+    for agent in protocol.agents:
+        title = registry.regressor_entry(agent).title
+        for variant in protocol.variants:
+            values = {name: result.values(agent, variant, name) for name in _MEASURES}
+            for prefix, kind in (("", "predicts with"), ("pooled_", "all weight samples")):
+                inside = [f"{100 * values[f'{prefix}coverage_{level:g}'].mean():.1f}" for level in LEVELS]
+                rows.append([
+                    f"{title}, {variant}: {kind}", *inside,
+                    number(float(values[f"{prefix}transform_distance"].mean()), 2),
+                    mean_std(values[f"{prefix}crps_shared"]),
+                ])  # fmt: skip
+            found = [result.values(agent, variant, f"auroc_{name}") for name in SCORES]
+            detectors.append([
+                f"{title}, {variant}", f"{100 * result.values(agent, variant, 'wrong').mean():.1f}",
+                *(number(float(np.nanmean(f)) if np.isfinite(f).any() else np.nan, 2) for f in found),
+            ])  # fmt: skip
+    levels = [f"in {100 * level:g} % interval (%)" for level in LEVELS]
+    return Section(
+        title="Calibration: as sure as it may be?",
+        words=(
+            f"Each network is asked about {protocol.test_points} unseen points. An interval that is said to hold 80 % "
+            "of the outcomes should hold 80 %; the probability integral transform should be uniform (its distance "
+            "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better, "
+            f"computed at the first {min(CRPS_POINTS, protocol.test_points)} of the points. "
+            "Two distributions are judged: the one predictions are drawn from, and all weight samples side by side.",
+            f"A prediction is called wrong where its error, the {spec.error_name}, is above {spec.wrong_above:g}. The "
+            "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
+            "prediction has the higher uncertainty of two (AUROC; 0.5 is chance, 1 is perfect).",
+        ),
+        pictures=(_coverage_picture(result),),
+        tables=(
+            Table(name="calibration", header=["", *levels, "PIT distance", "CRPS, mean (std)"], rows=rows),
+            Table(
+                name="auroc", header=["AUROC of", "wrong (%)", *(name.replace("_", " ") for name in SCORES)],
+                rows=detectors,
+            ),
+        ),
+    )  # fmt: skip
+
+
+_MEASURES = tuple(
+    f"{prefix}{name}"
+    for prefix in ("", "pooled_")
+    for name in (*(f"coverage_{level:g}" for level in LEVELS), "transform_distance", "crps_shared")
+)
+
+
+def _coverage_picture(result: RegressionResult) -> Picture:
+    """Coverage of every central interval: the diagonal is calibration."""
+
+    def draw() -> Figure:
+        variants, agents = result.protocol.variants, result.protocol.agents
+        figure = Figure(figsize=(3.1 * len(variants) + 1.2, 3.4), layout="constrained")
+        levels = np.linspace(0.02, 0.98, 49)
+        for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
+            axes.plot([0, 100], [0, 100], color="#8c8c8c", linewidth=1, linestyle=(0, (4, 3)))
+            for shade, agent in zip(_SHADES, agents, strict=False):
+                title = registry.regressor_entry(agent).title
+                for name, line, label in (
+                    ("transform", "-", "predicts with"),
+                    ("pooled_transform", ":", "all samples"),
+                ):
+                    values = np.abs(result.arrays(agent, variant, f"calibration/{name}").ravel() - 0.5)
+                    share = [(values <= level / 2).mean() * 100 for level in levels]
+                    axes.plot(100 * levels, share, color=shade, linestyle=line, label=f"{title}, {label}")
+            axes.set(title=variant, xlabel="central interval (%)", xlim=(0, 100), ylim=(0, 100))
+        figure.axes[0].set_ylabel("outcomes inside (%)")
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8.5)
+        return figure
+
+    alt = "Share of outcomes inside each central predictive interval, beside the diagonal of perfect calibration."
+    caption = "Below the diagonal the network is surer than it may be, above it less sure than it could be."
+    return picture("coverage", draw, alt=alt, caption=caption)
+
+
+def _costs(result: RegressionResult) -> Section:
+    rows = [
+        [
+            f"{registry.regressor_entry(agent).title}, {variant}",
+            number(float(result.values(agent, variant, "train_cpu_s").mean())),
+            number(float(result.values(agent, variant, "measure_cpu_s").mean())),
+        ]
+        for agent in result.protocol.agents
+        for variant in result.protocol.variants
+    ]
+    table = Table(name="costs", header=["CPU seconds a network", "training", "measuring"], rows=rows)
+    return Section(
+        title="What it cost",
+        words=(
+            f"The networks of a run train together, as one batched computation; its CPU seconds are shared out among "
+            f"them. The whole bench took {result.wall_s:,.0f} s of wall time.",
+        ),
+        tables=(table,),
+    )

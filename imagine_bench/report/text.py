@@ -1,0 +1,249 @@
+"""The sentences of a report: what the agents are, and the short answer, computed from the numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imagine_bench import registry, statistics
+from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
+from imagine_bench.statistics import Estimate
+
+FEW_SEEDS = 5
+"""Below this the bootstrap interval is hardly more than the range of the seeds, and the report says so."""
+_NAMED = 4
+"""Missing runs that are named; the others are counted."""
+
+
+@dataclass(frozen=True)
+class AgentWords:
+    """How an agent is introduced.
+
+    Attributes:
+        title: For headings, legends and tables.
+        description: One sentence for a reader who knows none of this.
+    """
+
+    title: str
+    description: str
+
+
+_AGENTS = {
+    "random": AgentWords("random", "Picks every macro-action by chance: the floor."),
+    "oracle": AgentWords(
+        "oracle", "Is shown the true state and the rules and acts optimally: the ceiling, no learner."
+    ),
+    "dqn": AgentWords(
+        "DQN", "Learns the value of each macro-action from real experience only (deep Q-learning): the baseline."
+    ),
+    "imagination": AgentWords(
+        "imagination",
+        "DQN that also learns a model of its world and practises on transitions it imagines with it, all of them.",
+    ),
+    "imagination_uncertainty": AgentWords(
+        "imagination + uncertainty",
+        "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
+    ),
+    "factored": AgentWords(
+        "factored",
+        "Sees discrete parts, learns which of them an action changes and what is rewarded, imagines every future "
+        "within reach, goes where it is in doubt while it trains, and plans in its model when it is tested.",
+    ),
+    "sb3_dqn": AgentWords(
+        "SB3 DQN (pixels)", "Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop."
+    ),
+    "sb3_qrdqn": AgentWords(
+        "SB3 QR-DQN (pixels)", "The same library's QR-DQN, which learns the distribution of the return, on pixels."
+    ),
+    "sb3_dqn_latents": AgentWords(
+        "SB3 DQN (latents)", "The same library's DQN on the latents that the suite's own DQN sees."
+    ),
+    "imagination_only": AgentWords(
+        "imagination only",
+        "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world "
+        "is trained in that model alone, and is what is tested.",
+    ),
+    "imagination_only_uncertainty": AgentWords(
+        "imagination only + uncertainty",
+        "The same, but an imagined episode ends where the model is unsure.",
+    ),
+}
+
+
+def agent_words(agent: str) -> AgentWords:
+    """Title and description of an agent; one that is not known here has those of its registry line."""
+    if agent in _AGENTS:
+        return _AGENTS[agent]
+    entry = registry.agents().get(agent)
+    spoken = agent.replace("_", " ")
+    return AgentWords(spoken, "") if entry is None else AgentWords(entry.title or spoken, entry.description)
+
+
+def lasting(budgets: Sequence[int | None]) -> str:
+    """Mean number of episodes; where some seeds never got there, how many did."""
+    there = [budget for budget in budgets if budget is not None]
+    if len(there) < len(budgets):
+        return f"– ({len(there)} of {len(budgets)} seeds)"
+    return f"{sum(there) / len(there):.0f}"
+
+
+def origin(facts: Mapping[str, object]) -> str:
+    """Where the figures of a page come from: ``protocol hash 6bf1d791349c; commit c9d5ec664788.`` and so on."""
+    return "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items()) + "."
+
+
+def percent(share: float) -> str:
+    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as an en dash."""
+    return "–" if math.isnan(share) else f"{100.0 * share:.1f}"
+
+
+def signed_percent(share: float) -> str:
+    """Like :func:`percent` with a sign, the minus a true one."""
+    return "–" if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+
+
+def mean_text(values: Sequence[float], rng: np.random.Generator, words: Callable[[float], str] = percent) -> str:
+    """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
+    if any(math.isnan(value) for value in values):
+        return "–"
+    mean = words(float(np.mean(values)))
+    if len(values) == 1:
+        return mean
+    low, high = statistics.bootstrap_interval(values, rng, statistic="mean")
+    return f"{mean} [{words(low)}, {words(high)}]"
+
+
+def score_text(score: Score) -> str:
+    """``61.3 [55.0, 67.2]``."""
+    return f"{percent(score.value)} [{percent(score.low)}, {percent(score.high)}]"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """``+6.3 [−2.0, +14.1]``, or without the brackets where there is no interval: one seed, or a boundless gain."""
+    if math.isnan(estimate.low):
+        return signed_percent(estimate.value)
+    return f"{signed_percent(estimate.value)} [{signed_percent(estimate.low)}, {signed_percent(estimate.high)}]"
+
+
+def question(data: ReportData) -> str:
+    """What was asked."""
+    protocol = data.result.protocol
+    return (
+        f"Does imagination, practising on the predictions of a learned model of the world, let a robot master "
+        f"“{data.spec.title}” with less real experience? {_count(len(protocol.agents), 'agent')} "
+        f"{'was' if len(protocol.agents) == 1 else 'were'} trained from {_count(len(protocol.seeds), 'seed')} for up "
+        f"to {protocol.budgets[-1]:,} real episodes and tested, without exploring, on {protocol.evaluation_episodes:,} "
+        f"new episodes at each of {_count(len(protocol.budgets), 'budget')}."
+    )
+
+
+def answers(data: ReportData) -> list[str]:
+    """The short answer, one sentence a finding, whatever the numbers say."""
+    budget = data.budgets[-1]
+    sentences = [_unfinished(data)] if data.result.missing else []
+    if BASE_AGENT in data.scores:
+        sentences.append(
+            f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
+            f"{percent(data.scores[BASE_AGENT][budget].value)}\u00a0% of the test episodes "
+            f"(chance {percent(data.facts.chance_level)}\u00a0%, optimum {percent(data.facts.optimum)}\u00a0%)."
+        )
+    sentences += [_verdict(data, agent) for agent in data.comparisons]
+    if len(data.areas) > 1:
+        sentences.append(_largest_area(data))
+    if not data.comparisons:
+        sentences.append(
+            "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
+        )
+    sentences += few_words(len(data.result.protocol.seeds))
+    return sentences
+
+
+def few_words(count: int, noun: str = "seeds") -> list[str]:
+    """A sentence of warning where a bootstrap interval rests on few."""
+    if not 1 < count < FEW_SEEDS:
+        return []
+    return [f"With only {count} {noun} an interval is hardly more than their range, and too narrow: read it as a hint."]
+
+
+def _largest_area(data: ReportData) -> str:
+    budget = data.budgets[-1]
+    areas = {agent: data.areas[agent][budget] for agent in data.areas}
+    named = {agent: f"“{agent_words(agent).title}” ({area_text(area)} %)" for agent, area in areas.items()}
+    ranked = sorted(areas, key=lambda agent: areas[agent].value, reverse=True)
+    first = [named[agent] for agent in ranked if areas[agent].value == areas[ranked[0]].value]
+    who = (
+        f"{', '.join(first[:-1])} and {first[-1]} alike"
+        if len(first) > 1
+        else f"{first[0]}; next is {named[ranked[1]]}"
+    )
+    return f"Over all episodes up to {budget:,} the mean success is highest for {who}."
+
+
+def area_text(area: Estimate) -> str:
+    """``61.3 [55.0, 67.2]``, or without the brackets where one seed allows no interval."""
+    interval = "" if math.isnan(area.low) else f" [{percent(area.low)}, {percent(area.high)}]"
+    return f"{percent(area.value)}{interval}"
+
+
+def _unfinished(data: ReportData) -> str:
+    whole, part = data.result.whole, data.result.protocol
+    missing, more = data.result.missing[:_NAMED], len(data.result.missing) - _NAMED
+    others = f"; and {_count(more, 'more run')}" if more > 0 else ""
+    if whole is None:  # several benches as one
+        shown = f"One of these benches is not finished: shown are {_count(len(part.seeds), 'seed')} up to "
+        shown += f"{part.budgets[-1]:,} real episodes."
+    else:
+        shown = f"This bench is not finished: shown are {len(part.seeds)} of {_count(len(whole.seeds), 'seed')} up to "
+        shown += f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes."
+    return f"{shown} Missing are {'; '.join(missing)}{others}. The same bench command goes on."
+
+
+def _verdict(data: ReportData, agent: str) -> str:
+    budgets, comparisons = data.budgets, data.comparisons[agent]
+    last = comparisons[budgets[-1]]
+    title = agent_words(agent).title
+    score = percent(data.scores[agent][budgets[-1]].value)
+    difference = last.difference
+    head = f"“{title}” solves {score}\u00a0%, {_points(difference)}"
+    if math.isnan(difference.low):
+        return f"{head}; one seed says nothing about how much of that is luck."
+    interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
+    if difference.low > 0:
+        verdict = "so at this budget it is ahead"
+    elif difference.high < 0:
+        verdict = "so at this budget it is behind"
+    else:
+        verdict = "which includes zero, so at this budget no difference is shown"
+    return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons, len(data.result.protocol.seeds))}"
+
+
+def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
+    if len(comparisons) < 2:
+        return ""
+    ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
+    behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
+    parts, clearly = [], "clearly " if seeds >= FEW_SEEDS else ""
+    for budgets, word in ((ahead, "ahead"), (behind, "behind")):
+        if budgets:
+            parts.append(f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}")
+    if not parts:
+        return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
+    return f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets)."
+
+
+def _points(difference: Estimate) -> str:
+    if difference.value == 0:
+        return "exactly as much as DQN"
+    points = f"{abs(100.0 * difference.value):.1f}"
+    return f"{points} percentage points {'less' if difference.value < 0 else 'more'} than DQN"
+
+
+def _listing(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,204 @@
+"""Where a bench lies: ``<root>/<task>/<preset>-<protocol hash>/<agent>/seed_<n>/``; other settings lie elsewhere.
+
+``protocol.json`` says what is compared and ``sessions.json`` who worked on it, when, with what; nothing is ever
+overwritten by another protocol, for its hash is in the name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.registry import load
+from imagine_bench.store import run_folder
+from imagine_bench.store.files import lock, make_folder, read_json, reading, write_json
+from imagine_bench.task_types import task_type
+
+_PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sessions.json"
+_IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
+"""Facts that decide the bits of a result."""
+
+
+class BenchStore:
+    """The folder of one protocol.
+
+    Args:
+        folder: The folder itself: that of :func:`bench_folder`, or wherever somebody has moved it to.
+        protocol: What is compared, of any kind.
+    """
+
+    def __init__(self, folder: Path, protocol: Any) -> None:
+        self.protocol, self.folder = protocol, folder
+        self._began_s = time.monotonic()
+        self._sittings: list[dict[str, Any]] = []
+
+    def open(self) -> None:
+        """Make the folder, or see that the one there is of this protocol.
+
+        Raises:
+            SetupError: It cannot be written.
+            ArtefactError: It holds something else, which is left untouched.
+        """
+        make_folder(self.folder)
+        path = self.folder / _PROTOCOL
+        if not path.exists():
+            write_json(path, self.protocol.as_dict())
+        elif read_protocol(self.folder).as_dict() != self.protocol.as_dict():  # a list in a file may be a tuple
+            raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the folder for this process.
+
+        Raises:
+            BusyError: Another bench works there.
+        """
+        return lock(self.folder / ".lock", f"The bench folder {self.folder}")
+
+    def run_folder(self, agent: str, seed: int) -> Path:
+        """The folder of one run."""
+        return _run_folder(self.folder, agent, seed)
+
+    def missing(self, until: int | None = None) -> list[tuple[str, int]]:
+        """Agents and seeds that are not finished, or have not come to the budget ``until``, seed by seed."""
+        wanted = [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
+        unfinished = [pair for pair in wanted if not run_folder.is_done(self.run_folder(*pair))]
+        return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
+
+    def begin_session(self, environment: dict[str, Any]) -> list[str]:
+        """Note that work starts now.
+
+        Args:
+            environment: What :func:`imagine_bench.machine.describe_environment` says.
+
+        Returns:
+            Names of facts that decide the bits and are not as in the first session.
+        """
+        path = self.folder / _ENVIRONMENT
+        begun = path.exists()
+        if begun:
+            self._sittings = _read_sittings(self.folder)
+        self._began_s = time.monotonic()
+        changed, now = self.changed(environment), _facts(environment)
+        self._sittings.append({
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "wall_s": 0.0,
+            "command": environment["command"],
+            "changed": {name: now.get(name) for name in changed},
+        })  # fmt: skip
+        self.note_time()
+        if not begun:
+            write_json(path, environment)  # last, so that a bench with an environment has sessions too
+        return changed
+
+    def changed(self, environment: dict[str, Any]) -> list[str]:
+        """Names of facts that decide the bits and are not as in the first session; none before there was one."""
+        path = self.folder / _ENVIRONMENT
+        first = read_json(path, "a bench's environment") if path.exists() else environment
+        then, now = _facts(first), _facts(environment)
+        return [name for name in _IDENTITY if then.get(name) != now.get(name)]
+
+    def note_time(self) -> None:
+        """Note how long this session has lasted, so that a kill loses little of the count."""
+        self._sittings[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
+        write_json(self.folder / _SITTINGS, self._sittings)
+
+
+def bench_folder(root: Path, protocol: Any) -> Path:
+    """Where the bench of a protocol belongs below ``root``, the folder of all benches, such as ``runs``."""
+    return Path(root / protocol.task / f"{protocol.preset}-{protocol.hash}")
+
+
+def load_bench(folder: Path) -> Any:
+    """Read a finished bench, as the result class of its task's kind.
+
+    Raises:
+        ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
+    """
+    protocol = read_protocol(folder)
+    folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
+    kind = task_type(protocol.task)
+    load_run = load(kind.load_run)
+    runs = tuple(load_run(run) for run in folders if run_folder.is_done(run))
+    return load(kind.result)(protocol=protocol, runs=runs, **bench_facts(folder))
+
+
+def bench_facts(folder: Path) -> dict[str, Any]:
+    """``environment``, ``folder`` and ``wall_s`` of a bench's result.
+
+    Raises:
+        ArtefactError: A file is missing or damaged; the message names it.
+    """
+    sessions = _read_sittings(folder)
+    environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sessions": sessions}
+    return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
+
+
+def require_either(given: Path | None, task: str | None) -> None:
+    """Raise InvalidValueError where a path and a task are given: what lies at a path is of a task already."""
+    if given is not None and task is not None:
+        raise InvalidValueError(f"Both {given} and --task {task} were given; leave one of them out.")
+
+
+def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
+    """The bench folder below ``root`` that was worked on last, of any task or of some.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    found = [path for path in root.glob(f"*/*/{_SITTINGS}") if not tasks or path.parts[-3] in tasks]
+    if not found:
+        some = next(iter(tasks), "arrow_puzzle")
+        where = root / some if len(tasks) == 1 else root
+        raise ArtefactError(
+            f"There is no {'such ' if tasks else ''}bench below {where}; "
+            f"run one with 'imagine-bench bench --task {some}'."
+        )
+    return max(found, key=lambda path: path.stat().st_mtime).parent
+
+
+def newest_recording(root: Path, task: str | None = None) -> Path:
+    """The recording below ``root`` that was written last, of a run or of a plan, of any task or of one.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    where = root / (task or "")
+    found = sorted(where.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise ArtefactError(
+            f"There is no recording below {where}; run a bench with 'imagine-bench bench --task "
+            f"{task or 'arrow_puzzle'}'."
+        )
+    return found[-1]
+
+
+def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """An environment with its machine's processor among the facts."""
+    return {**environment, "cpu": environment.get("machine", {}).get("cpu")}
+
+
+def _read_sittings(folder: Path) -> list[dict[str, Any]]:
+    path, what = folder / _SITTINGS, "a bench's sessions"
+    sessions: list[dict[str, Any]] = read_json(path, what, holds=list)
+    with reading(path, what):
+        return [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
+
+
+def _run_folder(folder: Path, agent: str, seed: int) -> Path:
+    return folder / agent / f"seed_{seed}"
+
+
+def read_protocol(folder: Path) -> Any:
+    """The protocol of a bench folder.
+
+    Raises:
+        ArtefactError: It is missing or damaged; the message names it.
+    """
+    data = read_json(folder / _PROTOCOL, "a bench's protocol")
+    with reading(folder / _PROTOCOL, "a bench's protocol"):
+        return load(task_type(data["task"]).protocol).from_dict(data)

@@ -1,0 +1,152 @@
+"""Snapshots that a ``kill -9`` at any moment cannot damage: one folder each, complete once it has its name.
+
+A folder ``checkpoint_000007_episode_120`` (the seventh of its run) holds ``agent.safetensors``, ``runner.safetensors``
+and ``state.json``, which has the digests of the other two. The newest is kept; the one before it goes when the newer is
+complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.store.files import make_folder, read_json, sha256, sync_folder, write_bytes, write_json, writing
+
+FORMAT = "imagine_bench checkpoint 1"
+_NAME, _PARTIAL = "checkpoint_", ".partial_"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """An agent and the runner around it, after a whole number of episodes.
+
+    Attributes:
+        episode: Training episodes done.
+        agent: The agent's own state.
+        arrays: The runner's arrays.
+        values: The runner's JSON-serialisable values.
+    """
+
+    episode: int
+    agent: AgentState
+    arrays: Mapping[str, NDArray[Any]]
+    values: Mapping[str, Any]
+
+
+def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
+    """Write a snapshot below ``folder`` and remove the ones it replaces.
+
+    Returns:
+        The checkpoint's own folder.
+
+    Raises:
+        SetupError: It cannot be written; the earlier checkpoint is untouched.
+    """
+    make_folder(folder)
+    earlier = _checkpoints(folder)
+    number = int(earlier[-1].name.split("_")[1]) + 1 if earlier else 1
+    final = folder / f"{_NAME}{number:06d}_episode_{snapshot.episode}"
+    partial = folder / f"{_PARTIAL}{final.name}"
+    with writing(final):
+        for leftover in folder.glob(f"{_PARTIAL}*"):  # of a process that was killed while it wrote or removed
+            shutil.rmtree(leftover)
+        partial.mkdir()
+        write_bytes(partial / "agent.safetensors", _packed(snapshot.agent.arrays))
+        write_bytes(partial / "runner.safetensors", _packed(snapshot.arrays))
+        state = {
+            "format": FORMAT,
+            "episode": snapshot.episode,
+            "sha256": {name: sha256(partial / name) for name in ("agent.safetensors", "runner.safetensors")},
+            "agent": snapshot.agent.values,
+            "runner": snapshot.values,
+        }
+        write_json(partial / "state.json", state)
+        partial.replace(final)
+        sync_folder(folder)
+        for old in earlier:
+            _remove(old)
+    return final
+
+
+def load_newest(folder: Path) -> Snapshot | None:
+    """The newest checkpoint below ``folder``, or None where there is none yet; the run may go on meanwhile.
+
+    Raises:
+        ArtefactError: It is damaged or not a checkpoint; the message names the file, which is left untouched.
+    """
+    while found := _checkpoints(folder):
+        try:
+            return load_snapshot(found[-1])
+        except ArtefactError:
+            if found[-1].is_dir():  # else a newer one has replaced it
+                raise
+    return None
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether there is a checkpoint below ``folder``."""
+    return bool(_checkpoints(folder))
+
+
+def load_snapshot(checkpoint: Path) -> Snapshot:
+    """Read one checkpoint folder.
+
+    Raises:
+        ArtefactError: It is damaged or not a checkpoint; the message names the file, which is left untouched.
+    """
+    path = checkpoint / "state.json"
+    state = read_json(path, "a checkpoint's state")
+    if state.get("format") != FORMAT:
+        raise ArtefactError(f"{path} was not written as {FORMAT!r}. It was left untouched.")
+    try:
+        agent = _unpacked(checkpoint / "agent.safetensors", state["sha256"])
+        runner = _unpacked(checkpoint / "runner.safetensors", state["sha256"])
+        return Snapshot(
+            episode=state["episode"],
+            agent=AgentState(arrays=agent, values=state["agent"]),
+            arrays=runner,
+            values=state["runner"],
+        )
+    except (KeyError, TypeError) as error:
+        raise ArtefactError(f"{path} lacks {error}. It was left untouched.") from error
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    return sorted(folder.glob(f"{_NAME}*")) if folder.is_dir() else []
+
+
+def _remove(checkpoint: Path) -> None:
+    """Remove a checkpoint so that no half of it can pass for a whole one: its name goes first."""
+    shutil.rmtree(checkpoint.rename(checkpoint.with_name(f"{_PARTIAL}{checkpoint.name}")))
+
+
+def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
+
+
+def _unpacked(path: Path, digests: Mapping[str, str]) -> dict[str, NDArray[Any]]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ArtefactError(f"Cannot read {path}: {error.strerror}.") from error
+    if hashlib.sha256(content).hexdigest() != digests[path.name]:
+        raise ArtefactError(
+            f"{path} is damaged: its content is not what was written. It was left untouched; delete the run's folder "
+            "to start that run anew."
+        )
+    try:
+        arrays: dict[str, NDArray[Any]] = load(content)
+    except SafetensorError as error:
+        raise ArtefactError(f"{path} is not a safetensors file: {error}. It was left untouched.") from error
+    return arrays

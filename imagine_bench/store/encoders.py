@@ -1,0 +1,69 @@
+"""Which encoder artefact a bench uses: the task's bundled one, another bundled one by name, or a file."""
+
+from __future__ import annotations
+
+import os
+from importlib import resources
+from pathlib import Path
+
+from imagine_bench.errors import ArtefactError, UnknownNameError
+from imagine_bench.interfaces import TaskSpec, bundled_name
+from imagine_bench.store.files import read_json, sha256
+
+_SUFFIX = ".safetensors"
+
+
+def bundled() -> dict[str, Path]:
+    """The encoders that come with the package, by name."""
+    folder = Path(str(resources.files("imagine_bench.assets") / "encoders"))
+    return {path.stem: path for path in sorted(folder.glob(f"*{_SUFFIX}"))}
+
+
+def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str = "latents") -> Path:
+    """The encoder file to use.
+
+    Args:
+        spec: The task.
+        appearance: Its appearance level; each has its own bundled encoders.
+        given: A bundled name or a path instead; None for the task's own.
+        kind: Which of the task's own: ``"latents"``, continuous, or ``"codes"``, one-hot, of discrete parts.
+
+    Raises:
+        UnknownNameError: ``given`` is neither; the message lists the bundled names.
+        ArtefactError: The task has no bundled encoder at this level.
+    """
+    known = bundled()
+    if given is None:
+        name = bundled_name(spec.encoder, appearance, kind)
+        if name not in known:
+            raise ArtefactError(
+                f"No encoder {name!r} is bundled; train one with "
+                f"'imagine-bench encoder --task {spec.id} --appearance {appearance}"
+                f"{' --recipe codes' if kind == 'codes' else ''}' and give it with --encoder."
+            )
+        return known[name]
+    if given in known:
+        return known[given]
+    path = Path(given).expanduser()
+    if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
+        return path.resolve()
+    raise UnknownNameError("encoder", given, known)
+
+
+def kind(path: Path) -> str:
+    """Whether an encoder gives ``"latents"`` or ``"codes"``, by the card beside it.
+
+    Raises:
+        ArtefactError: The card is damaged.
+    """
+    card = path.with_suffix(".json")
+    return "codes" if card.is_file() and read_json(card, "an encoder's card").get("code_sizes") else "latents"
+
+
+def identity(path: Path) -> str:
+    """What stands for an encoder in a protocol: its name and the beginning of its digest.
+
+    Raises:
+        ArtefactError: The file cannot be read.
+    """
+    return f"{path.stem}@{sha256(path)[:12]}"

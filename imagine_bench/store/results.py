@@ -1,0 +1,247 @@
+"""What a bench measured, as plain data: written by the runner, read by statistics, report and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.bench.protocol import Protocol
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.errors import ArtefactError
+from imagine_bench.store.files import first_difference
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenLoop:
+    """How right the imagination is by depth, against the rules, over rollouts that the rules keep alive.
+
+    All arrays have shape (D,), index d for imagined step d + 1.
+
+    Attributes:
+        count: Imagined transitions compared.
+        correct: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
+        correct_accepted: The same among those the uncertainty filter keeps (NaN where it keeps none).
+        accepted: Share the filter keeps.
+        reward_mae: Mean absolute error of the predicted reward.
+        termination_error: Share with the wrong side of 0.5 for P(terminal).
+        epistemic: Mean epistemic uncertainty.
+        aleatoric: Mean aleatoric uncertainty.
+        modal: Mean modal uncertainty.
+        judged: Imagined transitions that began in the right macrostate, so that they can be wrong by themselves.
+        auroc_epistemic: How well epistemic uncertainty finds the wrong ones among those: the probability that a wrong
+            one has the higher uncertainty of two; 0.5 is chance, NaN where none or all are wrong.
+        auroc_aleatoric: The same for aleatoric uncertainty.
+        auroc_modal: The same for modal uncertainty.
+    """
+
+    count: NDArray[np.int64]
+    correct: NDArray[np.float64]
+    correct_accepted: NDArray[np.float64]
+    accepted: NDArray[np.float64]
+    reward_mae: NDArray[np.float64]
+    termination_error: NDArray[np.float64]
+    epistemic: NDArray[np.float64]
+    aleatoric: NDArray[np.float64]
+    modal: NDArray[np.float64]
+    judged: NDArray[np.float64]
+    auroc_epistemic: NDArray[np.float64]
+    auroc_aleatoric: NDArray[np.float64]
+    auroc_modal: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Futures:
+    """Sampled futures against the exact ones, from every macrostate of play and macro-action: P pairs, depths 1 to D.
+
+    Attributes:
+        macrostates: Where each begins. Shape (P, M).
+        actions: Its first macro-action. Shape (P,).
+        samples: Futures of each pair. Shape ().
+        total_variation: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
+        floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
+        missing: Possible outcomes that are not imagined. Shape (D, P).
+        hallucinated: Imagined outcomes that are impossible. Shape (D, P).
+        reward_error: Absolute error of the expected reward of this macro-action. Shape (D, P).
+        termination_error: Absolute error of the probability that the episode is over. Shape (D, P).
+        survival_probability: Exact probability that the episode went on until this macro-action. Shape (D, P).
+    """
+
+    macrostates: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    total_variation: NDArray[np.float64]
+    floor: NDArray[np.float64]
+    missing: NDArray[np.float64]
+    hallucinated: NDArray[np.float64]
+    reward_error: NDArray[np.float64]
+    termination_error: NDArray[np.float64]
+    survival_probability: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedRollout:
+    """An imagined rollout beside what the real environment shows for the same start and actions.
+
+    Attributes:
+        start_frame: The real frame it starts from. Shape (64, 64, 3), uint8.
+        start_macrostate: What that frame shows. Shape (M,).
+        rollout: What the agent imagined.
+        real_frames: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
+        real_macrostates: What the rules say. Shape (D, M).
+        real_rewards: What the rules say. Shape (D,).
+        real_terminated: Shape (D,).
+    """
+
+    start_frame: NDArray[np.uint8]
+    start_macrostate: NDArray[np.int64]
+    rollout: ImaginedRollout
+    real_frames: NDArray[np.uint8]
+    real_macrostates: NDArray[np.int64]
+    real_rewards: NDArray[np.float64]
+    real_terminated: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """One evaluated budget of one run.
+
+    Attributes:
+        episodes: Real training episodes so far.
+        env_steps: Real training macro-actions so far.
+        test_episodes: Greedy test episodes.
+        successes: Test episodes that ended in success.
+        mean_return: Mean undiscounted return of the test episodes.
+        mean_length: Mean macro-actions of the test episodes.
+        faults: Macro-actions of the test episodes whose physics disagreed with the rules.
+        train_cpu_s: CPU seconds of training (environment and learning) since the run began.
+        eval_cpu_s: CPU seconds of this evaluation.
+        diagnostics: The agent's own means since the previous checkpoint.
+        open_loop: Imagination against the rules, for agents that imagine.
+        futures: Sampled futures against the rules, for agents that can be asked for many.
+    """
+
+    episodes: int
+    env_steps: int
+    test_episodes: int
+    successes: int
+    mean_return: float
+    mean_length: float
+    faults: int
+    train_cpu_s: float
+    eval_cpu_s: float
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+    open_loop: OpenLoop | None = None
+    futures: Futures | None = None
+
+    @property
+    def success_rate(self) -> float:
+        """Share of test episodes that succeeded, in [0, 1]."""
+        return self.successes / self.test_episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """One finished run.
+
+    Attributes:
+        agent: Registered agent.
+        seed: The run's seed.
+        checkpoints: One a budget, in the protocol's order.
+        settings: The agent's settings as run.
+        training_success: Whether each training episode succeeded. Shape (episodes,).
+        training_length: Macro-actions of each training episode. Shape (episodes,).
+        imagined: Example rollouts at the last budget, for agents that imagine.
+        sampled_rollouts: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
+        folder: Where the run's files lie.
+        recording: Its Rerun recording, or None.
+    """
+
+    agent: str
+    seed: int
+    checkpoints: tuple[Checkpoint, ...]
+    settings: Mapping[str, Any]
+    training_success: NDArray[np.bool_]
+    training_length: NDArray[np.int64]
+    imagined: tuple[ComparedRollout, ...]
+    folder: Path
+    recording: Path | None
+    sampled_rollouts: tuple[ComparedRollout, ...] = ()
+
+
+def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
+    """Refuse runs of one agent, by folder, with different settings; kept results, which have none, are passed over.
+
+    Raises:
+        ArtefactError: Two runs differ; the message says where and in what.
+    """
+    known = [(folder, settings) for folder, settings in runs if settings]
+    for folder, settings in known[1:]:
+        difference = first_difference(known[0][1], settings)
+        if difference is not None:
+            name, value, other = difference
+            raise ArtefactError(
+                f"{known[0][0]} ran with {name} {value!r} and {folder} with {other!r}, as another kind of machine may "
+                f"choose. Runs that are compared need one value: give it with --set {name}=..., or use one kind of "
+                "machine."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchResult:
+    """All runs of a protocol. Every agent and seed is there, or this cannot be built.
+
+    Attributes:
+        protocol: What was compared.
+        runs: One an agent and seed.
+        environment: Command, commit, versions, machine, GL renderer, threads; JSON-like.
+        folder: Where the bench's files lie.
+        wall_s: Wall seconds of the bench, over all its sessions.
+        whole: The protocol of which this is a part; None if it is all of it.
+        missing: What a part lacks, one sentence a run.
+
+    Raises:
+        ArtefactError: A run of the protocol is missing, doubled or has other budgets, or other settings than another.
+    """
+
+    protocol: Protocol
+    runs: tuple[RunResult, ...]
+    environment: Mapping[str, Any]
+    folder: Path
+    wall_s: float
+    whole: Protocol | None = None
+    missing: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
+        found = [(run.agent, run.seed) for run in self.runs]
+        missing = sorted(wanted - set(found))
+        if missing or len(found) != len(wanted):
+            raise ArtefactError(
+                f"{self.folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
+                f"missing: {missing or 'none'}. Run the same bench command again to complete it."
+            )
+        for run in self.runs:
+            budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
+            if budgets != self.protocol.budgets:
+                raise ArtefactError(f"{run.folder} has budgets {budgets}, the protocol says {self.protocol.budgets}.")
+        for agent in self.protocol.agents:
+            require_one_setting([(run.folder, run.settings) for run in self.of(agent)])
+
+    @property
+    def protocol_hash(self) -> str:
+        """The hash of the whole protocol, which names the bench's folder."""
+        return (self.whole or self.protocol).hash
+
+    def of(self, agent: str) -> tuple[RunResult, ...]:
+        """The runs of one agent, in the order of the protocol's seeds."""
+        by_seed = {run.seed: run for run in self.runs if run.agent == agent}
+        return tuple(by_seed[seed] for seed in self.protocol.seeds)
+
+    def success_rates(self, agent: str) -> NDArray[np.float64]:
+        """Success rates of one agent. Shape (seeds, budgets)."""
+        return np.array([[checkpoint.success_rate for checkpoint in run.checkpoints] for run in self.of(agent)])

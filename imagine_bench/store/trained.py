@@ -1,0 +1,180 @@
+"""A trained agent, taken up again from the last checkpoint of its run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import registry
+from imagine_bench.bench.protocol import Protocol
+from imagine_bench.bench.runs import RunSpec
+from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.store import encoders
+from imagine_bench.store.archive import is_archive
+from imagine_bench.store.bench_folder import BenchStore, read_protocol
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.files import read_json, reading
+from imagine_bench.store.results import BenchResult, RunResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """An agent as its run left it.
+
+    Attributes:
+        agent: The agent itself.
+        spec: What its run was.
+        task: The task it was trained on.
+        episodes: Real training episodes it has had on its task, without those on tasks before.
+        folder: Its run's folder.
+    """
+
+    agent: Agent
+    spec: RunSpec
+    task: TaskSpec
+    episodes: int
+    folder: Path
+
+    @property
+    def imaginer(self) -> Imaginer:
+        """The same agent, as one that imagines.
+
+        Raises:
+            InvalidValueError: It does not imagine.
+        """
+        if not isinstance(self.agent, Imaginer):
+            raise InvalidValueError(
+                f"The agent {self.spec.agent!r} of {self.folder} does not imagine; give the run of one that does."
+            )
+        return self.agent
+
+
+def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
+    """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
+
+    Args:
+        folder: A run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``.
+        encoder: Bundled name or path, where the run used an encoder that is not bundled.
+
+    Raises:
+        ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
+        UnknownNameError: No such encoder.
+    """
+    path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
+    config = read_json(path, what)
+    with reading(path, what):
+        task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
+        settings = tuple(sorted(_flat(config["settings"]).items()))
+    require_control(task, str(folder))
+    with reading(path, what):
+        protocol = Protocol.from_dict(config["protocol"])
+    spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
+    snapshot = load_newest(folder / "checkpoints")
+    if snapshot is None:
+        raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
+    as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
+    agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
+    agent.restore(snapshot.agent)
+    if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
+        while agent.train_in_model():
+            pass
+    return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
+
+
+def require_control(task: str, what: str) -> None:
+    """Raise ArtefactError for a task in which no agent acts."""
+    if task not in registry.TASKS:
+        raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
+
+
+def require_runs(bench: Path) -> None:
+    """Raise ArtefactError for results that were kept without the agents."""
+    if is_archive(bench):
+        raise ArtefactError(
+            f"{bench} holds kept results and no agents; give a bench's own folder, runs/<task>/<preset>-<hash>."
+        )
+
+
+def imagining(result: BenchResult) -> tuple[RunResult, ...]:
+    """The runs of a bench whose agents imagine.
+
+    Raises:
+        ArtefactError: There are none.
+    """
+    runs = tuple(run for run in result.runs if run.imagined)
+    if not runs:
+        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
+    return runs
+
+
+def learners(bench: Path) -> tuple[Path, ...]:
+    """The run folders of a bench, finished or not, whose agents have learned and can be taken up again.
+
+    Raises:
+        ArtefactError: There are none.
+    """
+    protocol = read_protocol(bench)
+    store = BenchStore(bench, protocol)
+    entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
+    able = [agent for agent, entry in entries.items() if entry.learns and not entry.external_training_loop]
+    folders = [store.run_folder(agent, seed) for agent in able for seed in protocol.seeds]
+    found = tuple(folder for folder in folders if _has_learned(folder))
+    if not found:
+        raise ArtefactError(
+            f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again (a library's "
+            "cannot); give the folder of a bench with one, such as of dqn."
+        )
+    return found
+
+
+def _has_learned(run: Path) -> bool:
+    """Whether a run has had an episode on its task; one with tasks before may have a checkpoint without."""
+    snapshot = load_newest(run / "checkpoints")
+    return snapshot is not None and snapshot.episode > 0
+
+
+def best_run(result: BenchResult) -> RunResult:
+    """The imagining run of a bench that solves most of its last test; of equals, most of the one before, and so on.
+
+    Raises:
+        ArtefactError: There is none.
+    """
+    return max(imagining(result), key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
+
+
+def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
+    entry = registry.agent_entry(agent)
+    used = protocol.encoder_of(entry.encoder_kind)
+    if not entry.needs_encoder or used is None:
+        return None
+    task, name = registry.task(protocol.task), used.partition("@")[0]
+    if given is not None and _is_other(task, protocol, given, used):
+        given = None
+    if given is None and name not in encoders.bundled():
+        raise ArtefactError(f"The run saw through encoder {used}, which is not bundled; give its file with --encoder.")
+    path = encoders.resolve(task, protocol.appearance, given or name)
+    if encoders.identity(path) != used:
+        raise ArtefactError(
+            f"The run saw through encoder {used}, and {path} is {encoders.identity(path)}; give the right "
+            "file with --encoder."
+        )
+    return path
+
+
+def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool:
+    """Whether an encoder was given for the agents of the bench that see through another kind than this one."""
+    found = encoders.identity(encoders.resolve(task, protocol.appearance, given))
+    return found != used and found in (protocol.encoder, protocol.codes)
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value})
+    return flat

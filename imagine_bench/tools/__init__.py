@@ -1,0 +1,1 @@
+"""Commands beside the bench: doctor, speed, film."""

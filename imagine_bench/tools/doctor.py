@@ -1,0 +1,127 @@
+"""What this machine and installation have, and in words what is wrong with them."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from packaging.requirements import Requirement
+
+from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError
+from imagine_bench.machine import commit, gl_renderer, installed, machine, versions
+
+_SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
+_FRAMES = 200
+_NEEDED_DISK_GIB = 1.0
+_REASONS = {
+    "mujoco": " MuJoCo 4.0 breaks dm-control 1.0.50: 'MjModel' has no 'flex_vertedge'.",
+    "torch": " Results repeat bit for bit only on one version.",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Examination:
+    """What was found.
+
+    Attributes:
+        facts: Names and values, in order.
+        complaints: Sentences about what will not work, each with what to do.
+        notes: Sentences about what works, but could be better.
+    """
+
+    facts: tuple[tuple[str, str], ...]
+    complaints: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = [f"{name:16}{value}" for name, value in self.facts]
+        lines += [f"Note: {note}" for note in self.notes]
+        lines += [f"Wrong: {complaint}" for complaint in self.complaints] or ["Everything works."]
+        return "\n".join(lines)
+
+
+def examine() -> Examination:
+    """Look at versions, GL, threads, GPU and disk; draws a few frames of the first task."""
+    found, here = versions(), machine()
+    complaints = unmet_requirements()
+    gl, frame, gl_complaint = _drawing()
+    complaints += [gl_complaint] if gl_complaint else []
+    free_gib = shutil.disk_usage(Path.cwd()).free / 2**30
+    if free_gib < _NEEDED_DISK_GIB:
+        complaints.append(f"Only {free_gib:.1f} GiB are free in {Path.cwd()}; a bench needs about 1 GiB.")
+    facts = {
+        "command": sys.executable,
+        "commit": commit() or "not in a checkout",
+        **found,
+        "system": here["system"],
+        "processor": f"{here['cpu']}, {here['cores']} cores usable, {here['memory_gib']} GiB",
+        "NVIDIA GPU": here["gpu"] or "none",
+        "threads a run": "1",
+        "GL renderer": gl,
+        "64x64 frame": frame,
+        "free disk": f"{free_gib:.1f} GiB",
+    }
+    notes = _notes(here["gpu"], gl)
+    return Examination(facts=tuple(facts.items()), complaints=tuple(complaints), notes=tuple(notes))
+
+
+def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str]:
+    """A sentence for each package that is missing or not of a version that works; extras are not looked for.
+
+    Args:
+        version_of: The installed version of a package, ``"missing"`` where there is none.
+    """
+    complaints = []
+    for text in metadata.requires("imagine-bench") or []:
+        wanted = Requirement(text)
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
+            continue
+        version = version_of(wanted.name)
+        if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
+            state = "is missing" if version == "missing" else f"{version} is installed"
+            complaints.append(
+                f"{wanted.name} {state}, but {wanted.specifier} is needed.{_REASONS.get(wanted.name, '')} "
+                "Run 'make setup' in a fresh .venv."
+            )
+    return complaints
+
+
+def _drawing() -> tuple[str, str, str | None]:
+    """GL renderer, milliseconds a frame, and what is wrong."""
+    try:
+        name = gl_renderer()
+        return name, f"{_frame_ms():.3f} ms", None
+    except ImagineBenchError as error:
+        return "none", "none", str(error)
+    except Exception as error:  # a broken installation fails anywhere: it is what is looked for
+        return "none", "none", f"Drawing a frame failed with {type(error).__name__}: {error}. Run 'make setup' anew."
+
+
+def _frame_ms() -> float:
+    spec = registry.task(next(iter(registry.TASKS)))
+    states = np.array([spec.rules.start_states[0]] * _FRAMES, dtype=np.int64)
+    rng = np.random.default_rng(0)
+    spec.render_macrostates(states[:1], "clean", rng)
+    start_s = time.process_time()
+    spec.render_macrostates(states, "clean", rng)
+    return 1e3 * (time.process_time() - start_s) / _FRAMES
+
+
+def _notes(gpu: str | None, gl: str) -> list[str]:
+    notes = []
+    cuda = any((found.name or "").startswith("nvidia-") for found in metadata.distributions())
+    if gpu is None and cuda:
+        notes.append(
+            "torch is a CUDA build of several GB and there is no NVIDIA GPU: in a new .venv, "
+            "'TORCH_INDEX=https://download.pytorch.org/whl/cpu make setup' takes the CPU build."
+        )
+    if gpu is not None and any(name in gl.lower() for name in _SOFTWARE_GL):
+        notes.append(f"Frames are drawn in software ({gl}) although there is a GPU; its driver's EGL is not installed.")
+    return notes

@@ -1,0 +1,125 @@
+"""Does contact physics do what the rules say? Long random walks beside a twin whose outcomes are perfect."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import PerformanceTargets, TaskSpec
+from imagine_bench.seeding import SeedTree, episode_seed
+
+_ACTIONS_A_WALK = 200
+"""Macro-actions between two resets: errors may accumulate."""
+_STANDS_M = 0.02
+"""An object so near to its height on the table stands there."""
+_QUARTER_RAD = np.pi / 2
+
+
+@dataclass
+class Fidelity:
+    """What a walk showed.
+
+    Attributes:
+        actions: Macro-actions done.
+        as_ruled: How many ended as the rules say, without a fault.
+        faults: Reasons of the others.
+        bystander_mm: The furthest that an object moved which the action should leave where it stood.
+        error_mm: Of each object acted on, its distance from where a perfect execution leaves it.
+        error_deg: Its yaw from there, to the nearest quarter turn, since objects have no marked side.
+        cpu_s: CPU seconds of each macro-action, frame included.
+    """
+
+    actions: int = 0
+    as_ruled: int = 0
+    faults: list[str] = field(default_factory=list)
+    bystander_mm: float = 0.0
+    error_mm: list[float] = field(default_factory=list)
+    error_deg: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+
+
+def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int) -> Fidelity:
+    """Walk at random in contact physics, judged by the objects' poses in the simulation and not by ``info`` alone.
+
+    Args:
+        spec: The task.
+        targets: Which bodies to look at, and whether walks go on through ends.
+        actions: Macro-actions of the measurement.
+    """
+    real, perfect = (
+        gymnasium.make(spec.env_id, execution=execution, disable_env_checker=True).unwrapped
+        for execution in ("physics", "kinematic")
+    )
+    found, rng = Fidelity(), SeedTree(0).child("speed", "physics", spec.id).generator()
+    play = [state for state in spec.rules.states if not spec.rules.is_terminal(state)]
+    real.reset(seed=episode_seed("tuning", 0, actions))
+    standing_m = _poses(real, targets)[:, 2]  # every start has all objects on the table
+    fresh = True
+    for step in range(actions):
+        if fresh or step % _ACTIONS_A_WALK == 0:
+            options = {"macrostate": play[int(rng.integers(len(play)))]}
+            for env in (perfect, real):
+                _, info = env.reset(seed=episode_seed("tuning", 0, step), options=options)
+        before, state = _poses(real, targets), tuple(int(value) for value in info["macrostate"])
+        action = int(rng.integers(spec.n_actions))
+        *_, wanted = perfect.step(action)
+        start = time.process_time()
+        _, _, terminated, _, info = real.step(action)
+        found.cpu_s.append(time.process_time() - start)
+        right = not info["fault"] and np.array_equal(info["macrostate"], wanted["macrostate"])
+        found.actions, found.as_ruled = found.actions + 1, found.as_ruled + right
+        if right:
+            after = _poses(real, targets)
+            acted_on = np.not_equal(state, info["macrostate"])[: len(after)]
+            _compare(found, acted_on, standing_m, before, after, _poses(perfect, targets))
+        else:
+            found.faults.append(info.get("fault_reason", f"{wanted['macrostate']} was to be reached"))
+        fresh = not right or (terminated and not targets.goes_on)
+    for env in (real, perfect):
+        env.close()
+    return found
+
+
+def _poses(env: Any, targets: PerformanceTargets) -> NDArray[np.float64]:
+    """Positions and quaternions of the objects, now. Shape (N, 7)."""
+    motion = env.motion()
+    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in targets.objects]])
+
+
+def _compare(
+    found: Fidelity,
+    acted_on: NDArray[np.bool_],
+    standing_m: NDArray[np.float64],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    perfect: NDArray[np.float64],
+) -> None:
+    """Take in where the objects are after a macro-action that ended as the rules say.
+
+    Args:
+        found: Changed in place.
+        acted_on: Objects whose coordinate changed. Shape (N,).
+        standing_m: Height of each on the table. Shape (N,).
+        before: Poses before the action. Shape (N, 7).
+        after: Poses after it. Shape (N, 7).
+        perfect: Poses after a perfect execution. Shape (N, 7).
+    """
+    stood = (np.abs(before[:, 2] - standing_m) < _STANDS_M) & (np.abs(after[:, 2] - standing_m) < _STANDS_M)
+    for index in np.flatnonzero(acted_on):
+        found.error_mm.append(1e3 * float(np.linalg.norm(after[index, :3] - perfect[index, :3])))
+        off_rad = (_yaw_rad(after[index]) - _yaw_rad(perfect[index]) + _QUARTER_RAD / 2) % _QUARTER_RAD
+        found.error_deg.append(abs(float(np.degrees(off_rad - _QUARTER_RAD / 2))))
+    for index in np.flatnonzero(stood & ~acted_on):
+        moved_mm = 1e3 * float(np.abs(after[index, :3] - before[index, :3]).max())
+        found.bystander_mm = max(found.bystander_mm, moved_mm)
+
+
+def _yaw_rad(pose: NDArray[np.float64]) -> float:
+    """Yaw of a pose (position, quaternion w x y z) about the world's vertical."""
+    w, x, y, z = pose[3:]
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

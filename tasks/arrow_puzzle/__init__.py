@@ -1,0 +1,1 @@
+"""The arrow puzzle (thesis, chapter 5)."""

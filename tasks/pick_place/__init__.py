@@ -1,0 +1,1 @@
+"""Pick-and-place with a human who changes their mind (thesis, chapter 3)."""

@@ -1,0 +1,74 @@
+"""The scene of pick-and-place with a human as one MJCF model, compiled by plain MuJoCo."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+
+import mujoco
+
+from ..scenes import constants as c
+from ..scenes.arm import arm_root
+from ..scenes.composing import mjcf
+from ..scenes.hand import add_person_materials, add_pointing_hand
+from ..scenes.objects import add_objects, standing_m
+from ..scenes.tabletop import add_tabletop
+from .open_hand import add_open_hand
+
+TIMESTEP_S = 0.003
+"""Objects are carried here: contacts are as stiff as two steps, and in softer ones what is held creeps as the arm
+accelerates, since the servos' damping is integrated implicitly and contacts are not."""
+
+_SOLIMP = (0.988, 0.995)
+"""Stiffer than MuJoCo's (0.9, 0.95), where a ball sinks by 2 mm in each carry; beyond 0.995 grips chatter and fail."""
+
+PALM_M = (c.ROW_X_M + 0.145, 0.0, c.TABLE_HEIGHT_M + 0.055)
+"""Middle of the palm that asks for a handover, in the world."""
+
+IDLE_FINGERTIP_M = (0.96, 0.26, c.TABLE_HEIGHT_M + 0.02)
+IDLE_PALM_M = (1.00, -0.26, c.TABLE_HEIGHT_M + 0.04)
+"""Where the human's hands rest when they say nothing: at the table's far edge, outside the agent's frame."""
+
+_FOVY_DEG, _PITCH_RAD = 57.0, math.radians(5.5)
+"""Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom what the gripper holds."""
+
+
+def fingertip_m(index: int) -> tuple[float, float, float]:
+    """Nominal tip of the index finger that points at object ``index``, in the world."""
+    x_m, y_m, _ = standing_m(index)
+    dx_m, dy_m, dz_m = c.FINGERTIP_IN_SLOT_M
+    return (x_m + dx_m, y_m + dy_m, c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + dz_m)
+
+
+def stiffen_contacts(root: mjcf.RootElement) -> None:
+    """The contact parameters of every geom of this scene, the gripper's tips included."""
+    root.default.geom.solref = root.find("default", "tip").geom.solref = (2 * TIMESTEP_S, 1.0)
+    root.default.geom.solimp = _SOLIMP
+
+
+def pick_root() -> mjcf.RootElement:
+    """The whole scene; the arm is its root, so that every name stays without a prefix."""
+    root = arm_root()
+    root.model = "pick_place"
+    stiffen_contacts(root)
+    add_tabletop(root, TIMESTEP_S)
+    add_objects(root)
+    add_person_materials(root)
+    add_pointing_hand(root, IDLE_FINGERTIP_M)
+    add_open_hand(root, IDLE_PALM_M)
+    camera = root.find("camera", c.AGENT_CAMERA)
+    camera.fovy = _FOVY_DEG
+    camera.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
+    return root
+
+
+@functools.cache
+def _compiled() -> mujoco.MjModel:
+    root = pick_root()
+    return mujoco.MjModel.from_xml_string(root.to_xml_string(), assets=root.get_assets())
+
+
+def compile_pick_scene() -> mujoco.MjModel:
+    """A model of the scene of one's own: appearance may write its colours, lights and cameras."""
+    return copy.copy(_compiled())

@@ -1,0 +1,124 @@
+"""Pick-and-place with a human (thesis, chapter 3): what the bench needs to know, and the environment.
+
+Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
+from imagine_bench.rules import facts
+
+from .rules import N_OBJECTS, PickPlaceRules
+
+if TYPE_CHECKING:
+    from ..macro_env import MacroEnv
+
+HORIZON = 50
+"""Of no weight: an optimal agent needs 6 actions on average and is cut off once in 25,000 episodes."""
+_OBJECTS = ("ball", "car", "cup")
+_PLACES = ("left", "middle", "right")
+
+
+def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
+    """Frames of macrostates in the kinematic mode; see :func:`.studio.frames_of`."""
+    from ..frames import frames_of  # noqa: PLC0415
+    from .world import PickWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
+
+    return frames_of(PickWorld, _RULES, macrostates, appearance, rng)
+
+
+_CHAPTER_3 = ("dqn", "imagination_only")
+_COMPARED = ("random", "oracle", *_CHAPTER_3)
+_FILTERED = "imagination_only_uncertainty"  # not in `quick`: there its filter was seen to discard nothing
+_PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {"agents": (*_COMPARED, _FILTERED)},
+    "quick": {"agents": (*_COMPARED, "imagine"), "evaluation_episodes": 100, "sampled_futures": 400},
+    "thesis": {  # section 3.2.3: 10 runs of 1000 episodes, each tested on 100
+        "agents": _CHAPTER_3,
+        "seeds": tuple(range(10)),
+        "budgets": (1000,),
+        "evaluation_episodes": 100,
+        "sampled_futures": 400,
+    },
+    "full": {"agents": (*_COMPARED, _FILTERED, "imagine"), "budgets": (100, 250, 500, 1000), "sampled_futures": 400},
+}
+
+_RULES = PickPlaceRules()
+SPEC = TaskSpec(
+    id="pick_place",
+    title="Pick-and-place with a human",
+    description=(
+        "A human points at one of three objects, which the arm picks; they then point at another, so that it must be "
+        "put back first, or open their palm for a handover. What they want next is random, and a wrong action ends it."
+    ),
+    env_id="imagine_bench/PickPlace-v0",
+    horizon=HORIZON,
+    action_names=(*(f"pick or place the {name}" for name in _OBJECTS), "hand over"),
+    macrostate_names=(*(f"{place} object" for place in _PLACES), "gesture"),
+    macrostate_values=(
+        *(("placed", "picked", "handed over"),) * N_OBJECTS,
+        (*_PLACES, "handover", "withdrawn"),
+    ),
+    preprocessing="small_rgb",
+    encoder="pick_place",
+    rules=_RULES,
+    facts=functools.partial(facts, _RULES, HORIZON),
+    render_macrostates=render_macrostates,
+    reference="pick_place",
+    settings="chapter_3",
+    targets=PerformanceTargets(
+        objects=_OBJECTS,
+        as_ruled=0.995,
+        bystander_mm=3.0,
+        error_mm=5.0,
+        physics_per_cpu_s=60,
+        kinematic_per_cpu_s=5_000,
+        encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
+    ),
+    presets=_PRESETS,
+    success_threshold=0.98,
+)
+
+
+def make_env(**options: Any) -> MacroEnv:
+    """Pick-and-place with a human; ``options`` are the keyword arguments of MacroEnv.
+
+    Actions 0, 1, 2 pick object i up, or put it back if it is held; action 3 hands over. What the robot is told it does
+    as far as that is possible, asked for or not; what is not possible it reaches out for in vain. The human answers
+    after having seen the result.
+
+    Readings of the rules where the thesis is silent:
+
+    ============================ ===================================================================================
+    question                     reading
+    ============================ ===================================================================================
+    where an episode starts      all objects on the table, the human points at one of the three, equally likely
+    after a pick as asked        the human's next wish is drawn: either other object or the handover, 1/3 each
+    holding, another is pointed  only putting the held object back is right (0); picking before that, or handing over,
+    at                           is wrong
+    while it is put back         the human keeps pointing at the same object: the new wish stands
+    holding, palm open           only the handover is right (+5, end); putting the object back is wrong
+    nothing held                 only picking the object pointed at is right (+1); picking another or handing over
+                                 nothing is wrong
+    a wrong action               -5 and the end. It is carried out: a wrong object is picked, a held one put back.
+                                 Impossible ones (a second object, a handover without a palm) are reached for in vain
+    after a wrong action         the human withdraws both hands, so that the end can be seen
+    after a handover             the object lies in the palm, which stays; whatever is done then changes nothing
+    a drop, a miss               a fault with its reason; the human did not get what they asked for: as a wrong action
+    handed over, but tipped      it lies in the palm: a success, with a fault
+    put back tipped, turned or   not what was asked for: the human withdraws, as after a wrong action, with a fault
+    off its place
+    success                      a handover into the open palm; thesis, footnote 2 of chapter 3
+    time limit                   50 actions, which cuts off an optimal agent once in 25,000 episodes
+    ============================ ===================================================================================
+    """
+    from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
+    from .world import PickWorld  # noqa: PLC0415
+
+    return MacroEnv(SPEC, PickWorld, **options)

@@ -1,0 +1,1 @@
+"""Inverse kinematics by motor babbling (thesis 4.5.2)."""

@@ -1,0 +1,212 @@
+"""Inverse kinematics learned by motor babbling (thesis 4.5.2): which place can the robot trust itself to reach?
+
+A planar arm of three links sets random joint configurations and sees where its tip comes to rest; networks learn the
+way back, from places to configurations, of which there are several. Every predicted configuration is carried out in
+MuJoCo. Importing this module is cheap: MuJoCo loads with the first movement.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.regression import SCORES, Dataset, Floats, Predict, RegressionSpec
+from imagine_bench.seeding import SeedTree
+
+if TYPE_CHECKING:
+    from .planar_arm import PlanarArm
+
+LINKS_M = (0.5, 0.3, 0.2)
+LOW_RAD = np.array([-2 * np.pi / 3, -3.6, -3.6])
+HIGH_RAD = -LOW_RAD
+NOISE_RAD = 0.01
+"""Standard deviation of the noise on the joint positions that are learned."""
+CANDIDATES, DECISIONS = 20, 50
+"""Points to choose from, and choices cumulated (table 4.1)."""
+MIN_SAMPLES, MAX_SAMPLES = 20, 1_000_000
+GRID = 45
+"""Points a side of the maps of figures 4.2 and 4.3, over the square that holds the workspace and a margin."""
+MARGIN_M = 1.1
+_DRAWS = 1000
+
+
+def arm() -> PlanarArm:
+    """This process' arm."""
+    from .planar_arm import planar_arm  # noqa: PLC0415  (MuJoCo loads with the first movement)
+
+    return planar_arm()
+
+
+def forward(joints_rad: Floats) -> Floats:
+    """Forward kinematics (equation 4.29): joints (..., 3) to the tip's place in the plane (..., 2), in metres."""
+    angles = np.cumsum(joints_rad, axis=-1)
+    return np.stack([(np.cos(angles) * LINKS_M).sum(axis=-1), (np.sin(angles) * LINKS_M).sum(axis=-1)], axis=-1)
+
+
+def distance_to_workspace(points_m: Floats) -> Floats:
+    """How far points lie outside of what the arm can reach, in metres; 0 inside. Points (..., 2), result (...).
+
+    With the elbow at polar angle t, |t| <= 120 degrees, the two outer links reach the ring of radii 0.1 and 0.5 m
+    around it. A point is outside exactly if its nearest elbow is more than 0.5 m away, by what is then missing.
+    """
+    radius, angle = np.linalg.norm(points_m, axis=-1), np.arctan2(points_m[..., 1], points_m[..., 0])
+    elbow = np.clip(angle, LOW_RAD[0], HIGH_RAD[0])
+    nearest = np.sqrt(radius**2 + LINKS_M[0] ** 2 - 2 * radius * LINKS_M[0] * np.cos(angle - elbow))
+    return np.maximum(nearest - LINKS_M[1] - LINKS_M[2], 0.0)
+
+
+def require_reachable(points_m: Floats, tolerance_m: float = 0.0) -> None:
+    """Raise InvalidValueError where a point (N, 2) lies further outside of the workspace than that, by how much."""
+    missing_m = distance_to_workspace(points_m)
+    if (missing_m > tolerance_m).any():
+        row = int(missing_m.argmax())
+        raise InvalidValueError(
+            f"{int((missing_m > tolerance_m).sum())} of {len(points_m)} targets are unreachable; the farthest, "
+            f"{np.round(points_m[row], 3).tolist()} m, lies {missing_m[row]:.3f} m outside of the workspace. "
+            "Choose targets whose distance_to_workspace is 0."
+        )
+
+
+def draw_targets(rng: np.random.Generator, count: int) -> Floats:
+    """Points drawn uniformly from the workspace. Shape (count, 2), in metres."""
+    found = np.empty((0, 2))
+    for _ in range(_DRAWS):
+        points = rng.uniform(-1.0, 1.0, size=(2 * count, 2))
+        found = np.concatenate([found, points[distance_to_workspace(points) == 0]])
+        if len(found) >= count:
+            return found[:count]
+    raise AssertionError("half of the square is workspace")  # pragma: no cover
+
+
+def draw_places(rng: np.random.Generator, count: int) -> Floats:
+    """Points drawn uniformly from the disc of the stretched arm, within reach or not. Shape (count, 2), in metres."""
+    radius, angle = sum(LINKS_M) * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, size=count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
+def samples_of(variant: str) -> int:
+    """The number of motor babbling samples that a variant names.
+
+    Raises:
+        InvalidValueError: It is not a whole number in the allowed range.
+    """
+    if not variant.isdecimal() or not MIN_SAMPLES <= int(variant) <= MAX_SAMPLES:
+        raise InvalidValueError(
+            f"A variant of robot_ik is a number of samples in [{MIN_SAMPLES}, {MAX_SAMPLES}], such as 2000, "
+            f"not {variant!r}."
+        )
+    return int(variant)
+
+
+def require_variant(variant: str) -> None:
+    """Raise InvalidValueError unless ``variant`` is a number of samples in the allowed range."""
+    samples_of(variant)
+
+
+def training(variant: str, rng: np.random.Generator) -> Dataset:
+    """Motor babbling: uniform joint configurations, carried out; the place reached, and the joints with noise."""
+    return testing(variant, rng, samples_of(variant))
+
+
+def testing(variant: str, rng: np.random.Generator, count: int) -> Dataset:
+    """More of the same babbling."""
+    require_variant(variant)
+    if count < 1:
+        raise InvalidValueError(f"{count} test points say nothing; ask for at least 1.")
+    joints_rad = rng.uniform(LOW_RAD, HIGH_RAD, size=(count, 3))
+    noise_rad = NOISE_RAD * rng.standard_normal(joints_rad.shape)
+    return Dataset(inputs=arm().execute(joints_rad), targets=joints_rad + noise_rad)
+
+
+def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
+    """Distance between the place asked for and the place reached by the predicted joints, in metres. Shape (N,).
+
+    Raises:
+        InvalidValueError: A place lies outside of the workspace.
+    """
+    require_variant(variant)
+    require_reachable(inputs, tolerance_m=1e-6)  # a stretched arm rests on the edge
+    return missed(inputs, predictions)
+
+
+def missed(points_m: Floats, joints_rad: Floats) -> Floats:
+    """How far from points (N, 2) the tip comes to rest when joints (N, 3) are carried out, in metres. Shape (N,)."""
+    return np.linalg.norm(arm().execute(joints_rad) - points_m, axis=-1)
+
+
+def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+    """The decisions of table 4.1 and the maps of figures 4.2 and 4.3.
+
+    Returns:
+        ``decision/...``: ``points`` and where the tip came to rest instead, ``reached`` (E, DECISIONS, CANDIDATES, 2),
+        ``error``, ``joints``, ``outside_m`` and one entry a score of the same leading shape, ``mink_error`` of the
+        first candidate of each choice (E, DECISIONS).
+        ``disc/...``: the same but ``mink_error`` of choices among points of the whole disc of the stretched arm, some
+        of them out of reach.
+        ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, ``stationarity``
+        (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
+    """
+    count = DECISIONS * CANDIDATES
+    parts = {"map": _map(variant, predict, len(seeds))}
+    points = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
+    parts["decision"] = {**_decide(points, predict, "decisions"), "mink_error": _mink_errors(points, seeds)}
+    points = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
+    parts["disc"] = _decide(points, predict, "disc")
+    measured = {f"{part}/{name}": values for part, found in parts.items() for name, values in found.items()}
+    return {**measured, "babbling": training(variant, seeds[0].child("data").generator()).inputs}
+
+
+def _decide(points_m: Floats, predict: Predict, purpose: str) -> dict[str, NDArray[Any]]:
+    """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
+    shape = (len(points_m), DECISIONS, CANDIDATES)
+    said = predict(points_m, purpose)
+    reached = np.stack([arm().execute(joints_rad) for joints_rad in said.prediction])  # [E, DECISIONS CANDIDATES, 2]
+    wrong = np.linalg.norm(reached - points_m, axis=-1)
+    result = {"points": points_m.reshape(*shape, 2), "error": wrong.reshape(shape)}
+    result |= {"reached": reached.reshape(*shape, 2)}
+    result |= {"joints": said.prediction.reshape(*shape, 3), "outside_m": distance_to_workspace(result["points"])}
+    return result | {name: score(said).reshape(shape) for name, score in SCORES.items()}
+
+
+def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
+    """Errors of inverse kinematics with the true arm at the first candidate of each choice. Shape (E, DECISIONS)."""
+    first = points_m.reshape(len(seeds), DECISIONS, CANDIDATES, 2)[:, :, 0]
+    solved = [arm().solve(p, node.child("mink").generator()) for p, node in zip(first, seeds, strict=True)]
+    return np.stack([missed(*pair) for pair in zip(first, solved, strict=True)])
+
+
+def _map(variant: str, predict: Predict, networks: int) -> dict[str, NDArray[Any]]:
+    side = np.linspace(-MARGIN_M, MARGIN_M, GRID)
+    points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    outside_m = distance_to_workspace(points)
+    said = predict(np.broadcast_to(points, (networks, *points.shape)), "map")
+    wrong, inside = np.full((networks, len(points)), np.nan), outside_m == 0
+    for row, prediction in enumerate(said.prediction):
+        wrong[row, inside] = errors(variant, points[inside], prediction[inside])
+    parts = {name: getattr(said, name) for name in ("epistemic", "aleatoric", "modal")}
+    return {"points": points, "outside_m": outside_m, "error": wrong, "stationarity": said.stationarity, **parts}
+
+
+SPEC = RegressionSpec(
+    id="robot_ik",
+    title="Robot inverse kinematics",
+    description=(
+        "A planar arm of three links moves at random and sees where its tip ends; from that it learns which joint "
+        "angles lead to a place. Then it may choose one of 20 places to reach for: does it choose one it can reach?"
+    ),
+    variants=("1000", "2000", "3000"),
+    require_variant=require_variant,
+    training=training,
+    testing=testing,
+    errors=errors,
+    error_name="distance between the place asked for and the place reached (m)",
+    wrong_above=0.1,
+    evaluate=evaluate,
+    sections="imagine_bench.regression.report_robot_ik:sections",
+    recorder="imagine_bench.recording.robot_ik:record",
+    scene=arm,
+    reference="robot_ik",
+)

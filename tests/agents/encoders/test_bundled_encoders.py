@@ -1,0 +1,87 @@
+"""The encoders that come with the package: what they read on fresh frames, and how fast."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard, bundled_encoder
+from imagine_bench.agents.encoders.probe import Latents
+from imagine_bench.agents.encoders.recipes import RECIPES
+from imagine_bench.agents.encoders.training import draw_frames
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.seeding import SeedTree
+
+PROMISED = [
+    (name, appearance, required)
+    for name, spec in ((name, registry.task(name)) for name in registry.TASKS)
+    if spec.targets is not None
+    for appearance, required in spec.targets.encoders.items()
+]
+"""Share of fresh frames whose whole macrostate must be read right."""
+
+
+@pytest.mark.parametrize(("task", "appearance", "required"), PROMISED)
+def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearance: str, required: float) -> None:
+    """1,000 frames of a seed that made nothing else; the margin is three binomial standard deviations."""
+    spec = registry.task(task)
+    path = bundled_encoder(f"{spec.encoder}-{appearance}")
+    encoder = Encoder.load(path)
+    assert path.stat().st_size < 2_000_000
+    assert (encoder.card.task, encoder.card.appearance) == (spec.id, appearance)
+    assert encoder.card == EncoderCard.from_json(path.with_suffix(".json").read_text())
+    assert encoder.card.recipe == RECIPES[spec.settings]["default"] and encoder.card.cpu_s["total"] <= 120
+    assert encoder.card.recipe.held_out_frames >= 4000 and encoder.card.probe["mlp"] >= required
+    rng = SeedTree(987_654_321).child("encoder_probe", appearance).generator()
+    frames, macrostates = draw_frames(spec, appearance, 1000, rng)
+    mu, sigma = encoder.encode(frames)
+    read = (encoder.read_macrostate(mu) == macrostates).all(axis=1).mean()
+    assert read >= required - 3 * math.sqrt(required * (1 - required) / 1000)
+    sampled = Latents(mu=mu, sigma=sigma).sample(torch.Generator().manual_seed(0))
+    expected = encoder.card.probe["mlp_sampled"]
+    read_sampled = (encoder.read_macrostate(sampled) == macrostates).all(axis=1).mean()
+    assert read_sampled >= expected - 3 * math.sqrt(max(expected * (1 - expected), 0.005) / 1000)
+    shuffled = (encoder.read_macrostate(mu) == np.roll(macrostates, 1, axis=0)).all(axis=1).mean()
+    assert shuffled < 2 / len(spec.rules.states) + 0.04  # the same measure fails where it should
+
+
+@pytest.mark.parametrize("task", sorted({name for name, *_ in PROMISED}))
+def test_bundled_encoder_reads_what_physics_leaves_behind(task: str) -> None:
+    """It was trained on frames whose outcomes were set; objects that were carried or turned lie a little elsewhere."""
+    spec = registry.task(task)
+    encoder = Encoder.load(bundled_encoder(f"{spec.encoder}-mild"))
+    env = gymnasium.make(spec.env_id, appearance="mild", disable_env_checker=True).unwrapped
+    rng, frames, macrostates, over = SeedTree(5).generator(), [], [], True
+    for step in range(40):
+        if over:
+            env.reset(seed=step)
+        frame, _, over, _, info = env.step(int(rng.integers(spec.n_actions)))
+        frames.append(frame)
+        macrostates.append(info["macrostate"])
+    env.close()
+    read = encoder.read_macrostate(encoder.encode(np.array(frames))[0])
+    assert (read == np.array(macrostates)).all(axis=1).sum() >= 39
+    assert len(np.unique(macrostates, axis=0)) > 5
+
+
+@pytest.mark.parametrize("appearance", ["clean", "mild"])
+@pytest.mark.parametrize("task", sorted({name for name, *_ in PROMISED}))
+def test_bundled_codes_give_every_macrostate_a_code_of_its_own(task: str, appearance: str) -> None:
+    """Neither torn by jitter nor mixed up. A code for every fourth frame of a macrostate would be a third torn."""
+    spec = registry.task(task)
+    encoder = Encoder.load(bundled_encoder(f"{spec.encoder}-{appearance}-codes"))
+    rng = SeedTree(987_654_321).child("encoder_probe", appearance, "codes").generator()
+    frames, macrostates = draw_frames(spec, appearance, 1000, rng)
+    codes = [tuple(row) for row in encoder.encode(frames)[0].tolist()]
+    pairs = Counter(zip(map(tuple, macrostates.tolist()), codes, strict=True))
+    usual: dict[tuple[int, ...], tuple[float, ...]] = {}
+    for (macrostate, code), _ in pairs.most_common():
+        usual.setdefault(macrostate, code)
+    assert len(set(usual.values())) == len(usual)
+    assert sum(pairs[macrostate, code] for macrostate, code in usual.items()) >= 995

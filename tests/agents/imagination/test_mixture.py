@@ -1,0 +1,128 @@
+"""The mixture's mathematics against torch.distributions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.mixture import Mixture
+from torch import distributions
+
+N, K, Z = 7, 4, 3
+
+
+def random_mixture(*leading: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Mixture:
+    generator = torch.Generator().manual_seed(seed)
+    outputs = torch.randn(*leading, mdn.output_size(K, Z), generator=generator, dtype=dtype) * 2.0
+    return mdn.from_outputs(outputs, K, Z, log_sigma_floor=-4.0)
+
+
+def reference(mixture: Mixture) -> distributions.MixtureSameFamily:
+    components = distributions.Independent(distributions.Normal(mixture.means, mixture.log_sigmas.exp()), 1)
+    return distributions.MixtureSameFamily(distributions.Categorical(logits=mixture.log_weights), components)
+
+
+def test_log_likelihood_and_mean_are_those_of_torch_distributions() -> None:
+    mixture = random_mixture(N)
+    targets = torch.randn(N, Z, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 3.0
+    oracle = reference(mixture)
+    torch.testing.assert_close(mdn.log_likelihood(mixture, targets), oracle.log_prob(targets), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(mdn.mean(mixture), oracle.mean, rtol=1e-10, atol=1e-10)
+
+
+def test_log_likelihood_stays_finite_where_densities_underflow() -> None:
+    mixture = random_mixture(N, dtype=torch.float32)
+    far = torch.full((N, Z), 300.0)
+    assert reference(mixture).log_prob(far).exp().max() == 0.0, "the density itself must underflow here"
+    assert torch.isfinite(mdn.log_likelihood(mixture, far)).all()
+
+
+def test_gradient_of_the_log_likelihood_against_finite_differences() -> None:
+    outputs = torch.randn(2, mdn.output_size(K, Z), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    target = torch.randn(2, Z, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+
+    def loss(values: torch.Tensor) -> torch.Tensor:
+        return mdn.log_likelihood(mdn.from_outputs(values, K, Z, -4.0), target)
+
+    assert torch.autograd.gradcheck(loss, (outputs.requires_grad_(),), eps=1e-6, atol=1e-7)
+
+
+def test_every_gradient_of_the_log_likelihood_is_summed_over_what_was_broadcast() -> None:
+    """Targets of one leading axis more than the mixture, and a mixture of one more than the targets."""
+    draws = torch.Generator().manual_seed(5)
+
+    def loss(log_weights: torch.Tensor, means: torch.Tensor, sigmas: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        return mdn.log_likelihood(Mixture(log_weights, means, sigmas), t)
+
+    for leading, targets in (((), (3,)), ((2, 3), (3,))):
+        shapes = (*leading, K), (*leading, K, Z), (*leading, K, Z), (*targets, Z)
+        values = [torch.randn(shape, dtype=torch.float64, generator=draws).requires_grad_() for shape in shapes]
+        assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-7)
+
+
+def test_sigma_never_falls_below_the_floor_and_keeps_a_gradient_near_it() -> None:
+    outputs = torch.full((1, mdn.output_size(K, Z)), -8.0, dtype=torch.float64, requires_grad=True)
+    mixture = mdn.from_outputs(outputs, K, Z, log_sigma_floor=-4.0)
+    assert (mixture.log_sigmas >= -4.0).all()
+    mixture.log_sigmas.sum().backward()
+    assert outputs.grad is not None
+    assert (outputs.grad[:, -K * Z :] > 0.1).all()
+
+
+def test_coefficients_sum_to_one() -> None:
+    torch.testing.assert_close(random_mixture(N).log_weights.exp().sum(-1), torch.ones(N, dtype=torch.float64))
+
+
+def test_samples_have_the_mean_and_variance_of_the_mixture() -> None:
+    one = random_mixture(1)
+    count = 200_000
+    many = one.map(lambda values: values.expand(count, *values.shape[1:]))
+    variance = reference(one).variance[0]
+    drawn = mdn.sample(many, 1.0, torch.Generator().manual_seed(4))
+    error = drawn.mean(0) - mdn.mean(one)[0]
+    assert (error.abs() < 4.0 * (variance / count).sqrt()).all()
+    torch.testing.assert_close(drawn.var(0), variance, rtol=0.03, atol=0.0)
+
+
+def test_temperature_zero_gives_the_mean_of_a_component_and_scales_the_noise() -> None:
+    mixture = random_mixture(N)
+    cold = mdn.sample(mixture, 0.0, torch.Generator().manual_seed(5))
+    distance = (mixture.means - cold.unsqueeze(1)).abs().sum(-1)  # [N, K]
+    assert (distance.min(dim=1).values == 0.0).all()
+    warm, half = (mdn.sample(mixture, t, torch.Generator().manual_seed(5)) for t in (1.0, 0.5))
+    torch.testing.assert_close(half - cold, 0.5 * (warm - cold))
+    assert (warm != cold).all()
+
+
+def test_the_likeliest_value_is_the_mean_of_the_largest_component() -> None:
+    mixture = random_mixture(2, N)
+    found = mdn.likeliest(mixture)
+    for pair in np.ndindex(2, N):
+        assert torch.equal(found[pair], mixture.means[pair][int(mixture.log_weights[pair].argmax())])
+    draws = [mdn.sample(mixture.map(lambda part: part[0]), 0.0, torch.Generator().manual_seed(s)) for s in range(99)]
+    distances = (torch.stack(draws) - found[0]).abs().sum(-1)  # [99, N]
+    assert 0.2 < (distances == 0.0).double().mean() < 1.0  # it is drawn, and so are others
+
+
+def test_average_over_weight_samples_averages_coefficients_means_and_variances() -> None:
+    samples = random_mixture(5, N)
+    averaged = mdn.average(samples)
+    torch.testing.assert_close(averaged.log_weights.exp(), samples.log_weights.exp().mean(0))
+    torch.testing.assert_close(averaged.means, samples.means.mean(0))
+    torch.testing.assert_close((2.0 * averaged.log_sigmas).exp(), (2.0 * samples.log_sigmas).exp().mean(0))
+
+
+@pytest.mark.parametrize(("components", "dimensions", "size"), [(5, 8, 85), (1, 1, 3)])
+def test_output_size(components: int, dimensions: int, size: int) -> None:
+    assert mdn.output_size(components, dimensions) == size
+
+
+def test_an_ensemble_predicts_with_all_its_members_components() -> None:
+    """Two members that swap the order of their components: averaging them one by one would invent a third place."""
+    means = torch.tensor([[0.0, 10.0], [10.0, 0.0]]).view(2, 1, 2, 1)  # [E, N, K, Z]
+    members = mdn.Mixture(torch.full((2, 1, 2), 0.5).log(), means, torch.full((2, 1, 2, 1), -3.0))
+    pooled = mdn.average(members, members=2)
+    assert sorted(pooled.means.flatten().tolist()) == [0.0, 0.0, 10.0, 10.0]
+    torch.testing.assert_close(pooled.log_weights.exp(), torch.full((1, 4), 0.25))
+    assert mdn.average(members).means.flatten().tolist() == [5.0, 5.0]

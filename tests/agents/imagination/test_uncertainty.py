@@ -1,0 +1,97 @@
+"""The split of the predictive variance against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.mixture import Mixture
+from imagine_bench.agents.imagination.uncertainty import decompose, drawn_variance, reduction, surprise
+
+from imagine_bench.errors import UnknownNameError
+
+T, N, K, Z = 6, 5, 3, 2
+
+
+def samples(dtype: torch.dtype) -> Mixture:
+    generator = torch.Generator().manual_seed(0)
+    outputs = torch.randn(T, N, mdn.output_size(K, Z), generator=generator, dtype=torch.float64)
+    return mdn.from_outputs(outputs.to(dtype), K, Z, log_sigma_floor=-3.0)
+
+
+def brute_force_total(mixtures: Mixture) -> np.ndarray:
+    """Variance of the uniform mixture over all T K components, in plain loops and second moments."""
+    weights, means = mixtures.log_weights.double().exp().numpy(), mixtures.means.double().numpy()
+    variances = (2.0 * mixtures.log_sigmas.double()).exp().numpy()
+    total = np.zeros((N, Z))
+    for n in range(N):
+        for z in range(Z):
+            first = second = 0.0
+            for t in range(T):
+                for k in range(K):
+                    probability = weights[t, n, k] / T
+                    first += probability * means[t, n, k, z]
+                    second += probability * (variances[t, n, k, z] + means[t, n, k, z] ** 2)
+            total[n, z] = second - first**2
+    return total
+
+
+@pytest.mark.parametrize(("dtype", "relative"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_the_three_causes_sum_to_the_total_predictive_variance(dtype: torch.dtype, relative: float) -> None:
+    parts = decompose(samples(dtype))
+    total = (parts.epistemic + parts.aleatoric + parts.modal).double().numpy()
+    np.testing.assert_allclose(total, brute_force_total(samples(dtype)), rtol=relative)
+
+
+def test_each_cause_is_its_equation() -> None:
+    mixtures = samples(torch.float64)
+    alpha, mu, var = (
+        mixtures.log_weights.exp().unsqueeze(-1),
+        mixtures.means,
+        (2.0 * mixtures.log_sigmas).exp(),
+    )
+    inner = (alpha * mu).sum(2)  # [T, N, Z]
+    parts = decompose(mixtures)
+    torch.testing.assert_close(parts.epistemic, inner.square().mean(0) - inner.mean(0).square())  # 4.25
+    torch.testing.assert_close(parts.aleatoric, (alpha * var).sum(2).mean(0))  # 4.26
+    torch.testing.assert_close(parts.modal, ((alpha * mu.square()).sum(2) - inner.square()).mean(0))  # 4.27
+
+
+def test_one_weight_sample_has_no_epistemic_and_one_component_no_modal_uncertainty() -> None:
+    mixtures = samples(torch.float64)
+    lone = Mixture(mixtures.log_weights[:1], mixtures.means[:1], mixtures.log_sigmas[:1])
+    assert decompose(lone).epistemic.abs().max() == 0.0
+    assert decompose(lone).modal.min() > 0.0
+    single = Mixture(torch.zeros(T, N, 1), mixtures.means[:, :, :1].float(), mixtures.log_sigmas[:, :, :1].float())
+    assert decompose(single).modal.abs().max() == 0.0
+    assert decompose(single).epistemic.min() > 0.0
+
+
+@pytest.mark.parametrize(("name", "expected"), [("sum", 6.0), ("mean", 2.0), ("max", 3.0)])
+def test_reductions_by_name(name: str, expected: float) -> None:
+    assert reduction(name)(torch.tensor([[1.0, 2.0, 3.0]])).tolist() == [expected]
+
+
+def test_a_drawn_value_is_as_uncertain_as_the_component_it_came_from() -> None:
+    """Two components far apart: noise 1 and weights that move the mean by 1, noise 9 and weights that agree."""
+    means = torch.tensor([[[[0.0], [100.0]]], [[[2.0], [100.0]]]])  # [T = 2, N = 1, K = 2, Z = 1]
+    log_sigmas = torch.tensor([1.0, 3.0]).log().view(1, 1, 2, 1).expand(2, 1, 2, 1)
+    both = Mixture(torch.full((2, 1, 2), 0.5).log(), means, log_sigmas)
+    for value, variance in ((1.0, 1.0 + 1.0), (100.0, 9.0)):
+        found = drawn_variance(both, mdn.average(both), torch.tensor([[value]]))
+        assert found.item() == pytest.approx(variance, rel=1e-5)
+    for value, variance in ((0.0, 1.0), (2.0, 1.0), (100.0, 9.0)):  # two networks, whose components nobody averages
+        found = drawn_variance(both, mdn.average(both, 2), torch.tensor([[value]]), members=2)
+        assert found.item() == pytest.approx(variance, rel=1e-5)
+
+
+def test_surprise_is_the_negative_log_density_of_all_weight_samples_together() -> None:
+    mixtures, values = samples(torch.float64), torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
+    densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), values).exp() for t in range(T)]
+    torch.testing.assert_close(surprise(mixtures, values), -torch.stack(densities).mean(dim=0).log())
+
+
+def test_an_unknown_reduction_lists_the_known_ones() -> None:
+    with pytest.raises(UnknownNameError, match=r"No uncertainty reduction 'men'. Did you mean 'mean'\? Known: sum, m"):
+        reduction("men")

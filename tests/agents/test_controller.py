@@ -1,0 +1,90 @@
+"""The controller: targets by hand, the schedule, gradients."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from imagine_bench.agents.controller import Controller, bellman_errors, epsilon, td_target
+from imagine_bench.agents.networks import joint
+from imagine_bench.agents.networks.mlp import Parameters
+from imagine_bench.agents.replay import Batch
+from imagine_bench.agents.settings import ControllerSettings
+
+from imagine_bench.errors import DivergedError
+
+
+def test_target_by_hand_termination_stops_bootstrapping_and_truncation_does_not() -> None:
+    reward, q_next = torch.tensor([50.0, -1.0]), torch.tensor([[3.0, 7.0], [3.0, 7.0]])
+    ended_and_cut_off = torch.tensor([1.0, 0.0])  # a truncated transition is stored with terminated = 0
+    assert td_target(reward, ended_and_cut_off, q_next, 0.9).tolist() == pytest.approx([50.0, -1.0 + 0.9 * 7.0])
+
+
+def test_epsilon_falls_from_maximum_to_minimum() -> None:
+    settings = ControllerSettings(epsilon_min=0.001, epsilon_max=0.8, epsilon_decay=0.03)
+    assert epsilon(0, settings) == pytest.approx(0.8)
+    assert epsilon(100, settings) == pytest.approx(0.001 + 0.799 * math.exp(-3.0))
+    assert epsilon(10**6, settings) == pytest.approx(0.001)
+
+
+def make(discount: float = 0.9) -> Controller:
+    settings = ControllerSettings(hidden=(8,), discount=discount)
+    return Controller(3, 2, settings, torch.Generator().manual_seed(0))
+
+
+def batch(reward: float = 1.0) -> Batch:
+    generator = torch.Generator().manual_seed(1)
+    z, next_z = torch.randn(2, 5, 3, generator=generator)
+    terminated = torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0])
+    return Batch(z, torch.tensor([0, 1, 1, 0, 1]), torch.full((5,), reward), next_z, terminated)
+
+
+def loss(controller: Controller, rows: Batch) -> torch.Tensor:
+    return bellman_errors([controller], joint.batches([rows]), Parameters(controller.optimiser.parameters))[0, 0]
+
+
+def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
+    controller, rows = make(), batch()
+    values, following = controller.values(rows.z), controller.values(rows.next_z)
+    errors = []
+    for i in range(5):
+        bootstrap = 0.0 if rows.terminated[i] else 0.9 * following[i].max()
+        errors.append((1.0 + bootstrap - values[i, rows.action[i]]) ** 2)
+    torch.testing.assert_close(loss(controller, rows).detach(), torch.stack(errors).mean())
+
+
+def test_no_gradient_flows_through_the_target() -> None:
+    controller, rows = make(), batch()
+    target = td_target(rows.reward, rows.terminated, controller.values(rows.next_z), 0.9)
+    q = controller.network(rows.z.unsqueeze(0))[0].gather(1, rows.action.unsqueeze(1)).squeeze(1)
+    weight = controller.network.weights[0]
+    (expected,) = torch.autograd.grad((target - q).square().mean(), weight)
+    (given,) = torch.autograd.grad(loss(controller, rows), weight)
+    torch.testing.assert_close(given, expected)
+    assert expected.abs().max() > 0.0
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_leaves_the_weights() -> None:
+    controller = make()
+    before = controller.optimiser.arrays()["value"]
+    with pytest.raises(DivergedError, match=r"controller's loss is nan. Lower controller.learning_rate"):
+        controller.update(batch(reward=float("nan")))
+    assert (controller.optimiser.arrays()["value"] == before).all()
+
+
+def test_a_target_network_follows_at_its_rate_and_gives_the_targets() -> None:
+    settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
+    controller = Controller(3, 2, settings, torch.Generator().manual_seed(0))
+    before = controller.arrays()["value"]
+    assert (controller.arrays()["target"] == before).all()
+    controller.update(batch())
+    after = controller.arrays()
+    expected = before + 0.25 * (after["value"] - before)
+    assert after["target"] == pytest.approx(expected, abs=1e-7) and (after["value"] != before).any()
+    plain = make()
+    plain.load({name: array for name, array in after.items() if name != "target"})
+    assert loss(controller, batch()) != loss(plain, batch()), "the loss must use the target network's values"
+    again = Controller(3, 2, settings, torch.Generator().manual_seed(5))
+    again.load(after)
+    assert loss(controller, batch()) == loss(again, batch())

@@ -1,0 +1,183 @@
+"""Agents from Stable-Baselines3: they learn, the same each time, from the starts that every agent of a seed meets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from test_runner import same_but_for_time, small
+
+import imagine_bench  # noqa: F401 - registers the environments
+from imagine_bench import registry
+from imagine_bench.bench import runner
+from imagine_bench.bench.bench import plan
+from imagine_bench.bench.evaluation import TrainingStarts
+from imagine_bench.bench.runs import RunSpec
+from imagine_bench.capabilities import ExternalTrainer
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.seeding import episode_seed
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.results import RunResult
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+LATENTS = "sb3_dqn_latents"
+FEW: dict[str, Any] = {"sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500}
+
+
+def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> RunResult:
+    few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": tuple(sorted(FEW.items()))}
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
+    result = runner.run(spec, folder, lambda progress: None)
+    assert result is not None
+    return result
+
+
+@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS])
+def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
+    result = do(tmp_path / "run", agent)
+    first, last = result.checkpoints
+    assert [row.env_steps for row in result.checkpoints] == [
+        result.training_length[:6].sum(),
+        result.training_length.sum(),
+    ]
+    assert result.training_length.shape == (12,) and result.training_length.max() <= 10
+    assert (first.test_episodes, last.test_episodes) == (4, 4)
+    assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
+
+
+def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
+    """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
+    short = do(tmp_path / "short", budgets=(6,), overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
+    longer = do(tmp_path / "longer", overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
+    first, same = short.checkpoints[0], longer.checkpoints[0]
+    assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
+
+
+def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    do(tmp_path / "run")
+    assert not list(temporary.iterdir())
+
+
+def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = do(tmp_path / "whole")
+
+    def killed(*arguments: Any, **names: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runner.run_folder, "finish", killed)
+        do(tmp_path / "run")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runner.EvaluationCounts, "add_episode", killed)
+        do(tmp_path / "run")
+    assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
+    assert same_but_for_time(whole, do(tmp_path / "run"))
+    other = do(tmp_path / "other", seed=1)
+    assert whole.training_length.tolist() != other.training_length.tolist()
+
+
+def test_the_registry_knows_which_agents_train_themselves() -> None:
+    for name, entry in registry.AGENTS.items():
+        if entry.settings == "imagine_bench.agents.library.settings":
+            agent = registry.make_agent(name, spec(name).context())
+            assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
+        else:
+            assert not entry.external_training_loop
+
+
+def test_its_episodes_start_where_every_agent_of_that_seed_starts() -> None:
+    entry = registry.task_entry("arrow_puzzle")
+    with_starts = TrainingStarts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
+    plain = gymnasium.make(entry.env_id, execution="kinematic")
+    for episode in range(4):
+        frame, _ = with_starts.reset(seed=99)  # a loop may ask for another
+        expected, _ = plain.reset(seed=episode_seed("training", 3, episode))
+        assert np.array_equal(frame, expected)
+    with_starts.close()
+    plain.close()
+
+
+def test_latents_are_those_of_our_own_agents() -> None:
+    from imagine_bench.agents.encoders.encoder import Encoder
+    from imagine_bench.agents.library.latent_observation import LatentObservation
+
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    wrapped = LatentObservation(env, "arrow_puzzle-clean")
+    latents, _ = wrapped.reset(seed=5)
+    frame, _ = env.reset(seed=5)
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    assert np.array_equal(latents, Encoder.load(path).encode(frame[None])[0][0].numpy())
+    assert latents.shape == wrapped.observation_space.shape and latents.dtype == np.float32
+    assert wrapped.observation_space.contains(wrapped.step(0)[0])
+    wrapped.close()
+
+
+def test_latents_of_another_task_or_of_no_name_are_refused() -> None:
+    from imagine_bench.agents.library.latent_observation import LatentObservation
+
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    with pytest.raises(InvalidValueError, match=r"pick_place reads frames as 'small_rgb', this .* 'gray_strips'"):
+        LatentObservation(env, "pick_place-clean")
+    with pytest.raises(UnknownNameError, match=r"No encoder 'arrow_puzle-clean'\. Did you mean 'arrow_puzzle-clean'"):
+        LatentObservation(env, "arrow_puzle-clean")
+    env.close()
+
+
+def test_it_is_never_taken_up_again_half_way() -> None:
+    agent = registry.make_agent("sb3_dqn", spec("sb3_dqn").context())
+    with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):
+        agent.restore(AgentState(arrays={}, values={}))
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from imagine_bench.agents.library import sb3 as peers
+
+    present = peers.importlib.import_module
+
+    def missing(name: str) -> Any:
+        if name == "sb3_contrib":
+            raise ImportError(f"No module named {name!r}")
+        return present(name)
+
+    context = spec("sb3_qrdqn").context()
+    monkeypatch.setattr(peers.importlib, "import_module", missing)
+    sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
+    with pytest.raises(SetupError, match=sentence):
+        peers.make_qrdqn(context)
+    with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
+        plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "words"),
+    [
+        ({"sb3.gamma": 1.5}, InvalidValueError, r"sb3\.gamma is 1\.5; it must lie in \[0, 1\]"),
+        ({"sb3.learning_rate": 0.0}, InvalidValueError, r"sb3\.learning_rate is 0\.0; it must be above 0"),
+        ({"sb3.batch_size": 0}, InvalidValueError, r"sb3\.batch_size is 0; it must be at least 1"),
+        ({"sb3.tau": 0.1}, UnknownNameError, "No setting 'sb3.tau'"),
+    ],
+)
+def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        registry.load("imagine_bench.agents.library.settings:resolve")("quick", overrides, "chapter_5")
+
+
+def spec(agent: str) -> RunSpec:
+    return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0)
+
+
+@pytest.mark.slow
+def test_it_learns_far_above_chance(tmp_path: Path) -> None:
+    result = do(tmp_path / "run", budgets=(1500,), evaluation_episodes=100, overrides=())
+    chance = registry.task("arrow_puzzle").facts().chance_level
+    assert result.checkpoints[-1].success_rate > 10 * chance

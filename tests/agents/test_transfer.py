@@ -1,0 +1,257 @@
+"""What learners keep from one task to the next of the same world, what they forget, and what they ask about."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import fake_codes
+import numpy as np
+import pytest
+from fake_codes import ACTIONS, agent, frame, live, starts, success
+from fake_latents import context
+from fake_latents import live as live_on_latents
+from imagine_bench.agents.factored.agent import ImagineAgent
+from imagine_bench.agents.factored.dynamics import Dynamics
+from imagine_bench.agents.factored.queries import last_step, likeliest
+from imagine_bench.agents.imagination import agent as imagination_agents
+from imagine_bench.agents.imagination import model_only as imagination_only
+from test_imagine import same
+from test_learner import same as same_learner
+
+from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
+from imagine_bench.interfaces import Observation
+
+GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
+"""Another task in the tiny world: other goals, the same bad end."""
+
+
+def other_step(code: tuple[int, ...], action: int) -> tuple[tuple[int, ...], float, bool]:
+    reached, reward, ended = _STEP(code, action)
+    if reward > 0:
+        return reached, -1.0, False
+    return (reached, 10.0, True) if reached in GOALS.values() else (reached, reward, ended)
+
+
+_STEP, _STARTS = fake_codes.step, fake_codes.starts
+
+
+@pytest.fixture
+def other_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    codes = [code for code in (*_STARTS(), *GOALS) if code not in GOALS.values()]
+    monkeypatch.setattr(fake_codes, "step", other_step)
+    monkeypatch.setattr(fake_codes, "starts", lambda: codes)
+
+
+def dynamics_of(learner: ImagineAgent) -> list[np.ndarray]:
+    return [part.evidence for part in learner.model.dynamics.parts]
+
+
+def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
+    learner, rng = agent(), np.random.default_rng(0)
+    assert isinstance(learner, TransferLearner)
+    live(learner, range(30), rng)
+    assert learner.diagnostics()["real_transitions"] == len(learner.memory)
+    live(learner, range(30, 31), rng)
+    learner.reset_for_new_task()
+    known = Dynamics(learner.sizes, ACTIONS, learner.settings.dynamics)
+    for row in learner.memory.since(0):
+        known.add(np.array(row.code), row.action, np.array(row.following))
+    for mine, all_of_it in zip(dynamics_of(learner), known.parts, strict=True):
+        assert np.array_equal(mine, all_of_it.evidence)
+    assert learner.model.outcomes.causes is None
+    assert not learner.q_values(Observation(frame=frame((0, 1, 0)))).any(), "nothing is known of the new task"
+    measured = learner.diagnostics()
+    assert set(measured) == {"real_transitions", "teacher/answers", "model/outcomes"}, "nothing yet of this task"
+    assert measured["real_transitions"] == 0
+
+
+@pytest.mark.parametrize("carried", [0.0, 0.5])
+def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
+    learner = agent(outcomes__carried=carried)
+    live(learner, range(40), np.random.default_rng(0))
+    learner.reset_for_new_task()
+    lamp = Observation(frame=frame((0, 2, 1)))
+    watch(learner, (0, 2, 0), 1)  # (2, 2, 0), the bad end: both kinds of end are met again, one by hint alone
+    watch(learner, (0, 1, 1), 3)  # back to (0, 0, 1)
+    before = float(learner.imagine(lamp.frame, actions=np.array([3]), depth=1, rng=np.random.default_rng(0)).rewards[0])
+    goal = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
+    assert (goal.rewards[0] > 2.0) == (carried > 0.0), "an earlier goal is expected where hints are taken"
+    for _ in range(2):
+        won = fake_codes.transition((2, 0, 1), 2)
+        learner.observe(dataclasses.replace(won, reward=-1.0, terminated=False), episode=1)
+    after = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
+    assert after.rewards[0] < 1.0
+    assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by hint alone, too"
+
+
+def watch(learner: ImagineAgent, code: tuple[int, ...], action: int) -> None:
+    learner.observe(fake_codes.transition(code, action), episode=0)
+
+
+def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    learned = agent(3)
+    live(learned, range(40), np.random.default_rng(3))
+    assert success(learned) == 1.0
+    learned.reset_for_new_task()
+    fresh = agent(3)
+    codes = [code for code in (*_STARTS(), *GOALS) if code not in GOALS.values()]
+    monkeypatch.setattr(fake_codes, "step", other_step)
+    monkeypatch.setattr(fake_codes, "starts", lambda: codes)
+    scores = []
+    for learner in (learned, fresh):
+        rng, curve = np.random.default_rng(4), []
+        for first in range(0, 16, 4):
+            live(learner, range(first, first + 4), rng)
+            curve.append(success(learner))
+        scores.append(curve)
+    assert scores[0][-1] == 1.0
+    assert sum(scores[0]) > sum(scores[1]) + 0.3
+
+
+def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_bit(other_task: None) -> None:
+    learner, resumed = agent(), agent(99)
+    first, second = np.random.default_rng(0), np.random.default_rng(0)
+    live(learner, range(10), first)
+    learner.reset_for_new_task()
+    ask(learner, 2)
+    live(learner, range(3), first)
+    second.bit_generator.state = first.bit_generator.state
+    saved = learner.state()
+    kept = copy.deepcopy(saved)
+    onward = live(learner, range(3, 12), first)
+    assert same(saved, kept)
+    resumed.restore(saved)
+    assert live(resumed, range(3, 12), second) == onward
+    learner.reset_for_new_task()
+    resumed.reset_for_new_task()
+    assert live(learner, range(4), first) == live(resumed, range(4), second)
+    assert same(learner.state(), resumed.state())
+
+
+# --- questions ---------------------------------------------------------------------------------------------------
+
+
+def ask(learner: ImagineAgent, questions: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+    """Let it ask and answer truly; the plans asked about."""
+    asked = []
+    for _ in range(questions):
+        actions = learner.question(Observation(frame=frame(code)))
+        if actions is None:
+            break
+        asked.append(tuple(actions.tolist()))
+        here = code
+        for action in actions:
+            here, reward, ended = _STEP(here, int(action))
+        learner.learn_label(Observation(frame=frame(code)), actions, Answer(reward, ended))
+    return asked
+
+
+def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics() -> None:
+    learner = agent()
+    assert isinstance(learner, QueryingAgent)
+    assert learner.question(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
+    live(learner, range(12), np.random.default_rng(0))
+    learner._learn(len(learner.memory))  # what was no surprise too
+    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.memory.real()
+    doubt = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
+    asked = ask(learner, 200)
+    assert 0 < len(asked) < 200
+    assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
+    assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
+    assert (learner.memory.real(), learner.memory.told()) == (real, len(asked))
+    assert learner.diagnostics()["teacher/answers"] == len(asked)
+    after = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
+    assert after <= doubt
+
+
+def test_answers_save_episodes() -> None:
+    def curve(questions: int) -> float:
+        total = 0.0
+        for seed in range(3):
+            learner, rng = agent(seed), np.random.default_rng(seed)
+            for first in range(0, 20, 5):
+                live(learner, range(first, first + 5), rng)
+                ask(learner, questions, (0, 1, 1))
+                ask(learner, questions, (0, 1, 0))
+                total += success(learner) / 12
+        return total
+
+    assert curve(4) > curve(0) + 0.05
+
+
+def test_what_has_no_answer_is_not_asked_again() -> None:
+    learner = agent()
+    live(learner, range(12), np.random.default_rng(0))
+    seen, asked = Observation(frame=frame((0, 1, 1))), []
+    for _ in range(5):
+        actions = learner.question(seen)
+        assert actions is not None
+        code, action, _ = last_step(learner.model, (0, 1, 1), actions)
+        asked.append((code, action))
+        learner.learn_label(seen, actions, None)
+    assert len(set(asked)) == 5
+    assert learner.memory.told() == 0
+    assert learner.memory.in_vain == set(asked)
+
+
+def test_questions_lead_where_the_dynamics_do() -> None:
+    learner = agent()
+    live(learner, range(40), np.random.default_rng(0))
+    learner._learn(len(learner.memory))
+    code, action, following = last_step(learner.model, (0, 1, 1), np.array([0, 2, 1]))
+    assert code == (1, 2, 1)
+    assert (action, following) == (1, (0, 2, 1))
+    reached, sure = likeliest(learner.model, np.array(starts()))
+    assert reached.shape == (len(starts()), ACTIONS, 3)
+    assert sure.shape == (len(starts()), ACTIONS)
+    assert all(
+        tuple(reached[row, action].tolist()) == _STEP(code, action)[0]
+        for row, code in enumerate(starts())
+        for action in range(ACTIONS)
+    )
+
+
+def test_a_prior_for_staying_is_no_knowledge() -> None:
+    """Of one part that holds all, it alone would call more than half sure."""
+    learner = agent(dynamics__factored=False)
+    codes = np.array([learner._modelled(code) for code in starts()])
+    assert not likeliest(learner.model, codes)[1].any()
+    live(learner, range(20), np.random.default_rng(0))
+    learner._learn(len(learner.memory))
+    assert (likeliest(learner.model, codes)[1] > 0.5).any()
+
+
+# --- the thesis' agents ------------------------------------------------------------------------------------------
+
+
+def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
+    learner = imagination_agents.make_uncertainty(context(monkeypatch, moving))
+    live_on_latents(learner, range(4), np.random.default_rng(0))
+    assert learner.imagination.threshold < 99.0
+    learner.reset_for_new_task()
+    assert learner.imagination.threshold == 99.0
+
+
+@pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, imagination_only.make])
+def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    learner, resumed = make(context(monkeypatch)), make(context(monkeypatch))
+    live_on_latents(learner, range(8), np.random.default_rng(0))
+    model = learner.imagination.model
+    kept = [weight.clone() for weight in model.dynamics.parameters()]
+    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.assessment, learner.controller)]
+    resumed.restore(learner.state())
+    learner.reset_for_new_task()
+    resumed.reset_for_new_task()
+    model = learner.imagination.model
+    assert all(bool((a == b).all()) for a, b in zip(kept, model.dynamics.parameters(), strict=True))
+    for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):
+        assert any(bool((a != b).any()) for a, b in zip(before, part.parameters(), strict=True))
+    assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
+    assert same_learner(learner.state(), resumed.state())
+    rngs = np.random.default_rng(1), np.random.default_rng(1)
+    assert live_on_latents(learner, range(5), rngs[0]) == live_on_latents(resumed, range(5), rngs[1])
+    trained = [weight.clone() for weight in learner.imagination.model.dynamics.parameters()]
+    assert any(bool((a != b).any()) for a, b in zip(kept, trained, strict=True)), "it goes on learning"
+    assert same_learner(learner.state(), resumed.state())

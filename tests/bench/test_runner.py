@@ -1,0 +1,289 @@
+"""One run: what agents are shown, what is counted, and that a killed and resumed run ends in the same bits."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import bench_fakes
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import imagine_bench  # noqa: F401 - registers the environments
+from imagine_bench import registry
+from imagine_bench.bench import runner
+from imagine_bench.bench.evaluation import EvaluationCounts
+from imagine_bench.bench.protocol import Protocol, protocol
+from imagine_bench.bench.runs import Progress, RunSpec
+from imagine_bench.errors import ArtefactError, DivergedError
+from imagine_bench.interfaces import AgentContext, Transition
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, episode_seed
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.results import Checkpoint, RunResult
+
+_TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
+
+
+def small(**changes: Any) -> Protocol:
+    few: dict[str, Any] = {
+        "agents": ("table",),
+        "seeds": (0,),
+        "budgets": (4, 9),
+        "evaluation_episodes": 5,
+        "execution": "kinematic",
+        "open_loop_starts": 0,
+        "recorded_episodes": 0,
+    }
+    return protocol("arrow_puzzle", "smoke", **{**few, **changes})
+
+
+def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:
+    spec = RunSpec(protocol=small(**changes), agent=agent, seed=seed, checkpoint_every_s=every_s)
+    return runner.run(spec, folder, lambda progress: None)
+
+
+def same_but_for_time(a: RunResult, b: RunResult) -> bool:
+    def rows(result: RunResult) -> list[Checkpoint]:
+        return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
+
+    arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
+    return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
+
+
+@pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
+def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
+) -> None:
+    asked = []
+    for name in ("examples", "imagine_sampled_rollouts", "ask"):
+        real = getattr(runner, name)
+        monkeypatch.setattr(
+            runner, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
+        )
+    do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
+    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("ask", purpose)}
+
+
+def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:
+    snapshot = load_newest(folder / "checkpoints")
+    assert snapshot is not None
+    return dict(snapshot.agent.arrays)
+
+
+def test_a_run_counts_what_happens(tmp_path: Path) -> None:
+    told: list[Progress] = []
+    spec = RunSpec(protocol=small(), agent="table", seed=3)
+    result = runner.run(spec, tmp_path / "run", told.append)
+    assert [row.episodes for row in result.checkpoints] == [4, 9]
+    assert result.training_length.shape == result.training_success.shape == (9,)
+    assert [row.env_steps for row in result.checkpoints] == [
+        result.training_length[:4].sum(),
+        result.training_length.sum(),
+    ]
+    assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [
+        row.env_steps for row in result.checkpoints
+    ]
+    assert all(row.test_episodes == 5 and 1 <= row.mean_length <= 10 for row in result.checkpoints)
+    assert result.settings == {"rate": 0.5}
+    assert (result.agent, result.seed, result.recording) == ("table", 3, None)
+    assert told[-1].phase == "done" and told[-1].done == told[-1].work == 9 + 2 * 5
+
+
+def test_the_runner_itself_learns_from_every_transition_once(tmp_path: Path) -> None:
+    """The runner's episodes, replayed by hand through the environment, are the agent's very transitions."""
+    do(tmp_path / "run", budgets=(6,))
+    agent = bench_fakes.TableAgent(context())
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="clean")
+    for episode in range(6):
+        frame, _ = env.reset(seed=episode_seed("training", 0, episode))
+        over = False
+        while not over:
+            before = bench_fakes.Observation(frame=frame)
+            action = agent.act(before, explore=True)
+            frame, reward, terminated, truncated, _ = env.step(action)
+            after = bench_fakes.Observation(frame=frame)
+            agent.observe(
+                Transition(
+                    observation=before,
+                    action=action,
+                    reward=float(reward),
+                    next_observation=after,
+                    terminated=terminated,
+                    truncated=truncated,
+                ),
+                episode=episode,
+            )
+            over = terminated or truncated
+    env.close()
+    assert np.abs(agent.table).sum() > 0
+    assert np.array_equal(final_arrays(tmp_path / "run")["table"], agent.table)
+
+
+def context(seed: int = 0) -> AgentContext:
+    return AgentContext(n_actions=6, preprocessing="gray_strips", encoder=None, seeds=SeedTree(seed).child("agent"))
+
+
+def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
+    seen = bench_fakes.NosyAgent.seen
+    seen.clear()
+    do(tmp_path / "plain", "nosy", agents=("nosy",))
+    assert len(seen) > 20 and all(value is None for value in seen)
+    seen.clear()
+    do(tmp_path / "privileged", "nosy_privileged", agents=("nosy_privileged",))
+    optimal_action, *macrostates = seen
+    assert callable(optimal_action)
+    assert all(macrostate.shape == (4,) for macrostate in macrostates)
+
+
+def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
+    first, second = do(tmp_path / "run", "oracle", agents=("oracle",)).checkpoints
+    assert dataclasses.replace(first, episodes=9) == second
+    assert (first.env_steps, first.success_rate, first.mean_length > 1) == (0, 1.0, True)
+
+
+def test_every_agent_and_seed_meets_the_same_test_starts() -> None:
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="clean")
+    starts = []
+    real_reset = env.reset
+
+    def reset(**options: Any) -> Any:
+        frame, info = real_reset(**options)
+        starts.append((tuple(info["macrostate"]), frame.tobytes()))
+        return frame, info
+
+    env.reset = reset  # type: ignore[method-assign]
+    for seed in (0, 1):
+        tally = EvaluationCounts()
+        for _ in range(4):
+            tally.add_episode(env, bench_fakes.TableAgent(context(seed)), privileged=False)
+    env.close()
+    assert starts[:4] == starts[4:]
+    assert len(set(starts)) > 1
+
+
+def test_a_finished_run_is_read_and_not_repeated(tmp_path: Path) -> None:
+    before = do(tmp_path / "run")
+    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*") if path.name != ".lock"}
+    assert same_but_for_time(before, do(tmp_path / "run"))
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+
+
+def test_other_settings_do_not_go_on_in_a_run_that_was_begun(tmp_path: Path) -> None:
+    do(tmp_path / "run")
+    (tmp_path / "run" / "DONE").unlink()
+    with pytest.raises(ArtefactError, match=r"was begun with protocol\.budgets \[4, 9\], and .* use \[4, 10\]"):
+        do(tmp_path / "run", budgets=(4, 10))
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "training.npz", "config.json", "imagined.npz"])
+def test_a_changed_result_is_noticed(tmp_path: Path, name: str) -> None:
+    do(tmp_path / "run")
+    path = tmp_path / "run" / name
+    path.write_bytes(path.read_bytes() + b"0")
+    with pytest.raises(ArtefactError, match=rf"{name} is not as the run left it.*left untouched"):
+        do(tmp_path / "run")
+
+
+def test_divergence_leaves_its_state_for_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def diverge(agent: bench_fakes.TableAgent, transition: Transition, *, episode: int) -> None:
+        if episode == 2:
+            raise DivergedError("The loss is NaN.")
+
+    monkeypatch.setattr(bench_fakes.TableAgent, "observe", diverge)
+    with pytest.raises(DivergedError, match=r"The loss is NaN\. The agent's state lies in .*diverged"):
+        do(tmp_path / "run")
+    saved = load_newest(tmp_path / "run" / "diverged")
+    assert saved is not None and saved.episode == 2
+
+
+class _KilledError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 7, 12, 16, 19])
+def test_stopping_anywhere_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
+    """After any episode, of training or of a test, half way through counting: the result is the same."""
+    whole = do(tmp_path / "whole")
+    real, calls = runner.save_snapshot, []
+
+    def killing(folder: Path, snapshot: Any) -> Path:
+        where = real(folder, snapshot)
+        calls.append(where)
+        if len(calls) == stop_after:
+            raise _KilledError
+        return where
+
+    monkeypatch.setattr(runner, "save_snapshot", killing)
+    with pytest.raises(_KilledError):
+        do(tmp_path / "run", every_s=0.0)
+    monkeypatch.setattr(runner, "save_snapshot", real)
+    assert same_but_for_time(whole, do(tmp_path / "run"))
+    weights, again = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
+    assert weights["table"].tobytes() == again["table"].tobytes()
+
+
+_CHILD = """
+import json, signal, sys
+from pathlib import Path
+import bench_fakes
+from imagine_bench import runner
+from imagine_bench.protocol import Protocol
+from imagine_bench.runs import RunSpec
+
+save, saves = runner.save_snapshot, iter(range(int(sys.argv[3])))
+def saying(folder, snapshot):
+    if next(saves, None) is None:
+        signal.pause()  # whoever is to kill this is late
+    print("saving", flush=True)
+    return save(folder, snapshot)
+
+runner.save_snapshot = saying
+spec = RunSpec(protocol=Protocol.from_dict(json.loads(sys.argv[2])), agent="table", seed=0, checkpoint_every_s=0.0)
+runner.run(spec, Path(sys.argv[1]), lambda progress: None)
+"""
+
+
+def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"budgets": (40, 80), "evaluation_episodes": 10}
+    whole = do(tmp_path / "whole", **changes)
+    folder, settings = tmp_path / "run", json.dumps(small(**changes).as_dict())
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1] / "fakes")}
+    for saves, delay_s in ((13, 0.0), (31, 0.002), (26, 0.009)):  # in training, in a test, and in the midst of writing
+        command = [sys.executable, "-c", _CHILD, str(folder), settings, str(saves)]
+        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
+            assert child.stdout is not None
+            lines = [child.stdout.readline() for _ in range(saves)]
+            time.sleep(delay_s)
+            child.kill()
+        assert lines == [b"saving\n"] * saves and child.returncode == -signal.SIGKILL
+        snapshot = load_newest(folder / "checkpoints")
+        assert snapshot is not None and not (folder / "DONE").exists()
+    assert 40 < snapshot.episode < 80  # non-vacuous: the last kill came half way
+    assert same_but_for_time(whole, do(folder, **changes))
+    assert final_arrays(tmp_path / "whole")["table"].tobytes() == final_arrays(folder)["table"].tobytes()
+
+
+def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> None:
+    """The checkpoint of a test is written before its row of the table."""
+    folder = tmp_path / "run"
+    do(folder)
+    table = (folder / "metrics.csv").read_text()
+    (folder / "DONE").unlink()
+    (folder / "metrics.csv").unlink()
+    spec = RunSpec(protocol=small(), agent="table", seed=0, until=4)
+    assert runner.run(spec, folder, lambda progress: None) is not None
+    assert (folder / "metrics.csv").read_text() == table
+
+
+def test_every_registered_agent_has_a_target() -> None:
+    for entry in registry.AGENTS.values():
+        assert callable(registry.load(entry.make))

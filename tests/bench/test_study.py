@@ -1,0 +1,187 @@
+"""Studies: one factor at a time on tuning seeds, which no reported result may use."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import bench_fakes  # noqa: F401 - registers its agents
+import numpy as np
+import pytest
+from imagine_bench.agents.imagination.chapter_5 import CHAPTER_5
+from imagine_bench.agents.presets import flatten
+
+from imagine_bench.bench import runner
+from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.bench.runs import Observer
+from imagine_bench.bench.studies import STUDIES
+from imagine_bench.bench.study import BASE, Line, Study, Variant, run_study
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.report.study import study_table, write_study
+
+STUDY = Study(
+    name="fakes",
+    question="Is a table better than a table?",
+    budgets=(3, 6),
+    seeds=(1000, 1001),
+    evaluation_episodes=4,
+    appearance="clean",
+    execution="kinematic",
+    variants=(
+        Variant(name="table", factor=BASE, agent="table"),
+        Variant(name="mild", factor="appearance", agent="table", against="table", appearance="mild"),
+        Variant(name="imaginer", factor="agent", agent="imaginer", against="mild"),
+    ),
+)
+
+
+class Here:
+    """Carries out jobs in this process, one after the other, and counts them."""
+
+    def __init__(self) -> None:
+        self.done: list[Job] = []
+
+    def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+        for job in jobs:
+            runner.run(job.spec, job.folder, on_progress)
+            self.done.append(job)
+        return ()
+
+
+def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
+    launcher = Here()
+    lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    assert [(line.variant.name, line.success.shape) for line in lines] == [
+        ("table", (2, 2)), ("mild", (2, 2)), ("imaginer", (2, 2)),
+    ]  # fmt: skip
+    assert {job.spec.protocol.appearance for job in launcher.done[2:4]} == {"mild"}
+    assert lines[0].difference is None
+    for line, base in ((lines[1], lines[0]), (lines[2], lines[1])):
+        assert line.difference is not None
+        expected = line.success.mean(axis=0) - base.success.mean(axis=0)
+        assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
+    again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    assert len(launcher.done) == 6, "what is done is not run again"
+    assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
+    write_study(tmp_path / "out", STUDY, lines)
+    rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
+    assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
+    origins = json.loads((tmp_path / "out" / "runs.json").read_text())
+    assert [origin["variant"] for origin in origins] == ["table", "mild", "imaginer"]
+    assert all(origin["versions"] and origin["machine"] for origin in origins)
+    assert (tmp_path / "out" / "study.png").stat().st_size > 5_000
+    assert "| appearance | mild | table |" in (tmp_path / "out" / "study.md").read_text()
+
+
+def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
+    alone = dataclasses.replace(STUDY, variants=STUDY.variants[:1])
+    write_study(tmp_path / "out", alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
+    assert not (tmp_path / "out" / "study.png").exists()
+    assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
+
+
+def test_tuning_runs_are_tested_on_starts_that_no_reported_run_meets(tmp_path: Path) -> None:
+    seeds: dict[int, list[int]] = {}
+    real_reset = runner.gymnasium.make
+
+    def make(*arguments: object, **options: object) -> object:
+        env = real_reset(*arguments, **options)
+        reset = env.reset
+
+        def noting(**how: object) -> object:
+            seeds.setdefault(current, []).append(int(str(how["seed"])))
+            return reset(**how)
+
+        env.reset = noting  # type: ignore[method-assign]
+        return env
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner.gymnasium, "make", make)
+        for current in (0, 1000):
+            from test_runner import do
+
+            do(tmp_path / str(current), seed=current, seeds=(current,))
+    assert len(seeds[0]) == len(seeds[1000]) == 9 + 2 * 5
+    assert not set(seeds[0]) & set(seeds[1000])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": (0, 1)}, r"chooses settings on seeds \(0, 1\); give seeds from 1000 on"),
+        ({"seeds": (1000, 3)}, "chooses settings on seeds"),
+        ({"variants": STUDY.variants[:1] * 2}, "each name once"),
+        ({"variants": STUDY.variants[1:]}, "'mild' is compared with 'table', which the study lacks"),
+    ],
+)
+def test_a_study_that_would_deceive_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        dataclasses.replace(STUDY, **changes)  # type: ignore[arg-type]
+
+
+def test_chosen_variants_bring_what_they_are_compared_with() -> None:
+    assert [variant.name for variant in STUDY.only(("imaginer",)).variants] == ["table", "mild", "imaginer"]
+    assert [variant.name for variant in STUDY.only(("mild",)).variants] == ["table", "mild"]
+    assert STUDY.only(()) == STUDY
+    with pytest.raises(UnknownNameError, match="No variant 'milld'"):
+        STUDY.only(("milld",))
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_the_settings_of_every_study_exist(name: str) -> None:
+    from imagine_bench.agents.presets import resolve
+
+    for variant in STUDIES[name].variants:
+        resolve("quick", variant.settings, "chapter_5")
+
+
+def test_the_table_says_what_helps() -> None:
+    success = {name: np.array([[value, 0.9], [value, 0.9]]) for name, value in (("table", 0.25), ("mild", 0.5))}
+    from imagine_bench.statistics import Estimate
+
+    lines = [
+        Line(
+            variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, folder=Path("a-b"), environment={},
+            difference=None,
+        ),
+        Line(
+            variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"), environment={},
+            difference=(Estimate(0.25, 0.1, 0.4), Estimate(0.0, -0.1, 0.1)),
+        ),
+    ]  # fmt: skip
+    assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in study_table(STUDY, lines)
+
+
+UNSTUDIED = {
+    "imagination.weight_samples": "nothing is sampled where nothing is dropped",
+    "imagination.end_episode": "after the last budget of a study",
+}
+
+
+def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
+    varied = {name for study in STUDIES.values() for variant in study.variants for name in variant.settings}
+    deviations = set(CHAPTER_5.presets["quick"])
+    assert deviations - varied == UNSTUDIED.keys()
+    for variant in STUDIES["deviations"].variants:
+        for name, value in variant.settings.items():
+            if name != "model.precision":  # the thesis' is that of the machine
+                assert value == flatten(CHAPTER_5.thesis)[name] != CHAPTER_5.presets["quick"][name].value
+
+
+def test_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, sentence in (
+        (["study", "--task", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'?"),
+        (["study", "--task", "arrow_puzzle", "--name", "factor"], "No study 'factor'. Did you mean 'factors'?"),
+        (["plan", "--task", "arrow_puzle"], "No task 'arrow_puzle'"),
+        (["plan", "--count", "0"], "Asked for 0 plans"),
+        (["plan"], "There is no such bench below"),
+        (["generalise"], "There is no such bench below"),
+    ):
+        assert main([*words, "--out", str(tmp_path / "runs")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("imagine-bench: ") and sentence in line
+    assert not (tmp_path / "runs").exists()

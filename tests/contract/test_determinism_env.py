@@ -1,0 +1,179 @@
+"""Equal seeds give equal bits, nothing of the past matters, and both executions walk the same macrostates."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import textwrap
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from worlds import WORLDS
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+
+SHADE = 16
+"""Gray levels of 256: a ball that was turned a little is shaded differently all over."""
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
+
+
+def make(task="arrow_puzzle", **options):
+    return gymnasium.make(registry.TASKS[task].env_id, **options).unwrapped
+
+
+def full_state(env):
+    model, data = env._world.model, env._world.data
+    state = np.empty(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    return state
+
+
+def walk(env, actions):
+    """Frames, rewards and full states along a walk."""
+    frames, rewards, states = [], [], []
+    for action in actions:
+        frame, reward, *_ = env.step(int(action) % int(env.action_space.n))
+        frames.append(frame)
+        rewards.append(reward)
+        states.append(full_state(env))
+    return np.array(frames), rewards, np.array(states)
+
+
+@pytest.mark.parametrize("appearance", APPEARANCES)
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("task", WORLDS)
+def test_equal_seeds_give_equal_frames_and_states(task, execution, appearance):
+    walks = []
+    for _ in range(2):
+        env = make(task, execution=execution, appearance=appearance)
+        first, _ = env.reset(seed=11)
+        walks.append((first, *walk(env, (0, 3, 4))))
+        env.close()
+    for one, other in zip(*walks, strict=True):
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("appearance", APPEARANCES)
+@pytest.mark.parametrize("task", WORLDS)
+def test_other_seeds_give_other_frames(task, appearance):
+    env, options = (
+        make(task, execution="kinematic", appearance=appearance),
+        {"macrostate": registry.task(task).rules.start_states[0]},
+    )
+    frames = {env.reset(seed=seed, options=options)[0].tobytes() for seed in range(8)}
+    env.close()
+    assert len(frames) == 8
+
+
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("task", WORLDS)
+def test_a_dirty_reset_is_a_fresh_environment(task, execution):
+    """Including velocities, warm starts, controls and time, and whatever looks came before."""
+    dirty, fresh = (make(task, execution=execution, appearance="strong") for _ in range(2))
+    dirty.reset(seed=1)
+    walk(dirty, (0, 2, 5))
+    dirty._world.data.qvel[:] = 0.3
+    dirty._world.data.qacc_warmstart[:] = 7.0
+    dirty._world.data.ctrl[:] = 0.1
+    frames = [env.reset(seed=4)[0] for env in (dirty, fresh)]
+    assert np.array_equal(*frames)
+    assert np.array_equal(full_state(dirty), full_state(fresh))
+    for one, other in zip(walk(dirty, (1, 4)), walk(fresh, (1, 4)), strict=True):
+        assert np.array_equal(one, other)
+    dirty.close()
+    fresh.close()
+
+
+def test_a_macro_action_depends_on_where_the_cubes_stand_and_on_nothing_else():
+    """The same cubes and action, reached by different pasts and in another MjData: the same bits."""
+    env, other = make(), make()
+    env.reset(seed=2, options={"macrostate": (1, 2, 0, 0)})
+    walk(env, (0, 3))
+    cubes = env._world.data.qpos.copy()
+    *_, states = walk(env, (4,))
+    other.reset(seed=9, options={"macrostate": (3, 3, 3, 0)})
+    walk(other, (5,))
+    other._world.data.qpos[:] = cubes
+    other._macrostate = other._world.read().macrostate
+    *_, again = walk(other, (4,))
+    assert np.array_equal(states, again)
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("task", WORLDS)
+def test_a_recorded_walk_replays_to_the_same_bits(task):
+    env = make(task, appearance="mild")
+    generator = np.random.default_rng(0)
+    first, _ = env.reset(seed=21)
+    actions, total = [], []
+    for _ in range(5):
+        action = int(generator.integers(env.action_space.n))
+        frame, reward, *_ = env.step(action)
+        actions.append(action)
+        total.append((frame.tobytes(), reward, full_state(env).tobytes()))
+    again, _ = env.reset(seed=21)
+    replay = [(*env.step(action)[:2], full_state(env).tobytes()) for action in actions]
+    env.close()
+    assert np.array_equal(first, again)
+    assert [(frame.tobytes(), reward, state) for frame, reward, state in replay] == total
+
+
+@pytest.mark.parametrize("task", tuple(registry.TASKS))
+def test_both_executions_walk_the_same_macrostates(task):
+    physics, kinematic = (make(task, execution=execution) for execution in EXECUTIONS)
+    generator, moved = np.random.default_rng(5), 0
+    for seed in range(3):
+        (_, start), (before, again) = (env.reset(seed=seed) for env in (physics, kinematic))
+        walked = [start["macrostate"].tolist()]
+        assert walked == [again["macrostate"].tolist()]
+        for action in generator.integers(registry.task(task).n_actions, size=5):
+            one, other = physics.step(int(action)), kinematic.step(int(action))
+            assert one[1:4] == other[1:4]
+            assert not one[4]["fault"]
+            assert one[4]["macrostate"].tolist() == other[4]["macrostate"].tolist()
+            walked.append(one[4]["macrostate"].tolist())
+            apart = share_of_other_pixels(one[0], other[0])
+            assert apart < 0.03
+            if walked[-1] != walked[-2]:
+                assert apart < 0.5 * share_of_other_pixels(one[0], before), "the frame of the step before is further"
+                moved += 1
+            before = other[0]
+    assert moved > 0
+    physics.close()
+    kinematic.close()
+
+
+def share_of_other_pixels(one, other):
+    return (np.abs(one.astype(int) - other).max(axis=2) > SHADE).mean()
+
+
+def test_another_process_draws_the_same_frames():
+    script = """
+        import hashlib, gymnasium, imagine_bench
+        env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="strong")
+        digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
+        digest.update(env.step(1)[0].tobytes())
+        print(digest.hexdigest())
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    env = make(execution="kinematic", appearance="strong")
+    digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
+    digest.update(env.step(1)[0].tobytes())
+    env.close()
+    assert done.stdout.strip() == digest.hexdigest()
+
+
+def test_frames_of_macrostates_depend_on_the_generator_alone():
+    spec = registry.task("arrow_puzzle")
+    macrostates = np.array([(0, 1, 2, 1), (3, 3, 0, 2)])
+    first = spec.render_macrostates(macrostates, "strong", np.random.default_rng(4))
+    spec.render_macrostates(macrostates[::-1], "strong", np.random.default_rng(5))
+    assert np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(4)))
+    assert not np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(6)))
+    assert spec.render_macrostates(macrostates[:0], "clean", np.random.default_rng(4)).shape == (0, 64, 64, 3)

@@ -1,0 +1,468 @@
+"""What every registered environment targets, in both executions."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import subprocess
+import sys
+import tempfile
+import textwrap
+from collections import Counter
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from imagine_bench.tasks.scenes.constants import ARM_GROUP
+from worlds import WORLDS
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, SceneReader
+
+TASKS = tuple(registry.TASKS)
+INFO_KEYS = {"macrostate", "is_success", "success", "legal", "fault", "sim_time_s", "ik_error_m"}
+KINEMATIC = {"execution": "kinematic"}
+
+
+def make(task="arrow_puzzle", **options):
+    return gymnasium.make(registry.TASKS[task].env_id, **options)
+
+
+@pytest.fixture(params=[(task, execution) for task in TASKS for execution in EXECUTIONS], ids="-".join)
+def env(request):
+    task, execution = request.param
+    env = make(task, execution=execution)
+    yield env
+    env.close()
+
+
+# --- checkers ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_s_checker_is_content(task, execution):
+    env = make(task, execution=execution, render_mode="rgb_array", width=64, height=48)
+    check_env(env.unwrapped, skip_render_check=execution == "physics")
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_stable_baselines_checker_is_content(task):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = make(task, **KINEMATIC)
+    checker.check_env(env, warn=True)
+    env.close()
+
+
+# --- spaces, info, ends ------------------------------------------------------------------------------------------
+
+
+def check_info(info, spec, *, after_step):
+    assert set(info) - {"fault_reason"} == INFO_KEYS
+    assert ("fault_reason" in info) == info["fault"]
+    assert info["macrostate"].dtype == np.int64
+    assert info["macrostate"].shape == (len(spec.macrostate_names),)
+    assert all(type(info[key]) is bool for key in ("is_success", "success", "legal", "fault"))
+    assert all(type(info[key]) is float for key in ("sim_time_s", "ik_error_m"))
+    assert info["is_success"] == info["success"]
+    assert after_step or info["sim_time_s"] == info["ik_error_m"] == 0.0
+
+
+def reached(spec, before, action, info):
+    """The rules' outcome that the environment reports; what the human does next may be one of several."""
+    after = tuple(info["macrostate"].tolist())
+    (outcome,) = [each for each in spec.rules.outcomes(before, action) if each.macrostate == after]
+    return outcome
+
+
+def test_an_episode_keeps_the_contract(env):
+    task = next(name for name, entry in registry.TASKS.items() if entry.env_id == env.spec.id)
+    spec, physics = registry.task(task), env.spec.kwargs["execution"] == "physics"
+    assert env.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+    assert env.action_space == gymnasium.spaces.Discrete(spec.n_actions)
+    frame, info = env.reset(seed=3)
+    check_info(info, spec, after_step=False)
+    assert tuple(info["macrostate"].tolist()) in spec.rules.start_states
+    for action in range(3):
+        before = tuple(info["macrostate"].tolist())
+        new_frame, reward, terminated, truncated, new_info = env.step(np.int64(action))
+        check_info(new_info, spec, after_step=True)
+        expected = reached(spec, before, action, new_info)
+        assert not new_info["fault"]
+        assert (reward, terminated, truncated) == (expected.reward, expected.terminated, False)
+        assert type(reward) is float
+        assert new_info["success"] == expected.success
+        assert (new_info["sim_time_s"] > 0.5) == (new_info["ik_error_m"] > 0.0) == physics
+        assert env.observation_space.contains(new_frame)
+        assert not np.shares_memory(frame, new_frame)
+        assert new_info is not info
+        assert new_info["macrostate"] is not info["macrostate"]
+        frame, info = new_frame, new_info
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_horizon_truncates_and_does_not_terminate(task):
+    """Ends by rule are ignored, so that the walk is long enough: the two never depend on each other."""
+    entry, spec = registry.TASKS[task], registry.task(task)
+    assert (spec.horizon, spec.env_id) == (entry.horizon, entry.env_id)
+    env, horizon, rules = make(task, **KINEMATIC), entry.horizon, spec.rules
+    _, info = env.reset(seed=0)
+    for step in range(horizon):
+        *_, terminated, truncated, info = env.step(step % rules.n_actions)
+        assert truncated == (step == horizon - 1)
+        assert terminated == rules.is_terminal(tuple(info["macrostate"].tolist()))
+    env.close()
+
+
+@pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_names", "macrostate_values"])
+def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, monkeypatch):
+    spec = registry.task("arrow_puzzle")
+    wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
+    monkeypatch.setattr("imagine_bench.tasks.arrow_puzzle.spec.SPEC", dataclasses.replace(spec, **{field: wrong}))
+    numbers = {"action_names": "n_actions 5", "macrostate_names": "names 3", "macrostate_values": r"values \(4, 4, 4\)"}
+    what = numbers.get(field, f"{field} {wrong!r}")
+    with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
+        registry.task("arrow_puzzle")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_macrostate_can_be_the_start_and_the_rules_go_on_from_it(task):
+    spec, env = registry.task(task), make(task, **KINEMATIC).unwrapped
+    generator = np.random.default_rng(0)
+    for state in spec.rules.states:
+        _, info = env.reset(options={"macrostate": state})
+        assert tuple(info["macrostate"].tolist()) == state
+        assert info["legal"] == spec.rules.is_legal(state)
+        assert info["success"] is False
+        action = int(generator.integers(spec.n_actions))
+        _, reward, terminated, _, info = env.step(action)
+        expected = reached(spec, state, action, info)
+        assert (reward, terminated) == (expected.reward, expected.terminated)
+        assert info["legal"] == (expected.success or not expected.terminated)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_starts_are_spread_over_the_start_states(task):
+    env, starts = make(task, **KINEMATIC).unwrapped, registry.task(task).rules.start_states
+    env.reset(seed=0)
+    counts = dict.fromkeys(starts, 0)
+    n = 12 * len(starts)
+    for _ in range(n):
+        _, info = env.reset()
+        counts[tuple(info["macrostate"].tolist())] += 1
+    env.close()
+    assert min(counts.values()) > 0
+    chi_square = sum((count - 12) ** 2 / 12 for count in counts.values())
+    assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
+
+
+def test_the_human_draws_each_wish_as_often_as_the_rules_say():
+    env, counts = make("pick_place", **KINEMATIC), Counter()
+    env.reset(seed=0)
+    for _ in range(300):
+        env.reset(options={"macrostate": (0, 0, 0, 1)})
+        counts[tuple(env.step(1)[4]["macrostate"].tolist())] += 1
+    env.close()
+    assert set(counts) == {(0, 1, 0, wish) for wish in (0, 2, 3)}
+    assert all(abs(count - 100) < 40 for count in counts.values()), "five standard deviations"
+
+
+def test_a_closed_environment_holds_no_opengl_context():
+    env = make(**KINEMATIC, render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    env.render()
+    env.human_view(64, 48)
+    renderers = env._eye, env._picture, env._human
+    assert all(renderer._canvas is not None for renderer in renderers)
+    env.close()
+    assert all(renderer._canvas is None for renderer in renderers)
+
+
+def test_render_gives_the_asked_view_and_nothing_without_a_mode():
+    env = make(render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC)
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (60, 80, 3)
+    assert np.array_equal(first, env.render())
+    assert not np.shares_memory(first, env.render())
+    env.close()
+    silent = make(**KINEMATIC).unwrapped
+    silent.reset(seed=0)
+    assert silent.render() is None
+    silent.close()
+
+
+def test_rendering_draws_no_random_number():
+    env = make(appearance="strong", render_mode="rgb_array", width=32, height=32, camera="wrist", **KINEMATIC).unwrapped
+    env.reset(seed=0)
+    before = env.np_random.bit_generator.state
+    env.render()
+    env.shapes()
+    env.motion()
+    assert env.np_random.bit_generator.state == before
+    env.close()
+
+
+# --- faults ------------------------------------------------------------------------------------------------------
+
+
+def test_a_cube_that_does_not_follow_is_a_fault_and_rewards_come_from_what_was_read():
+    """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
+    env = make().unwrapped
+    model = env._world.model
+    arm = np.flatnonzero(model.geom_group == ARM_GROUP)
+    model.geom_contype[arm] = model.geom_conaffinity[arm] = 0
+    env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
+    _, reward, terminated, _, info = env.step(0)  # a good turn would reach the goal
+    env.close()
+    assert info["fault"] is True
+    assert info["fault_reason"]
+    assert info["macrostate"].tolist() == [3, 1, 2, 0]
+    assert not info["success"]
+    assert (reward, terminated) == (-1.0, False)
+
+
+def test_a_pushed_cube_is_a_fault(monkeypatch):
+    env = make().unwrapped
+    env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
+    assert env.step(0)[4]["fault"] is False
+    turn = env._world._executor.turn
+
+    def clumsy(data, **arguments):
+        result = turn(data, **arguments)
+        data.joint("cube_2_joint").qpos[0] += 0.006
+        return result
+
+    monkeypatch.setattr(env._world._executor, "turn", clumsy)
+    *_, info = env.step(0)
+    env.close()
+    assert info["fault_reason"] == "cube 2 was pushed 6 mm while cube 0 was turned"
+
+
+# --- bad input ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"execution": "kinematik"},
+            r"No execution 'kinematik'\. Did you mean 'kinematic'\? Known: physics, kinematic",
+        ),
+        ({"appearance": "wild"}, r"No appearance 'wild'\..*Known: clean, mild, strong"),
+        ({"render_mode": "human"}, r"No render mode 'human'\..*Known: rgb_array"),
+        ({"camera": "hunam"}, r"No camera 'hunam'\. Did you mean 'human'\? Known: .*human"),
+        ({"width": 0}, r"Picture width 0 must be an integer from 1 to 4096 pixels"),
+        ({"height": 99999}, r"Picture height 99999 must be an integer from 1 to 4096 pixels"),
+        ({"height": 64.5}, r"Picture height 64\.5 must be an integer"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_wrong_options_name_what_is_allowed(options, message):
+    make_env = registry.load(registry.TASKS["arrow_puzzle"].env)
+    with pytest.raises(ImagineBenchError, match=message):
+        make_env(**options)
+
+
+@pytest.fixture(scope="module")
+def kinematic():
+    env = make(**KINEMATIC).unwrapped
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [(0, 1, 2), (0, 1, 2, 3), (0, 1, 4, 0), (-1, 1, 2, 0), (0.5, 1, 2, 0), (float("inf"), 1, 2, 0), "0120", 7, None],
+)
+def test_a_wrong_macrostate_is_refused(kinematic, given):
+    with pytest.raises(InvalidValueError, match=r"No macrostate .*; give 4 integers from 0 to at most \(3, 3, 3, 2\)"):
+        kinematic.reset(options={"macrostate": given})
+
+
+def test_an_unknown_reset_option_is_refused(kinematic):
+    with pytest.raises(UnknownNameError, match=r"No reset option 'macrostat'\. Did you mean 'macrostate'\?"):
+        kinematic.reset(options={"macrostat": (0, 1, 2, 0)})
+
+
+@pytest.mark.parametrize("options", [5, "abc", [1]])
+def test_reset_options_that_are_no_mapping_are_refused(kinematic, options):
+    with pytest.raises(InvalidValueError, match="are no mapping; give"):
+        kinematic.reset(options=options)
+
+
+def test_where_not_every_combination_is_a_macrostate_the_list_is_named():
+    env = gymnasium.make("imagine_bench/PickPlace-v0", **KINEMATIC)
+    with pytest.raises(InvalidValueError, match=r"one of the 19 of .*task\('pick_place'\)\.rules\.states, such as"):
+        env.reset(options={"macrostate": (0, 1, 2, 0)})
+    env.close()
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = make(**KINEMATIC).unwrapped
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.step(0)
+    env.close()
+
+
+def test_an_episode_whose_simulation_blew_up_is_over(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+    env = make().unwrapped
+    env.reset(seed=0)
+    env._world.data.joint("cube_2_joint").qpos[0] = 1e11
+    with pytest.raises(DivergedError):
+        env.step(0)
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.step(0)
+    env.reset(seed=0)
+    assert env.step(0)[4]["fault"] is False
+    env.close()
+
+
+@pytest.mark.parametrize("action", [6, -1, 1.5, "left", None, float("inf"), np.array([1, 2]), np.array([])])
+def test_a_wrong_action_is_refused(kinematic, action):
+    with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 5"):
+        kinematic.step(action)
+
+
+@pytest.mark.parametrize(
+    ("macrostates", "message"),
+    [
+        (np.zeros((2, 3), np.int64), r"of shape \(N, 4\), not int64 of shape \(2, 3\)"),
+        (np.zeros((2, 4)), r"must be integers of shape \(N, \d\), not float64 of shape \(2, 4\)"),
+        (np.full((1, 4), 3), r"No macrostate \(3, 3, 3, 3\); give one of 192, such as \(0, 0, 0, 0\)"),
+        (np.full((1, 4), -1), r"No macrostate \(-1, -1, -1, -1\)"),
+    ],
+)
+def test_render_macrostates_refuses_what_is_none(macrostates, message):
+    with pytest.raises(InvalidValueError, match=message):
+        registry.task("arrow_puzzle").render_macrostates(macrostates, "clean", np.random.default_rng(0))
+
+
+# --- processes, memory, imports ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("task", WORLDS)
+def test_async_vector_envs_match_single_ones(task, context):
+    """Also after this process has drawn: nothing of its OpenGL is used by the children."""
+    single = make(task, **KINEMATIC)
+    expected = [single.reset(seed=5)[0], single.step(2)[0]]
+    vector = gymnasium.make_vec(
+        registry.TASKS[task].env_id, num_envs=2, vectorization_mode="async",
+        vector_kwargs={"context": context}, **KINEMATIC,
+    )  # fmt: skip
+    try:
+        frames, infos = vector.reset(seed=[5, 6])
+        assert np.array_equal(frames[0], expected[0])
+        assert infos["macrostate"].shape == (2, len(registry.task(task).macrostate_names))
+        frames, *_ = vector.step(np.array([2, 3]))
+        assert np.array_equal(frames[0], expected[1])
+    finally:
+        vector.close()
+    single.close()
+
+
+@pytest.mark.parametrize("task", WORLDS)
+def test_a_pickled_environment_goes_on_alike(task):
+    env = make(task, **KINEMATIC, appearance="strong")
+    env.reset(seed=1)
+    twin = pickle.loads(pickle.dumps(env))
+    for action in (0, 3, env.action_space.n - 1):
+        one, other = env.step(action), twin.step(action)
+        assert np.array_equal(one[0], other[0])
+        assert one[1:4] == other[1:4]
+    env.close()
+    twin.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("task", WORLDS)
+def test_memory_stays_flat_over_resets(task):
+    script = """
+        import sys, gymnasium, imagine_bench
+        def peak():  # the resource module would count the parent's peak, too
+            return next(int(line.split()[1]) / 1024 for line in open("/proc/self/status") if line.startswith("VmHWM"))
+        env = gymnasium.make(sys.argv[1], execution="kinematic", appearance="strong")
+        env.reset(seed=0)
+        before = peak()
+        for _ in range(2000):
+            env.reset()
+        print(before, peak())
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), registry.TASKS[task].env_id]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    before_mb, after_mb = map(float, done.stdout.split())
+    assert after_mb < 300
+    assert after_mb - before_mb < 4
+
+
+def test_specs_are_cheap_and_importing_loads_nothing_heavy():
+    script = (
+        "import sys, imagine_bench; from imagine_bench import registry; "
+        "[registry.task(name) for name in registry.TASKS]; "
+        "print(sorted({'mujoco', 'dm_control', 'torch', 'mink', 'OpenGL'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# --- scene reader ------------------------------------------------------------------------------------------------
+
+
+def test_shapes_and_motion_describe_the_scene():
+    env = make().unwrapped
+    assert isinstance(env, SceneReader)
+    env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
+    shapes, still = env.shapes(), env.motion()
+    names = [shape.name for shape in shapes]
+    assert len(set(names)) == len(names)
+    assert {"cube_0_box", "cube_2_arrow", "hand_skin", "table_top", "floor"} <= set(names)
+    assert {shape.body for shape in shapes} <= set(still.body_names)
+    assert any(shape.body == "right_l3" for shape in shapes)
+    for shape in shapes:
+        assert shape.kind in ("box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh")
+        assert (shape.vertices is None) == (shape.faces is None) == (shape.kind != "mesh")
+        assert shape.kind == "mesh" or shape.size[0] > 0
+        assert shape.rgba.shape == (4,)
+        assert shape.pose_in_body.shape == (7,)
+        if shape.faces is not None:
+            assert shape.faces.max() < len(shape.vertices)
+    assert still.poses_in_world.shape == (1, len(still.body_names), 7)
+    env.capture_motion_hz = 20.0
+    *_, info = env.step(2)
+    motion = env.motion()
+    env.close()
+    assert np.all(np.diff(motion.time_s) > 0)
+    assert motion.time_s[0] == 0.0
+    assert motion.time_s[-1] == pytest.approx(info["sim_time_s"], abs=0.06)
+    assert motion.poses_in_world.shape == (len(motion.time_s), len(motion.body_names), 7)
+    moved = np.ptp(motion.poses_in_world[:, :, :3], axis=0).max(axis=1)
+    by_name = dict(zip(motion.body_names, moved, strict=True))
+    assert by_name["right_hand"] > 0.1
+    assert by_name["cube_0"] < 1e-3
+    assert by_name["hand"] == by_name["world"] == 0.0
+
+
+def test_the_human_view_shows_the_whole_scene_at_the_asked_size():
+    env = make(**KINEMATIC).unwrapped
+    env.reset(seed=0)
+    small = env.human_view(64, 48)
+    assert small.shape == (48, 64, 3)
+    assert small.std() > 20
+    with pytest.raises(InvalidValueError, match="Picture width -1"):
+        env.human_view(-1, 48)
+    env.close()
+
+
+def test_appearances_are_those_of_the_interfaces():
+    from imagine_bench.tasks.scenes.appearance import LEVELS
+
+    assert tuple(LEVELS) == APPEARANCES

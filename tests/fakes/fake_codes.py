@@ -1,0 +1,103 @@
+"""A readable stand-in for an encoder of codes, and a tiny world of two wheels and a lamp to live in."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from imagine_bench.agents.factored.agent import ImagineAgent
+from imagine_bench.agents.factored.settings import resolve
+
+from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+SIZES = (3, 3, 2)
+ACTIONS = 4
+
+
+class FakeCodes:
+    """Pixels (0, 0..2, 0) of a frame are its code."""
+
+    card = SimpleNamespace(code_sizes=SIZES)
+
+    def codes(self, frame: Frame) -> tuple[int, ...]:
+        return tuple(int(value) for value in frame[0, : len(SIZES), 0])
+
+    def decode(self, latents: torch.Tensor) -> np.ndarray:
+        return latents.mean(dim=1)[:, None, None].expand(-1, 64, 64).numpy()
+
+    def read_macrostate(self, latents: torch.Tensor) -> np.ndarray:
+        return torch.stack([part.argmax(dim=1) for part in latents.split(SIZES, dim=1)], dim=1).numpy()
+
+
+def frame(code: tuple[int, ...]) -> Frame:
+    picture = np.zeros((64, 64, 3), dtype=np.uint8)
+    picture[0, : len(code), 0] = code
+    return picture
+
+
+def step(code: tuple[int, ...], action: int) -> tuple[tuple[int, ...], float, bool]:
+    """Actions 0, 1 turn the first wheel on and back, 2, 3 the second.
+
+    Equal wheels end it badly, (2, 1) under a lit lamp and (1, 2) under a dark one end it well.
+    """
+    wheel, back = divmod(action, 2)
+    following = list(code)
+    following[wheel] = (following[wheel] + (-1 if back else 1)) % 3
+    reached = tuple(following)
+    if reached[0] == reached[1]:
+        return reached, -5.0, True
+    if reached == ((2, 1, 1) if reached[2] else (1, 2, 0)):
+        return reached, 10.0, True
+    return reached, -1.0, False
+
+
+def transition(code: tuple[int, ...], action: int) -> Transition:
+    following, reward, ended = step(code, action)
+    return Transition(
+        observation=Observation(frame=frame(code)),
+        action=action,
+        reward=reward,
+        next_observation=Observation(frame=frame(following)),
+        terminated=ended,
+        truncated=False,
+    )
+
+
+def starts() -> list[tuple[int, ...]]:
+    codes = [(a, b, lamp) for a in range(3) for b in range(3) for lamp in range(2) if a != b]
+    return [code for code in codes if code not in ((2, 1, 1), (1, 2, 0))]
+
+
+def agent(seed: int = 0, **overrides: object) -> ImagineAgent:
+    settings = resolve("quick", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5")
+    return ImagineAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
+
+
+def live(learner: ImagineAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
+    """Train on the tiny world; the actions taken."""
+    taken = []
+    for episode in episodes:
+        code = starts()[int(rng.integers(len(starts())))]
+        for _ in range(horizon):
+            action = learner.act(Observation(frame=frame(code)), explore=True)
+            learner.observe(transition(code, action), episode=episode)
+            taken.append(action)
+            code, _, ended = step(code, action)
+            if ended:
+                break
+    return taken
+
+
+def success(learner: ImagineAgent, horizon: int = 6) -> float:
+    """Share of starts from which the greedy agent ends well."""
+    solved = 0
+    for start in starts():
+        code = start
+        for _ in range(horizon):
+            code, reward, ended = step(code, learner.act(Observation(frame=frame(code)), explore=False))
+            if ended:
+                solved += reward > 0
+                break
+    return solved / len(starts())

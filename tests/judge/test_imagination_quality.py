@@ -1,0 +1,165 @@
+"""Open-loop questions and their marking, with imaginers whose answers are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bench_fakes
+import numpy as np
+import pytest
+from test_runner import context
+
+from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.interfaces import Outcome, TaskSpec
+from imagine_bench.judge.imagination_quality import EXAMPLES, Question, ask, examples, open_loop
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
+
+
+@pytest.fixture(scope="module")
+def spec() -> TaskSpec:
+    return registry.task("arrow_puzzle")
+
+
+@pytest.fixture(scope="module")
+def questions(spec: TaskSpec) -> tuple[Question, ...]:
+    return ask(spec, starts=40, depth=10, appearance="clean")
+
+
+def only(belief: dict[tuple[int, ...], float]) -> tuple[int, ...]:
+    (state,) = belief
+    assert belief[state] == pytest.approx(1.0)
+    return state
+
+
+def test_the_rules_keep_every_question_alive(spec: TaskSpec, questions: tuple[Question, ...]) -> None:
+    assert len(questions) == 40
+    for question in questions:
+        assert question.actions.shape == question.rewards.shape == (10,)
+        assert (question.rewards == -1.0).all()
+        before = None
+        for action, belief in zip(question.actions, question.beliefs, strict=True):
+            state = only(belief)
+            assert not spec.rules.is_terminal(state)
+            if before is not None:
+                assert [outcome.macrostate for outcome in spec.rules.outcomes(before, int(action))] == [state]
+            before = state
+
+
+def test_blind_random_actions_would_not_stay_alive(spec: TaskSpec) -> None:
+    """Non-vacuous: without the choice, nearly every rollout of ten would end."""
+    rng = np.random.default_rng(0)
+    alive = 0
+    for start in spec.rules.start_states:
+        state, over = start, False
+        for _ in range(10):
+            (outcome,) = spec.rules.outcomes(state, int(rng.integers(6)))
+            state, over = outcome.macrostate, over or outcome.terminated
+        alive += not over
+    assert alive <= 1
+
+
+def test_actions_vary_and_questions_repeat(spec: TaskSpec, questions: tuple[Question, ...]) -> None:
+    again = ask(spec, starts=40, depth=10, appearance="clean")
+    assert all(np.array_equal(a.frame, b.frame) for a, b in zip(questions, again, strict=True))
+    assert all(np.array_equal(a.actions, b.actions) for a, b in zip(questions, again, strict=True))
+    assert len({tuple(question.actions) for question in questions}) > 30
+
+
+class KnowsTheAnswers(bench_fakes.RulesImaginer):
+    """Right until ``wrong_from``, then wrong in one coordinate; finds its question by its frame and actions."""
+
+    def __init__(self, questions: tuple[Question, ...]) -> None:
+        super().__init__(context())
+        self.questions = questions
+
+    def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
+        (question,) = [q for q in self.questions if q.frame is frame and q.actions is actions]
+        blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        states = np.array([only(belief) for belief in question.beliefs])
+        states[self.wrong_from - 1 :, 3] += 1
+        return dataclasses.replace(blank, macrostates=states)
+
+
+def test_marks_are_right_by_depth(questions: tuple[Question, ...]) -> None:
+    loop = open_loop(KnowsTheAnswers(questions), questions, SeedTree(0))
+    assert loop.count.tolist() == [40] * 10
+    assert loop.correct.tolist() == loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
+    assert loop.correct_accepted[:3].tolist() == [1.0] * 3
+    assert np.isnan(loop.correct_accepted[3:]).all()
+    assert loop.reward_mae.tolist() == [0.5] * 10  # it says -0.5, the rules say -1
+    assert loop.termination_error.tolist() == [0.0] * 3 + [1.0] * 7
+    assert (loop.epistemic[0], loop.aleatoric[0], loop.modal[0]) == (0.25, 0.5, 0.75)
+
+
+class Doubts(bench_fakes.RulesImaginer):
+    """Wrong at depth 3 in every other rollout, where its epistemic uncertainty is high; modal is high where right."""
+
+    def __init__(self, questions: tuple[Question, ...]) -> None:
+        super().__init__(context())
+        self.questions = questions
+
+    def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
+        (index,) = [i for i, q in enumerate(self.questions) if q.frame is frame and q.actions is actions]
+        blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        states = np.array([only(belief) for belief in self.questions[index].beliefs])
+        epistemic, modal = np.full(depth, 0.1, np.float32), np.full(depth, 0.9, np.float32)
+        if index % 2:
+            states[2:, 3] += 1
+            epistemic[2], modal[2] = 0.8, 0.2
+        return dataclasses.replace(blank, macrostates=states, epistemic=epistemic, modal=modal)
+
+
+def test_uncertainty_is_held_to_the_errors_it_should_find(questions: tuple[Question, ...]) -> None:
+    loop = open_loop(Doubts(questions), questions, SeedTree(0))
+    half = len(questions) // 2
+    assert loop.judged.tolist() == [len(questions)] * 3 + [len(questions) - half] * 7  # after an error nobody is judged
+    assert loop.auroc_epistemic[2] == 1.0 and loop.auroc_modal[2] == 0.0 and loop.auroc_aleatoric[2] == 0.5
+    assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
+
+
+def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
+    agent = bench_fakes.RulesImaginer(context())
+    first = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
+    again = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
+    assert len(first) == EXAMPLES
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one.rollout.frames, other.rollout.frames)
+        assert np.array_equal(one.real_frames, other.real_frames)
+        assert one.real_frames.shape == (10, 64, 64, 3) and one.real_macrostates.shape == (10, 4)
+        assert one.real_terminated[-1]  # always turning the left cube ends in two arrows alike
+
+
+def test_examples_of_a_run_that_tunes_begin_elsewhere(spec: TaskSpec) -> None:
+    agent = bench_fakes.RulesImaginer(context())
+    reported, tuning = (
+        examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=evaluation_split(seed))
+        for seed in (0, TUNING_SEEDS)
+    )
+    assert [e.start_macrostate.tolist() for e in reported] != [e.start_macrostate.tolist() for e in tuning]
+
+
+class _Coin:
+    """Two safe states and a pit; action 1 always falls, action 0 falls from state 1 half the time."""
+
+    states = ((0,), (1,), (2,))
+    start_states = ((0,), (1,))
+
+    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+        pit = Outcome(0.5, (2,), -5.0, True, False)
+        safe = Outcome(0.5, (0,), -1.0, False, False)
+        if action == 1:
+            return (dataclasses.replace(pit, probability=1.0),)
+        return (pit, safe) if macrostate == (1,) else (dataclasses.replace(safe, probability=1.0),)
+
+
+def test_random_rules_are_asked_only_what_is_sure(spec: TaskSpec) -> None:
+    coin = dataclasses.replace(
+        spec,
+        rules=_Coin(),  # type: ignore[arg-type]
+        action_names=("stay", "jump"),
+        render_macrostates=lambda states, appearance, rng: np.zeros((len(states), 64, 64, 3), np.uint8),
+    )
+    asked = ask(coin, starts=8, depth=3, appearance="clean")
+    assert len(asked) == 8
+    assert all(question.actions.tolist() == [0, 0, 0] for question in asked)  # from (0,) alone, staying

@@ -1,0 +1,343 @@
+"""Recordings: whole files, the expected entities and timelines, closed whatever happens."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from fake_agents import FakeAgent, FakeImaginer
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
+from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.recording import episodes, q_table, record_run, recording_file
+from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
+
+REAL = {"/real/frame", "/real/story", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
+IMAGINED = {"/imagined/strip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
+BY_DEPTH = {
+    f"/imagined/episode_{episode}/{leaf}"
+    for episode in (1, 2)
+    for leaf in ("frame", "real_frame", "prediction/reward", "prediction/p_terminal", "uncertainty/epistemic")
+}
+VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
+
+
+def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: str | int) -> Path:
+    settings = {"seed": 3, "execution": "kinematic", "appearance": "mild", "episodes": 2, **changes}
+    return record_run("arrow_puzzle", agent, name=name, path=path, **settings)  # type: ignore[arg-type]
+
+
+def contents(path: Path) -> dict[str, set[str]]:
+    """Entity paths and their timelines."""
+    found: dict[str, set[str]] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
+    return found
+
+
+def rerun(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rerun", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(FakeImaginer(), tmp_path_factory.mktemp("recordings") / "run" / "recording.rrd")
+
+
+def test_verifies(imagined: Path) -> None:
+    checked = rerun("rrd", "verify", imagined)
+    assert checked.returncode == 0, checked.stderr
+
+
+def test_verify_is_not_blind(imagined: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.rrd"
+    damaged.write_bytes(imagined.read_bytes()[:2000] + b"\0" * 2000 + imagined.read_bytes()[4000:])
+    assert rerun("rrd", "verify", damaged).returncode != 0
+
+
+def test_entities_and_timelines(imagined: Path) -> None:
+    found = contents(imagined)
+    assert set(found) >= REAL | IMAGINED | BY_DEPTH | VALUES
+    for path in REAL - {"/scene/cube_1/cube_1_arrow"}:
+        assert found[path] >= {"sim_time", "env_step", "episode"}
+    assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
+    assert all("imagined_depth" in found[path] for path in BY_DEPTH)
+
+
+def times(path: Path, entity: str, timeline: str) -> set[int]:
+    """When something was logged for an entity."""
+    return {
+        time
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and timeline in chunk.timeline_names
+        for time in chunk.to_record_batch().column(timeline).to_pylist()
+    }
+
+
+def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:
+    frames = {name: times(imagined, "/real/frame", name) for name in ("env_step", "sim_time")}
+    assert len(frames["env_step"]) >= 4
+    assert {name: times(imagined, "/scene/cube_0", name) for name in frames} == frames
+
+
+def cleared(path: Path, entity: str) -> list[int]:
+    """At which real steps an entity was taken away."""
+    return sorted(
+        step
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and any("Clear" in name for name in chunk.to_record_batch().schema.names)
+        for step in chunk.to_record_batch().column("env_step").to_pylist()
+    )
+
+
+def test_at_an_episode_s_end_nothing_more_is_expected(imagined: Path) -> None:
+    ends = cleared(imagined, "/real/q_table")
+    assert len(ends) == 2 and ends[-1] == max(times(imagined, "/real/frame", "env_step"))
+    for entity in ("/imagined/strip", "/imagined/uncertainty/modal"):
+        assert cleared(imagined, entity) == ends
+
+
+def test_on_the_depth_timeline_only_the_first_start_is_real(imagined: Path) -> None:
+    depths = [
+        depth
+        for chunk in RrdReader(imagined).stream()
+        if chunk.entity_path == "/real/frame" and "imagined_depth" in chunk.timeline_names
+        for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
+    ]
+    assert depths == [0]
+
+
+class _HandsOver(FakeImaginer):
+    """Acts and imagines within the four macro-actions of pick-and-place."""
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        return 3
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        return super().imagine(frame, actions=rng.integers(4, size=depth), depth=depth, rng=rng)
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        return np.arange(4, dtype=np.float32)
+
+
+def test_where_chance_plays_several_courses_are_shown_and_elsewhere_not(imagined: Path, tmp_path: Path) -> None:
+    options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
+    path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
+    assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
+    assert "/imagined/sampled_rollouts" not in contents(imagined)
+
+
+def test_application_and_blueprint(imagined: Path) -> None:
+    reader = RrdReader(imagined)
+    assert [store.application_id for store in reader.recordings()] == ["imagine_bench_arrow_puzzle"]
+    assert [store.application_id for store in reader.blueprints()] == ["imagine_bench_arrow_puzzle"]
+
+
+def test_depths_are_those_of_the_rollout(imagined: Path) -> None:
+    depths = [
+        depth
+        for chunk in RrdReader(imagined).stream()
+        if chunk.entity_path == "/imagined/episode_1/frame"
+        for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
+    ]
+    assert depths == list(range(1 + episodes.IMAGINED_DEPTH))
+
+
+def logged(path: Path) -> dict[tuple[str, str], list[str]]:
+    """What was logged, by entity and column; how rows are cut into chunks depends on the clock and does not count."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        for name in set(batch.schema.names) - {"rerun.controls.RowId", "log_time"}:
+            if not chunk.entity_path.startswith("/__"):  # its start time
+                found.setdefault((chunk.entity_path, name), []).extend(map(str, batch.column(name).to_pylist()))
+    return {key: sorted(values) for key, values in found.items()}
+
+
+def test_two_recordings_of_one_seed_are_the_same(imagined: Path, tmp_path: Path) -> None:
+    again, other = (record(FakeImaginer(seed), tmp_path / f"{seed}.rrd") for seed in (0, 1))
+    assert logged(again) == logged(imagined)
+    assert logged(other) != logged(imagined)
+
+
+@pytest.mark.parametrize("name", ["random", "dqn"])
+def test_agents_that_neither_value_nor_imagine(name: str, tmp_path: Path) -> None:
+    found = contents(record(FakeAgent(), tmp_path / "plain.rrd", name=name, episodes=1))
+    assert set(found) >= REAL
+    assert not any(path.startswith(("/imagined", "/real/q_")) for path in found)
+
+
+def test_only_privileged_agents_see_the_macrostate(tmp_path: Path) -> None:
+    class Spy(FakeAgent):
+        seen: list[bool]
+
+        def act(self, observation: Observation, *, explore: bool) -> int:
+            assert not explore
+            self.seen.append(observation.macrostate is not None)
+            return super().act(observation, explore=explore)
+
+    for name, told in (("oracle", True), ("dqn", False)):
+        spy = Spy()
+        spy.seen = []
+        record(spy, tmp_path / f"{name}.rrd", name=name, episodes=1)
+        assert spy.seen
+        assert set(spy.seen) == {told}
+
+
+def test_physics_moves_the_arm_and_stays_small(tmp_path: Path) -> None:
+    path = record(FakeImaginer(), tmp_path / "physics.rrd", execution="physics")
+    assert path.stat().st_size < 6e6  # 5 episodes in 15 MB, with room
+    poses = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/scene/right_l6")
+    actions = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/real/reward")
+    assert poses > 20 * actions
+
+
+def test_a_failure_leaves_a_closed_partial_file_and_no_other(tmp_path: Path) -> None:
+    class Breaks(FakeImaginer):
+        def q_values(self, observation: Observation) -> np.ndarray:
+            raise RuntimeError("broken on purpose")
+
+    path = tmp_path / "recording.rrd"
+    with pytest.raises(RuntimeError, match="broken on purpose"):
+        record(Breaks(), path)
+    assert not path.exists()
+    partial = tmp_path / "recording.partial.rrd"
+    assert rerun("rrd", "verify", partial).returncode == 0
+    assert "/real/frame" in contents(partial)
+
+
+def test_an_existing_recording_survives_a_failure(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"earlier")
+    with pytest.raises(RuntimeError), recording_file(path, "arrow_puzzle", rrb.Blueprint()):
+        raise RuntimeError
+    assert path.read_bytes() == b"earlier"
+
+
+def test_unknown_names_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"No agent 'dqm'\. Did you mean 'dqn'"):
+        record(FakeAgent(), tmp_path / "a.rrd", name="dqm")
+    with pytest.raises(UnknownNameError, match="physics"):
+        record(FakeAgent(), tmp_path / "a.rrd", execution="physical")
+    assert not list(tmp_path.iterdir())
+
+
+def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ArtefactError, match=r"No recording .*none\.rrd"):
+        episodes.open_in_viewer(tmp_path / "none.rrd")
+    there = tmp_path / "there.rrd"
+    there.write_bytes(b"")
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(SetupError, match=r"No display here .* run 'rerun there.rrd'"):
+        episodes.open_in_viewer(there)
+
+
+def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = tmp_path / "there.rrd"
+    there.write_bytes(b"")
+    monkeypatch.setenv("DISPLAY", ":99")
+    failed = subprocess.CompletedProcess[str]([], returncode=1)
+    monkeypatch.setattr(episodes.subprocess, "run", lambda *_, **__: failed)
+    with pytest.raises(SetupError, match=r"the viewer failed; copy it .* or run 'rerun --serve-web"):
+        episodes.open_in_viewer(there)
+
+
+def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
+    rows = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
+    assert rows[1].startswith("  left")
+    assert rows[2].startswith("> right turn   +2.50 ")
+    assert rows[1].count("█") == 1
+    assert rows[2].count("█") == 16
+    assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
+
+
+def test_entity_names_are_lower_snake() -> None:
+    assert entity_name("Turn left (cube 1)") == "turn_left_cube_1"
+
+
+def test_rotation_against_the_matrix() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        quaternion = rng.normal(size=4)
+        quaternion /= np.linalg.norm(quaternion)
+        w, x, y, z = quaternion
+        matrix = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        vectors = rng.normal(size=(5, 3))
+        np.testing.assert_allclose(_rotate(quaternion, vectors), vectors @ matrix.T, atol=1e-12)
+
+
+def shape(kind: str, **changes: object) -> Shape3D:
+    values = {"size": np.array([0.1, 0.2, 0.3]), "pose_in_body": np.array([0, 0, 0, 1.0, 0, 0, 0]), "rgba": np.ones(4)}
+    return Shape3D(name=kind, body="body", kind=kind, **{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_every_kind_of_shape_is_drawn_and_others_refused(tmp_path: Path) -> None:
+    kinds = ("box", "sphere", "capsule", "cylinder", "ellipsoid")
+    triangle = shape("mesh", vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+    with recording_file(tmp_path / "shapes.rrd", "test", rrb.Blueprint()) as file:
+        log_shapes(file, [*(shape(kind) for kind in kinds), triangle, shape("box", size=np.full(3, 4.0))])
+    found = contents(tmp_path / "shapes.rrd")
+    assert set(found) >= {f"/scene/body/{kind}" for kind in (*kinds, "mesh")}
+    with pytest.raises(InvalidValueError, match="is of kind 'cone'"), rr.RecordingStream("test") as file:
+        log_shapes(file, [shape("cone")])
+
+
+def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
+    poses = np.zeros((4, 2, 7))
+    poses[..., 3] = 1.0
+    poses[:, 1, 0] = np.arange(4)
+    motion = Motion(body_names=("still", "moves"), time_s=np.arange(4) / 20.0, poses_in_world=poses)
+    with recording_file(tmp_path / "motion.rrd", "test", rrb.Blueprint()) as file:
+        log_motion(file, motion, end_s=1.15, sequences={"env_step": 3}, only_moved=True)
+    found = contents(tmp_path / "motion.rrd")
+    assert "/scene/moves" in found
+    assert "/scene/still" not in found
+
+
+def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
+    spec = registry.task("arrow_puzzle")
+    rng = np.random.default_rng(0)
+    start = np.array(spec.rules.start_states[0])
+    frame: Frame = spec.render_macrostates(start[None], "clean", rng)[0]
+    rollout = FakeImaginer().imagine(frame, actions=None, depth=8, rng=rng)
+
+    def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
+        frames = np.zeros((len(states), 64, 64, 3), np.uint8)
+        frames[:, 0, : states.shape[1], 0] = states
+        return frames
+
+    showing = dataclasses.replace(spec, render_macrostates=labelled)
+    compared = compare_rollout(showing, frame=frame, macrostate=start, rollout=rollout, appearance="clean", rng=rng)
+    state, over = tuple(int(value) for value in start), False
+    for depth, action in enumerate(rollout.actions):
+        reward = 0.0
+        if not over:
+            (outcome,) = spec.rules.outcomes(state, int(action))
+            state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
+        assert tuple(compared.real_macrostates[depth]) == state
+        assert tuple(compared.real_frames[depth, 0, : len(state), 0]) == state, "the frames must show what is real"
+        assert (compared.real_rewards[depth], compared.real_terminated[depth]) == (reward, over)
+    assert over, "the case never met an end: choose another seed"
+    assert compared.real_frames.shape == (8, 64, 64, 3)

@@ -1,0 +1,421 @@
+"""A regression bench through the same machinery as every other: run, resume, read, report, recording, wrong words."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.agents.regressors import settings as regressor_settings
+from test_recording import contents, times
+
+from imagine_bench import registry
+from imagine_bench.bench.bench import plan
+from imagine_bench.bench.runs import Progress, RunSpec
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.judge.calibration import log_score
+from imagine_bench.judge.quality import generalisation_report
+from imagine_bench.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext, runner
+from imagine_bench.regression import report_robot_ik as robot_ik
+from imagine_bench.regression import report_toy_regression as toy_regression
+from imagine_bench.regression.calibration import calibrate
+from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
+from imagine_bench.regression.runner import run
+from imagine_bench.report.page import flat
+from imagine_bench.report.sections import number
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store.trained import load_trained
+from imagine_bench.task_types import TASK_TYPES
+
+_TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
+
+
+def tiny(task: str, agent: str = "mc_dropout", **changes: Any) -> RunSpec:
+    values = {"networks": 2, "test_points": 30, "overrides": _overrides(agent), "agents": (agent,), **changes}
+    protocol, encoders = plan(task, "smoke", **values)
+    assert encoders == {}
+    return RunSpec(protocol=protocol, agent=agent, seed=0, checkpoint_every_s=0.0)
+
+
+def _overrides(agent: str) -> tuple[tuple[str, Any], ...]:
+    return tuple(pair for pair in _TINY if agent == "ensemble" or pair[0] != "members")
+
+
+def silent(_: Progress) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
+    return run(tiny("toy_regression"), tmp_path_factory.mktemp("toy"), silent)
+
+
+def test_every_kind_has_learners_and_all_names_load() -> None:
+    names = [name for kind in TASK_TYPES.values() for name in kind.tasks]
+    assert len(names) == len(set(names))
+    for kind in TASK_TYPES.values():
+        assert kind.tasks and kind.learners() and registry.load(kind.presets)
+        for target in (
+            kind.protocol, kind.plan, kind.run, kind.load_run, kind.load_so_far, kind.result, kind.write_report,
+            kind.summary_table,
+        ):  # fmt: skip
+            assert callable(registry.load(target))
+    for name in registry.REGRESSIONS:
+        spec = registry.regression(name)
+        assert (
+            spec.id == name and callable(registry.load(spec.sections)) and callable(registry.load(str(spec.recorder)))
+        )
+
+
+def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> None:
+    assert [(row["variant"], row["network"]) for row in toy.rows] == [
+        (variant, index) for variant in ("base", "low_data", "high_noise") for index in (0, 1)
+    ]
+    for row in toy.rows:
+        assert all(np.isfinite(float(v)) for k, v in row.items() if k != "variant" and not k.startswith("auroc"))
+        assert 0 <= float(row["coverage_0.8"]) <= 1 and float(row["crps"]) > 0
+    for variant in ("base", "low_data", "high_noise"):
+        found = toy.evaluations[variant]
+        assert found["epistemic"].shape == (2, 1000) and (found["epistemic"] > 0).all()
+        assert (found["stationarity"] <= np.log(5) + 1e-9).all() and (found["stationarity"] >= 0).all()
+    assert toy.recording is not None
+    named = contents(toy.recording)
+    for variant in ("base", "low_data", "high_noise"):
+        kinds = [f"{kind}/{what}" for kind in ("epistemic", "modal", "aleatoric") for what in ("estimated", "true")]
+        for part in ("y/training", "y/prediction", *kinds):
+            assert named[f"/{variant}/{part}"] == {"x_hundredths"}, part
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_variances_and_surprise_are_those_of_all_weight_samples_pooled(agent: str) -> None:
+    """Of targets far from 0 and from unit variance, so that they must be scaled back rightly."""
+    rng, context = np.random.default_rng(0), tiny_context(agent, scale=50.0, shift=300.0)
+    regressor = registry.make_regressor(agent, context)
+    regressor.train(2)
+    inputs = rng.normal(size=(2, 20, 1))
+    said, pooled = regressor.predict(inputs, rng), regressor.pooled(inputs)
+    weights = pooled.weights[..., None]
+    mean = (weights * pooled.means).sum(axis=-2, keepdims=True)
+    variance = (weights * (pooled.sigmas**2 + (pooled.means - mean) ** 2)).sum(axis=-2)
+    np.testing.assert_allclose(said.epistemic + said.aleatoric + said.modal, variance, rtol=1e-3)
+    np.testing.assert_allclose(said.mean, mean[..., 0, :], rtol=1e-5)
+    assert 10.0 < np.sqrt(variance).mean() < 250.0 and abs(mean.mean() - 300.0) < 100.0
+    np.testing.assert_allclose(said.surprise, log_score(pooled, said.prediction), atol=1e-3)
+
+
+def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
+    rng = np.random.default_rng(1)
+    inputs = rng.normal(size=(64, 1))
+    data = Dataset(inputs=inputs, targets=shift + scale * (np.sin(inputs) + 0.3 * rng.normal(size=(64, 1))))
+    overrides = {**dict(_overrides(agent)), "batch_size": 32}
+    return RegressorContext(
+        datasets=(data, data), seeds=(SeedTree(0), SeedTree(1)), preset="smoke", overrides=overrides
+    )
+
+
+class Knowing:
+    """Says one thing everywhere, and knows how wrong that is: its epistemic variance, and the negative of its modal."""
+
+    def predict(self, inputs: np.ndarray, rng: np.random.Generator) -> Prediction:
+        prediction = np.zeros((*inputs.shape[:2], 1))
+        toy = registry.regression("toy_regression")
+        wrong = np.stack([toy.errors("base", *pair) for pair in zip(inputs, prediction, strict=True)])[..., None]
+        constant = np.zeros(wrong.shape)
+        return Prediction(
+            prediction=prediction, mean=prediction, epistemic=wrong, aleatoric=constant, modal=-wrong,
+            stationarity=constant[..., 0], drawn=constant[..., 0], surprise=-wrong[..., 0],
+            predictive=self.pooled(inputs),
+        )  # fmt: skip
+
+    def pooled(self, inputs: np.ndarray) -> Mixtures:
+        shape = (*inputs.shape[:2], 1)
+        return Mixtures(weights=np.ones(shape), means=np.zeros((*shape, 1)), sigmas=np.full((*shape, 1), 1e6))
+
+
+def test_errors_are_paired_with_the_scores_of_the_same_points() -> None:
+    task, networks = registry.regression("toy_regression"), (SeedTree(0), SeedTree(1))
+    rows, arrays = calibrate(task, Knowing(), "base", networks, points=60, rng=np.random.default_rng(0))
+    assert arrays["error"].shape == (2, 60) and not np.array_equal(*arrays["error"])
+    for row in rows:
+        assert 0.0 < row["wrong"] < 1.0
+        assert row["auroc_epistemic"] == 1.0 and row["auroc_modal"] == row["auroc_surprise"] == 0.0
+        assert row["auroc_total"] == row["auroc_aleatoric"] == row["auroc_stationarity"] == 0.5
+        assert row["coverage_0.5"] == 1.0, "so wide a prediction has every outcome near its median"
+
+
+class _Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_interrupted_and_resumed_is_uninterrupted(agent: str, tmp_path: Path) -> None:
+    spec = tiny("toy_regression", agent, variants=("base", "low_data"), recorded=False)
+    whole = run(spec, tmp_path / "whole", silent)
+    for after in (2, 3, 2):
+        told = iter(range(after))
+
+        def observe(_: Progress, told: Any = told) -> None:
+            if next(told, None) is None:
+                raise _Killed
+
+        with pytest.raises(_Killed):
+            run(spec, tmp_path / "parts", observe)
+    told_after: list[Progress] = []
+    parts = run(spec, tmp_path / "parts", told_after.append)
+    told_whole: list[Progress] = []
+    run(spec, tmp_path / "again", told_whole.append)
+    assert 0 < told_whole[0].done < told_after[0].done, "it must have gone on, not begun anew"
+    for mine, theirs in zip(whole.rows, parts.rows, strict=True):
+        for name in set(mine) - {"train_cpu_s", "measure_cpu_s"}:
+            assert mine[name] == theirs[name] or (np.isnan(mine[name]) and np.isnan(theirs[name])), name
+    assert list(parts.evaluations) == list(whole.evaluations) == list(spec.protocol.variants)
+    for variant, arrays in whole.evaluations.items():
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(array, parts.evaluations[variant][name], err_msg=name)
+
+
+def test_a_checkpoint_gives_the_variants_back_in_the_order_of_the_protocol(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of arrays has no order; recordings and figures do."""
+    spec = tiny("toy_regression", variants=("base", "low_data", "high_noise"), recorded=False)
+
+    def observe(progress: Progress) -> None:
+        if progress.detail.startswith("high_noise"):
+            raise _Killed
+
+    with pytest.raises(_Killed):
+        run(spec, tmp_path / "run", observe)
+    run(spec, tmp_path / "whole", silent)
+    load = runner.load_newest
+
+    def other_order(folder: Path) -> Any:
+        found = load(folder)
+        return replace(found, arrays=dict(sorted(found.arrays.items(), reverse=True)))
+
+    monkeypatch.setattr(runner, "load_newest", other_order)
+    assert list(run(spec, tmp_path / "run", silent).evaluations) == ["base", "low_data", "high_noise"]
+    files = [tmp_path / name / "evaluation.npz" for name in ("run", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_runs_of_other_settings_are_not_averaged(toy: RegressionRun, tmp_path: Path) -> None:
+    """As where ``auto`` settled on another precision on another machine."""
+    two = replace(tiny("toy_regression").protocol, seeds=(0, 1))
+    facts = {"protocol": two, "environment": {}, "folder": tmp_path, "wall_s": 0.0}
+    same = replace(toy, seed=1, folder=tmp_path / "seed_1")
+    assert RegressionResult(runs=(toy, same), **facts).of("mc_dropout") == (toy, same)
+    other = replace(same, settings={**toy.settings, "precision": "float64"})
+    with pytest.raises(ArtefactError, match=r"ran with precision '.*' and .*seed_1 with 'float64'"):
+        RegressionResult(runs=(toy, other), **facts)
+
+
+def test_measures_that_an_older_version_had_not_are_empty_cells(toy: RegressionRun, tmp_path: Path) -> None:
+    older = [{name: value for name, value in row.items() if name != "crps"} for row in toy.rows[:2]]
+    folder = Path(shutil.copytree(toy.folder, tmp_path / "run"))
+    finish(folder, [*older, *toy.rows[2:]], toy.evaluations)
+    found = load_run(folder)
+    assert np.isnan(found.values("base", "crps")).all()
+    np.testing.assert_array_equal(found.values("low_data", "crps"), toy.values("low_data", "crps"))
+    assert np.isfinite(found.values("base", "coverage_0.8")).all()
+
+
+def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="is of a regression task, in which no agent acts"):
+        load_trained(toy.folder)
+    with pytest.raises(ArtefactError, match="Task 'toy_regression' is of a regression task"):
+        generalisation_report(None, root=tmp_path, task="toy_regression", encoder=None)
+
+
+def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "make_regressor", lambda *_: pytest.fail("a finished run was run again"))
+    again = run(tiny("toy_regression"), toy.folder, silent)
+    assert again.rows == toy.rows
+
+
+def test_a_damaged_result_is_named(toy: RegressionRun, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in toy.folder.iterdir():
+        if path.is_file():
+            (copy / path.name).write_bytes(path.read_bytes())
+    (copy / "metrics.csv").write_text("variant,network\n")
+    with pytest.raises(ArtefactError, match=r"metrics.csv is not as the run left it"):
+        run(tiny("toy_regression"), copy, silent)
+
+
+def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = [f"{name}={value}".replace(" ", "") for name, value in _overrides("mc_dropout")]
+    words = [
+        "bench", "--task", "robot_ik", "--preset", "smoke", "--agents", "mc_dropout", "--variants", "1000",
+        "--networks", "1", "--workers", "1", "--out", str(tmp_path), "--set", *settings,
+    ]  # fmt: skip
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "MC dropout, 1000" in said and "thesis, 1000" in said and "3.89 (0.67)" in said
+    (folder,) = (tmp_path / "robot_ik").iterdir()
+    report = folder / "report"
+    html = (report / "index.html").read_text()
+    assert "Table 4.1" in html and html.count("data:image/png;base64") == 4 and "unreachable" in html
+    for name in ("results", "table_4_1", "ratio_to_random", "disc", "disc_ratio_to_random", "calibration", "auroc"):
+        assert (report / f"{name}.csv").stat().st_size > 50
+    assert (report / "report.md").stat().st_size > 1000
+    recording = folder / "mc_dropout" / "seed_0" / "recording.rrd"
+    named = contents(recording)
+    for part in ("candidates", "chosen", "outside", "miss", "error", "story"):
+        assert named[f"/choice/{part}"] >= {"sim_time", "choice"}, part
+    assert min(times(recording, "/choice/story", "choice")) == 1, "counted as its words do"
+    assert any(path.startswith("/scene") for path in named)
+    assert main(words) == 0  # nothing is missing: the same table again, from the files
+    notice, *again = capsys.readouterr().out.splitlines()
+    assert notice == f"All runs lie in {folder} already; nothing was run."
+    assert again[:8] == said.splitlines()[:8]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--task", "robot_ik", "--variants", "5"], "a number of samples in [20, 1000000], such as 2000, not '5'"),
+        (["--task", "toy_regression", "--variants", "bse"], "No variant of toy_regression 'bse'. Did you mean 'base'?"),
+        (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: mc_dropout, ensemble."),
+        (["--task", "toy_regression", "--networks", "0"], "networks is 0; it must lie in [1, 1000]."),
+        (["--task", "toy_regression", "--budgets", "5"], "toy_regression takes no --budgets; leave it out."),
+        (["--task", "arrow_puzzle", "--networks", "5"], "arrow_puzzle takes no --networks; leave it out."),
+        (["--task", "toy_regression", "--set", "weight_samples=1"], "Setting weight_samples is 1; it must lie in [2,"),
+        (["--task", "toy_regression", "--set", "components=0"], "Setting components is 0; it must lie in [1, 1000]."),
+        (["--task", "toy_regression", "--set", "dropout=0.96"], "Setting dropout is 0.96; it must lie in [0, 0.95]."),
+        (["--task", "toy_regression", "--set", "dropout=0.001"], "Setting dropout is 0.001, which counts as 0"),
+        (["--task", "toy_regression", "--set", "epochs=0"], "Setting epochs is 0; it must be at least 1."),
+        (["--task", "toy_regression", "--set", "learning_rate=0"], "Setting learning_rate is 0.0; it must lie in (0,"),
+        (["--task", "toy_regression", "--set", "batch_size=1"], "batch_size is 1; it must be at least 8: layers are"),
+        (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
+        (["--task", "toy_regression", "--set", "members=1"], "Setting members is 1 in an ensemble; it must be at"),
+        (["--task", "toy_regression", "--set", "precision=half"], "No precision 'half'."),
+        (["--task", "toy_regression", "--set", "hidden=[64]"], "dropout acts between hidden layers, so it needs at"),
+        (["--task", "toy_regresion"], "No task 'toy_regresion'. Did you mean 'toy_regression'? Known: arrow_puzzle"),
+    ],
+)  # fmt: skip
+def test_wrong_words_get_one_line_and_write_nothing(
+    words: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *words, "--out", str(tmp_path / "runs")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert sentence in line
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(("preset", "epochs"), [("smoke", 4), ("quick", 120), ("thesis", 300)])
+def test_an_ensemble_never_costs_more_than_the_one_network(preset: str, epochs: int) -> None:
+    one, ensemble = (regressor_settings.resolve(preset, {}, ensemble=kind) for kind in (False, True))
+    assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
+
+
+@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (8, 75)])
+def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
+    data = Dataset(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
+    settings = {"hidden": (4, 4), "components": 2, "batch_size": batch_size}
+    context = RegressorContext(datasets=(data,), seeds=(SeedTree(0),), overrides=settings)
+    regressor = registry.make_regressor("mc_dropout", context)
+    regressor.train(2)
+    assert regressor.state().values["batches"] == 2 * updates
+
+
+def test_dropout_is_the_one_networks_and_members_are_the_ensembles() -> None:
+    one, ensemble = regressor_settings.resolve_all("quick", {"dropout": 0.1, "members": 3})
+    assert (one.dropout, one.members) == (0.1, 1)
+    assert (ensemble.dropout, ensemble.members) == (0.0, 3)
+
+
+def test_an_ensemble_draws_as_many_values_for_its_divergence_as_dropout_does() -> None:
+    one, ensemble = regressor_settings.resolve_all("thesis", {})
+    assert ensemble.members * ensemble.divergence_draws == one.weight_samples * one.divergence_draws
+
+
+def test_an_ensembles_two_distributions_are_one_and_score_alike(tmp_path: Path) -> None:
+    """Members side by side are what it predicts with; scored at the same points, both must have one CRPS."""
+    found = run(
+        tiny("toy_regression", "ensemble", variants=("base",), test_points=80, recorded=False), tmp_path, silent
+    )
+    alone, pooled = found.values("base", "crps_shared"), found.values("base", "pooled_crps_shared")
+    np.testing.assert_allclose(alone, pooled, rtol=1e-5)
+    assert not np.allclose(found.values("base", "crps"), pooled, rtol=1e-3), (
+        "all 80 points are others than the first 50"
+    )
+
+
+def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
+    good = Dataset(inputs=np.zeros((5, 1)), targets=np.ones((5, 1)))
+    seeds = (SeedTree(0).child("a"), SeedTree(0).child("b"))
+    for bad, words in (
+        (Dataset(inputs=np.zeros((4, 1)), targets=np.ones((4, 1))), "Dataset 1 has inputs and targets of shapes"),
+        (
+            Dataset(inputs=np.zeros((5, 1)), targets=np.full((5, 1), np.nan)),
+            "Dataset 1 holds values that are not finite",
+        ),
+    ):
+        with pytest.raises(InvalidValueError, match=words):
+            registry.make_regressor("mc_dropout", RegressorContext(datasets=(good, bad), seeds=seeds))
+    with pytest.raises(InvalidValueError, match="a seed for each, not 1 and 2"):
+        registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds))
+    sound = registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds[:1]))
+    with pytest.raises(InvalidValueError, match=r"N at least 1, not \(1, 0, 1\)"):
+        sound.predict(np.zeros((1, 0, 1)), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
+def test_regressors_learn_two_branches_and_refuse_a_foreign_snapshot(agent: str) -> None:
+    """Chance: |y| is uniform in [0.5, 1.5], so a network that ignores x cannot go below log 2 = 0.69 nats."""
+    rng = np.random.default_rng(0)
+
+    def branches(count: int) -> Dataset:
+        x = rng.uniform(-1, 1, (count, 1))
+        y = np.where(rng.random((count, 1)) < 0.5, 1.0, -1.0) * (1 + 0.5 * x) + 0.05 * rng.standard_normal((count, 1))
+        return Dataset(inputs=x, targets=y)
+
+    settings = {"epochs": 80, "hidden": (64, 64), "components": 4, "batch_size": 50, "learning_rate": 5e-3}
+    context = RegressorContext(datasets=(branches(600),), seeds=(SeedTree(5),), overrides=settings)
+    regressor = registry.make_regressor(agent, context)
+    regressor.train(80)
+    test = branches(200)
+    said = regressor.predict(test.inputs[None], rng)
+    predictive = Mixtures(**{name: getattr(said.predictive, name)[0] for name in ("weights", "means", "sigmas")})
+    assert log_score(predictive, test.targets).mean() < 0.2
+    truth = (1 + 0.5 * test.inputs[:, 0]) ** 2  # half the distance between the branches, squared
+    assert np.corrcoef(said.modal[0, :, 0], truth)[0, 1] > 0.3  # chance: 0
+    state = regressor.state()
+    with pytest.raises(ArtefactError):
+        regressor.restore(AgentState(arrays={**state.arrays, "other": np.zeros(1)}, values=state.values))
+
+
+def test_claims_and_ratios_by_hand() -> None:
+    values = np.array([2.0, 3.0, 4.0])
+    assert toy_regression.holds(values, "≥ 3").tolist() == [False, True, True]
+    assert toy_regression.holds(values, "≤ 3").tolist() == [True, True, False]
+    estimate = robot_ik.ratio_to_random(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.random.default_rng(0))
+    assert estimate == pytest.approx((0.5, 0.5, 0.5))  # every network halves its own random error
+    assert set(SCORES) >= {"epistemic", "aleatoric", "modal", "stationarity", "surprise", "drawn_component"}
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (9.999, 3, "10.0"), (1234.5, 3, "1234"), (0.0042, 3, "0.004"), (0.004, 2, "4.0e\u221203"), (0.0, 3, "0.000"),
+        (-3.14159, 3, "\u22123.14"), (123456.0, 3, "1.23e+05"), (math.nan, 3, "–"),
+    ],
+)  # fmt: skip
+def test_numbers_show_what_there_is(value: float, digits: int, text: str) -> None:
+    assert number(value, digits) == text
+
+
+def test_lists_of_sittings_are_rows_not_python() -> None:
+    facts = {"seeds": [0, 1], "sessions": [{"wall_s": 1.0, "changed": {}}, {"wall_s": 2.0, "changed": {"commit": "a"}}]}
+    assert flat("", facts) == [
+        ("seeds", "0; 1"), ("sessions.1.wall_s", "1.0"),
+        ("sessions.2.wall_s", "2.0"), ("sessions.2.changed.commit", "a"),
+    ]  # fmt: skip

@@ -1,0 +1,138 @@
+"""Whole files or none, and one sentence for each way in which a folder can refuse."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from imagine_bench.errors import ArtefactError, BusyError, SetupError
+from imagine_bench.store.files import (
+    csv_text,
+    first_difference,
+    lock,
+    make_folder,
+    read_json,
+    write_bytes,
+    write_json,
+    writing,
+)
+
+_HOLD = """
+import sys, time
+from pathlib import Path
+from imagine_bench.files import lock
+with lock(Path(sys.argv[1]), "The folder"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_json_comes_back(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"x": [1, 2.5, "ü"]})
+    assert read_json(tmp_path / "a.json", "a test") == {"x": [1, 2.5, "ü"]}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    ("code", "sentence"),
+    [
+        (errno.ENOSPC, "the disk is full; free some space and run the same command again"),
+        (errno.EACCES, "you may not write there; choose another folder"),
+        (errno.EROFS, "that file system is read-only"),
+    ],
+)
+def test_a_refusal_is_one_sentence_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, sentence: str
+) -> None:
+    path = tmp_path / "a.json"
+    write_json(path, "old")
+
+    def refuse(_: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(SetupError) as caught:
+        write_json(path, "new")
+    assert str(caught.value).startswith(f"Cannot write {path}: {sentence}")
+    assert json.loads(path.read_text()) == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+def test_a_really_full_disk() -> None:
+    path = Path("/dev/full")
+    with pytest.raises(SetupError, match="Cannot write /dev/full: the disk is full"), writing(path):
+        path.write_bytes(b"x")
+
+
+def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("not a folder")
+    with pytest.raises(SetupError, match="a part of that path is a file, not a folder"):
+        make_folder(tmp_path / "runs" / "arrow_puzzle")
+
+
+def test_damaged_json_is_named_and_untouched(tmp_path: Path) -> None:
+    path = tmp_path / "protocol.json"
+    path.write_bytes(b"{\x00")
+    with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol.*left untouched"):
+        read_json(path, "a bench's protocol")
+    assert path.read_bytes() == b"{\x00"
+
+
+def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) -> None:
+    path = tmp_path / ".lock"
+    child = subprocess.Popen([sys.executable, "-c", _HOLD, str(path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    with child.stdout:
+        assert child.stdout.readline() == "held\n"
+        with (
+            pytest.raises(
+                BusyError,
+                match=rf"The folder is in use by process {child.pid} on .*; wait for it, stop it, or choose another",
+            ),
+            lock(path, "The folder"),
+        ):
+            pass
+        child.kill()
+        child.wait()
+    with lock(path, "The folder"):
+        assert str(os.getpid()) in path.read_text()
+
+
+def test_a_lock_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handle: int, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("imagine_bench.store.files.os.write", full)
+    with lock(tmp_path / ".lock", "The folder"), pytest.raises(BusyError), lock(tmp_path / ".lock", "The folder"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "found"),
+    [
+        ({"a": 1, "b": {"c": [1, 2]}}, {"a": 1, "b": {"c": [1, 2]}}, None),
+        ({"a": 1, "b": {"c": 2, "d": 3}}, {"a": 1, "b": {"c": 2, "d": 4}}, ("b.d", 3, 4)),
+        ({"b": 1}, {"a": 2, "b": 1}, ("a", None, 2)),
+        ({"b": {"c": 1}}, {"b": 5}, ("b", {"c": 1}, 5)),
+        ({"b": 1}, {"a": None, "b": 1}, ("a", None, None)),
+    ],
+)
+def test_the_first_difference_is_named(then: object, now: object, found: object) -> None:
+    assert first_difference(then, now) == found
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SetupError, match="No such file"):
+        write_bytes(tmp_path / "missing" / "a", b"x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_as_csv() -> None:
+    assert csv_text([["a", "b"], (1, "x, y")]) == 'a,b\n1,"x, y"\n'

@@ -1,0 +1,62 @@
+"""Meshes of scenes: closed, facing outward, and as large as the solids they stand for."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.cubes import arrow_outline
+from imagine_bench.tasks.pick_place import open_hand
+from imagine_bench.tasks.scenes import hand, objects
+from imagine_bench.tasks.scenes.meshes import Mesh, arch, box, ellipsoid, limb, merge, prism, turned_profile
+
+
+def signed_volume_m3(mesh: Mesh) -> float:
+    """Enclosed volume; positive if every part is closed and its faces look outward (overlaps count twice)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def arrow():
+    return prism(arrow_outline(), 0.0, 0.001)
+
+
+PARTS = [
+    arrow, hand.hand_mesh, hand.wrist_mesh, hand.sleeve_mesh,
+    open_hand.open_hand_mesh, open_hand.open_wrist_mesh, open_hand.open_sleeve_mesh,
+    objects._car_body, objects._car_trim, objects._cup_body, objects._cup_inside,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.__name__)
+def test_meshes_are_closed_and_face_outward(part):
+    mesh = part()
+    edges = Counter(tuple(edge) for face in mesh.faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True))
+    assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
+    assert signed_volume_m3(mesh) > 0
+
+
+def test_volumes_of_flat_solids_are_exact():
+    outline = arrow_outline()
+    x, y = outline.T
+    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+    assert signed_volume_m3(prism(outline, -0.1, 0.2)) == pytest.approx(0.3 * area)
+    assert signed_volume_m3(box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
+    assert signed_volume_m3(box((0, 0, 0), (1, 1, 1), taper=0.5)) == pytest.approx((1 + 0.25 + 0.5) / 3)
+
+
+def test_volumes_of_round_solids_are_approached():
+    fine = ellipsoid((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), sides=96, rings=95)
+    assert signed_volume_m3(fine) == pytest.approx(4 / 3 * np.pi * 0.006, rel=5e-3)
+    tube = limb([(0, 0, 0, 0.1), (0, 0, 5, 0.1), (0, 0, 10, 0.1)], sides=96)
+    assert signed_volume_m3(tube) == pytest.approx(np.pi * 0.01 * 10, rel=0.02)
+    assert signed_volume_m3(turned_profile([(1.0, 0.0), (1.0, 2.0)], sides=96)) == pytest.approx(2 * np.pi, rel=1e-2)
+    rod = arch((0, 0, 0), radius=1.0, thickness=0.05, corners=48, sides=48)
+    assert signed_volume_m3(rod) == pytest.approx(np.pi * (np.pi * 0.05**2), rel=0.05)
+    assert rod.vertices[:, 0].min() == pytest.approx(-1.05, abs=1e-2)
+
+
+def test_merged_volumes_add_up():
+    small, large = box((0, 0, 0), (1, 1, 1)), box((5, 0, 0), (2, 2, 2))
+    assert signed_volume_m3(merge([small, large])) == pytest.approx(signed_volume_m3(small) + signed_volume_m3(large))

@@ -1,0 +1,102 @@
+"""The doctor and the facts it reads: what is wrong is said in words, what is right is left alone."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from imagine_bench import machine as environment
+from imagine_bench.cli import main
+from imagine_bench.errors import SetupError
+from imagine_bench.tools import doctor
+
+
+def test_this_installation_works(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    for word in ("mujoco", "dm-control", "torch", "GL renderer", "64x64 frame", "processor", "Everything works."):
+        assert word in out
+
+
+def with_version(**changed: str) -> Callable[[str], str]:
+    return lambda package: changed.get(package) or environment.installed(package)
+
+
+def test_the_broken_pair_is_named() -> None:
+    (complaint,) = doctor.unmet_requirements(with_version(mujoco="4.0.0"))
+    assert complaint.startswith("mujoco 4.0.0 is installed, but")
+    assert "MuJoCo 4.0 breaks dm-control 1.0.50" in complaint and "make setup" in complaint
+
+
+def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each edit, and a new file that nobody added, has a name of its own; what is no code has none."""
+
+    def git(*words: str) -> None:
+        identity = ("-c", "user.name=x", "-c", "user.email=x@example.org")
+        subprocess.run(["git", "-C", str(tmp_path), *identity, *words], check=True, capture_output=True)
+
+    def write(name: str, text: str) -> None:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    monkeypatch.setattr("imagine_bench.machine.imagine_bench.__file__", str(tmp_path / "imagine_bench/__init__.py"))
+    git("init", "-q")
+    write("agents/a.py", "1")
+    git("add", ".")
+    git("commit", "-qm", "x")
+    head = environment.commit()
+    assert head is not None and "+" not in head
+    write("README.md", "words")
+    write("runs/x.py", "results")
+    assert environment.commit() == head
+    seen = {head}
+    for name, text in (("agents/a.py", "2"), ("agents/a.py", "3"), ("agents/new.py", "1"), ("agents/new.py", "2")):
+        write(name, text)
+        now = environment.commit()
+        assert now is not None and now.startswith(f"{head}+changes.") and now not in seen
+        seen.add(now)
+    (tmp_path / "agents/new.py").unlink()
+    write("agents/a.py", "1")
+    assert environment.commit() == head
+
+
+def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/x/imagine_bench/__main__.py", "bench", "--task", "a b"])
+    assert environment.command() == "python -m imagine_bench bench --task 'a b'"
+    monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "list"])
+    assert environment.command() == "imagine-bench list"
+
+
+@pytest.mark.parametrize("package", ["mink", "jinja2", "matplotlib"])
+def test_a_missing_package_is_named(package: str) -> None:
+    (complaint,) = doctor.unmet_requirements(with_version(**{package: "missing"}))
+    assert complaint.startswith(f"{package} is missing, but")
+
+
+def test_versions_of_this_machine_satisfy_every_requirement() -> None:
+    assert doctor.unmet_requirements() == []
+
+
+def test_missing_gl_is_a_complaint_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def none() -> str:
+        raise SetupError("No OpenGL for headless rendering: install libegl1.")
+
+    monkeypatch.setattr(doctor, "gl_renderer", none)
+    with pytest.raises(SystemExit) as caught:
+        main(["doctor"])
+    assert caught.value.code == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "Wrong: No OpenGL for headless rendering: install libegl1."
+
+
+def test_the_environment_is_json_and_complete() -> None:
+    facts = environment.describe_environment()
+    assert set(facts) == {"command", "commit", "versions", "machine", "gl_renderer", "threads_a_run"}
+    assert "missing" not in facts["versions"].values()
+    assert facts["machine"]["cores"] >= 1 and facts["machine"]["cpu"]
+    assert {"daqp", "stable-baselines3"} <= set(facts["versions"]), "a solver of mink's, and a peer of the tests' extra"
+    assert facts["gl_renderer"] and not facts["gl_renderer"].startswith("none")

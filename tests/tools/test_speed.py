@@ -1,0 +1,25 @@
+"""``make speed``: it measures everything, and the figures that no machine may change hold."""
+
+import json
+
+from imagine_bench import registry
+from imagine_bench.tools.speed import speed_report
+
+
+def test_figures_are_measured_and_kept(tmp_path):
+    lines: list[str] = []
+    all_met = speed_report(tmp_path / "deep" / "speed.json", turns=100, show=lines.append)
+    kept = json.loads((tmp_path / "deep" / "speed.json").read_text())
+    figures = {figure["what"]: figure for figure in kept["figures"]}
+    assert len(lines) == len(figures) + 1 and kept["environment"]["versions"]["mujoco"]
+    assert all_met == all(figure["met"] for figure in figures.values())
+    assert any(name.startswith("a model update") for name in figures)
+    measured = [spec for spec in map(registry.task, registry.TASKS) if spec.targets is not None]
+    assert {spec.id for spec in measured} >= {"arrow_puzzle", "pick_place"}
+    for spec in measured:
+        wanted = ("macro-actions exactly", "other objects", "position error", "yaw error", "bundled")
+        exact = [name for name in figures if name.startswith(tuple(f"{spec.id}: {words}" for words in wanted))]
+        errors = [allowed for allowed in (spec.targets.error_mm, spec.targets.error_deg) if allowed is not None]
+        assert len(exact) == 2 + len(errors) + len(spec.targets.encoders)
+        for name in exact:
+            assert figures[name]["met"], figures[name]
