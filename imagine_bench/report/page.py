@@ -13,11 +13,12 @@ from imagine_bench.judge.filmstrips import first_cut, png, rollout_strip
 from imagine_bench.judge.sampled_filmstrips import courses_sheet
 from imagine_bench.report import plots
 from imagine_bench.report import text as words
-from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
+from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
 from imagine_bench.report.encoder import encoder_views
 from imagine_bench.report.sections import Picture
 from imagine_bench.report.template import render
 from imagine_bench.report.text import agent_words, percent, score_text
+from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, write_bytes
 from imagine_bench.store.results import BenchResult, ComparedRollout
 
@@ -53,7 +54,7 @@ def write_report(result: BenchResult) -> Path:
     pictures: list[plots.Plot | Picture] = [*drawn, *strips, *sampled_rollouts]
     files = {f"{each.name}.png": each.png for each in pictures}
     files |= {each.file: picture for each, picture in shown}
-    files["results.csv"] = results_csv(result).encode()
+    files |= {name: text.encode() for name, text in archive_files(result).items()}
     if data.open_loop:
         files["open_loop.csv"] = open_loop_csv(result).encode()
     files["summary.csv"] = summary_csv(data).encode()

@@ -1,7 +1,6 @@
 """Protocols: complete, hashed, and strict about what they are given."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -75,14 +74,6 @@ def test_a_preset_that_changes_is_another_bench(
     assert (after.hash != before.hash) is moved
     asked, _ = plan_control("arrow_puzzle", "quick", agents=agents, budgets=(5,))
     assert asked.settings_digest == after.settings_digest
-
-
-def test_a_protocol_from_before_keeps_its_hash() -> None:
-    """Results from before settings had a digest are still those that other kept files name."""
-    results = Path(__file__).parents[2] / "docs" / "results"
-    kept = json.loads((results / "arrow_puzzle-quick" / "protocol.json").read_text())
-    named = json.loads((results / "arrow_puzzle-generalisation" / "summary.json").read_text())["protocol_hash"]
-    assert "settings_digest" not in kept and Protocol.from_dict(kept).hash == named
 
 
 def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_word(monkeypatch):
