@@ -242,7 +242,7 @@ def test_a_bench_without_an_imagining_agent_has_no_model_to_ask(tmp_path: Path) 
     ("folder", "complaint"),
     [
         ("docs/results/arrow_puzzle_hard-thesis", "holds kept results and no agents; give a bench's own folder"),
-        ("docs/results/toy_regression-quick", "is of a regression task, in which no agent acts"),
+        ("docs/results/toy_regression-thesis", "is of a regression task, in which no agent acts"),
         ("docs", "There is no docs/protocol.json"),
     ],
 )

@@ -177,7 +177,7 @@ def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Pat
 
 
 def test_kept_results_of_a_regression_bench_are_said_to_have_no_report(capsys: pytest.CaptureFixture[str]) -> None:
-    kept = Path(__file__).parents[2] / "docs/results/toy_regression-quick"
+    kept = Path(__file__).parents[2] / "docs/results/toy_regression-thesis"
     assert main(["report", str(kept)]) == 2
     assert "keeps a bench of toy_regression, whose tables are its .csv files" in capsys.readouterr().err
 

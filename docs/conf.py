@@ -1,0 +1,23 @@
+"""The site: Sphinx with MyST and furo. ``make docs`` builds it into build/docs; warnings are errors."""
+
+from importlib import metadata
+
+project = "imagine_bench"
+author = "The imagine_bench developers"
+copyright = "2026, the imagine_bench developers"
+release = metadata.version("imagine-bench")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["deflist"]
+myst_heading_anchors = 4
+exclude_patterns = ["results/**/report"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+nitpicky = False
+
+html_theme = "furo"
+html_title = "imagine_bench"
