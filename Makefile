@@ -1,74 +1,107 @@
 # The two commands of a newcomer: make bench TASK=arrow_puzzle, make test. Each sets everything up first.
-
-TASK ?= arrow_puzzle
-PRESET ?= quick
-LAUNCHER ?= local
-ARGS ?=
-# where a command would take the newest bench of any task, only a TASK that was given narrows it
-OF_TASK = $(if $(filter file,$(origin TASK)),,--task $(TASK))
-PYTEST ?= -n auto --dist loadfile
+# Options of a command are given as variables, AGENTS='dqn oracle' for --agents dqn oracle, or as they are in ARGS.
 
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+PYTEST ?= -n auto --dist loadfile
+
+# The variables that each target takes.
+takes_bench := TASK PRESET AGENTS SEEDS BUDGETS APPEARANCE EXECUTION ENCODER VARIANTS LAUNCHER WORKERS DEVICE ARGS
+takes_peers := $(takes_bench)
+takes_study := TASK VARIANTS LAUNCHER WORKERS ARGS
+takes_plan := TASK EXECUTION ENCODER ARGS
+takes_generalise := TASK ENCODER ARGS
+takes_policy := TASK ENCODER ARGS
+takes_view := TASK ARGS
+takes_report := TASK ARGS
+takes_encoder := TASK APPEARANCE ARGS
+takes_film := TASK APPEARANCE ARGS
+takes_speed := ARGS
+takes_test := PYTEST ARGS
+takes_test-slow := $(takes_test)
+takes_docs := ARGS
+takes_lock := ARGS
+# The default of these; without TASK the others take the newest bench of any task.
+bench peers study encoder film: TASK ?= arrow_puzzle
+peers: AGENTS ?= sb3_dqn sb3_qrdqn sb3_dqn_latents
+peers: SEEDS ?= 0 1 2 3 4
+peers: BUDGETS ?= 100 250 500 1000 2000
+
+known := VENV PYTHON TORCH_INDEX $(foreach goal,$(MAKECMDGOALS),$(takes_$(goal)))
+unknown := $(foreach name,$(.VARIABLES),$(if $(findstring command line,$(origin $(name))),$(filter-out $(known),$(name))))
+ifneq ($(strip $(unknown)),)
+$(error 'make $(MAKECMDGOALS)' takes no $(strip $(unknown)). It takes $(sort $(known)))
+endif
+
+# --name value for each variable of the target that has a value
+options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench peers plan generalise policy study view report encoder film doctor test test-slow lint speed clean
+.PHONY: help ready setup bench peers plan generalise policy study view report encoder film doctor test test-slow lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo "  Options: TASK=$(TASK) PRESET=$(PRESET) ARGS='--seeds 0 1 2 ...' (imagine-bench list; imagine-bench bench --help)"
+	@echo "  Options: TASK=arrow_puzzle PRESET=quick AGENTS='dqn oracle' SEEDS='0 1' BUDGETS='100 200'; any other in ARGS='--device cuda'."
+	@echo "  'imagine-bench list' names tasks, presets and agents; 'imagine-bench bench --help' the options."
 
-$(READY): pyproject.toml .ci/setup.sh
-	@.ci/setup.sh $(VENV) $(READY)
+ready:
+	@.ci/setup.sh $(VENV)
 
-setup: $(READY)  ## Install everything into .venv and stop
-	@:
+setup: ready  ## Install everything into .venv and stop; PYTHON names the interpreter
 
-bench: $(READY)  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
-	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) $(ARGS)
+bench: ready  ## Train and compare the agents on TASK; leaves a report and recordings below runs/
+	@$(BIN)/imagine-bench bench $(options)
 
-peers: $(READY)  ## Train a library's agents on TASK, with the budgets and tests of our own
-	@$(BIN)/imagine-bench bench --task $(TASK) --preset $(PRESET) --launcher $(LAUNCHER) --agents sb3_dqn sb3_qrdqn sb3_dqn_latents --seeds 0 1 2 3 4 --budgets 100 250 500 1000 2000 $(ARGS)
+peers: ready  ## Train a library's agents on TASK, with the budgets and tests of our own
+	@$(BIN)/imagine-bench bench $(options)
 
-plan: $(READY)  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
-	@$(BIN)/imagine-bench plan $(OF_TASK) $(ARGS)
+plan: ready  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
+	@$(BIN)/imagine-bench plan $(options)
 
-generalise: $(READY)  ## Ask the newest bench's models for every transition, also those that no training can contain
-	@$(BIN)/imagine-bench generalise $(OF_TASK) $(ARGS)
+generalise: ready  ## Ask the newest bench's models for every transition, also those that no training can contain
+	@$(BIN)/imagine-bench generalise $(options)
 
-policy: $(READY)  ## Follow the policies of the newest bench's learners from every start by the rules
-	@$(BIN)/imagine-bench policy $(OF_TASK) $(ARGS)
+policy: ready  ## Follow the policies of the newest bench's learners from every start by the rules
+	@$(BIN)/imagine-bench policy $(options)
 
-study: $(READY)  ## Change one factor of the comparison on TASK at a time, on tuning seeds
-	@$(BIN)/imagine-bench study --task $(TASK) --launcher $(LAUNCHER) $(ARGS)
+study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
+	@$(BIN)/imagine-bench study $(options)
 
-view: $(READY)  ## Open the newest recording in the Rerun viewer
-	@$(BIN)/imagine-bench view $(OF_TASK) $(ARGS)
+view: ready  ## Open the newest recording in the Rerun viewer
+	@$(BIN)/imagine-bench view $(options)
 
-report: $(READY)  ## Write the newest bench's report again and show its table
-	@$(BIN)/imagine-bench report $(OF_TASK) $(ARGS)
+report: ready  ## Write the newest bench's report again and show its table
+	@$(BIN)/imagine-bench report $(options)
 
-encoder: $(READY)  ## Train an encoder for TASK anew and say how it compares to the bundled one
-	@$(BIN)/imagine-bench encoder --task $(TASK) $(ARGS)
+encoder: ready  ## Train an encoder for TASK anew and say how it compares to the bundled one
+	@$(BIN)/imagine-bench encoder $(options)
 
-film: $(READY)  ## Film an episode of TASK as a GIF
-	@$(BIN)/imagine-bench film --task $(TASK) $(ARGS)
+film: ready  ## Film an episode of TASK as a GIF
+	@$(BIN)/imagine-bench film $(options)
 
-doctor: $(READY)  ## Say what this machine has, and in words what is wrong with it
+doctor: ready  ## Say what this machine has, and in words what is wrong with it
 	@$(BIN)/imagine-bench doctor
 
-test: $(READY)  ## Run the tests, but for those that take minutes each
+test: ready  ## Run the tests, but for those that take minutes each; ARGS goes to pytest
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST) $(ARGS)
 
-test-slow: $(READY)  ## Run the tests that take minutes each
+test-slow: ready  ## Run the tests that take minutes each
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST) $(ARGS)
 
-lint: $(READY)  ## Check style, format and types
+lint: ready  ## Check style, format and types
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
-speed: $(READY)  ## Measure every speed and fidelity figure that is promised
-	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(ARGS)
+docs: ready  ## Build the site into build/docs; warnings are errors
+	@$(BIN)/python -m sphinx -W -q -b html docs build/docs $(ARGS)
+
+build: ready  ## Build the wheel into dist/ and use it in an empty folder
+	@.ci/build.sh $(VENV)
+
+lock:  ## Pin every package in .ci/requirements.lock after a change of pyproject.toml; ARGS=--upgrade takes the newest
+	@PATH="$$PATH:$(BIN)" uv pip compile -q pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-emit-package torch --config-file .ci/lock.toml --custom-compile-command 'make lock' -o .ci/requirements.lock $(ARGS) >/dev/null
+
+speed: ready  ## Measure every speed and fidelity figure that is promised
+	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(options)
 
 clean:  ## Remove caches and build leftovers; results and .venv stay
 	@rm -rf build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 _TOP = Path(__file__).parent.parent
+_PROJECT = tomllib.loads((_TOP / "pyproject.toml").read_text())
+_LOCK = (_TOP / ".ci/requirements.lock").read_text()
+_PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 _ROOMS = ("tasks", "agents", "assets")
 
 
@@ -25,7 +32,7 @@ def packages() -> dict[str, Path]:
 
 
 def test_every_folder_with_python_is_installed() -> None:
-    listed = tomllib.loads((_TOP / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    listed = _PROJECT["tool"]["setuptools"]["packages"]
     assert sorted(packages()) == sorted(listed)
 
 
@@ -79,3 +86,60 @@ def test_the_wheel_holds_every_module_and_resource(wheel: list[str]) -> None:
                 missing += [name] if name not in wheel else []
     assert missing == []
     assert any(name.endswith(".safetensors") for name in wheel)  # non-vacuous
+
+
+def locked(python: str) -> dict[str, Version]:
+    """Versions that the lock gives a Python on Linux."""
+    system = {"python_version": python, "python_full_version": f"{python}.5", "sys_platform": "linux"}
+    lines = [Requirement(line.rstrip(" \\")) for line in _LOCK.splitlines() if "==" in line]
+    found = [line for line in lines if line.marker is None or line.marker.evaluate(system)]
+    assert len({line.name for line in found}) == len(found) > 50, "one version each"
+    return {line.name: Version(str(line.specifier).removeprefix("==")) for line in found}
+
+
+@pytest.mark.parametrize("python", _PYTHONS)
+def test_the_lock_meets_every_requirement(python: str) -> None:
+    extras = _PROJECT["project"]["optional-dependencies"]
+    versions = locked(python) | {"torch": Version(torch_version())}
+    for text in [*_PROJECT["project"]["dependencies"], *extras["dev"], *extras["docs"]]:
+        wanted = Requirement(text)
+        if wanted.marker is None or wanted.marker.evaluate({"python_version": python}):
+            assert wanted.name in versions, f"{wanted.name} is not in the lock; run 'make lock'"
+            assert versions[wanted.name] in wanted.specifier, f"the lock has another {wanted.name}; run 'make lock'"
+
+
+def test_every_python_gets_the_versions_of_the_others() -> None:
+    """What bits depend on differs between no two Pythons."""
+    shared = set.intersection(*({*locked(python).items()} for python in _PYTHONS))
+    assert {"daqp", "gymnasium", "mink", "mujoco", "numpy", "safetensors", "scipy"} <= {name for name, _ in shared}
+    assert "dm-control" in locked("3.12") and "dm-control" not in locked("3.13"), "labmaze has no wheel for it"
+
+
+def test_the_lock_has_a_hash_for_everything_and_names_no_host() -> None:
+    entries = re.split(r"^(?=[a-z0-9])", _LOCK, flags=re.MULTILINE)[1:]
+    assert len(entries) > 80 and all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries)
+    assert "//" not in _LOCK and "--index" not in _LOCK and "--find-links" not in _LOCK
+
+
+def torch_version() -> str:
+    """The version of torch in pyproject.toml, the only package that is not in the lock."""
+    (pin,) = (text for text in _PROJECT["project"]["dependencies"] if text.startswith("torch=="))
+    return pin.removeprefix("torch==")
+
+
+def test_torch_is_pinned_alike_everywhere_and_its_needs_are_locked() -> None:
+    (described,) = tomllib.loads((_TOP / ".ci/lock.toml").read_text())["dependency-metadata"]
+    assert "torch" not in locked("3.11")
+    assert described["version"] == torch_version()
+    assert f"readonly torch={torch_version()}\n" in (_TOP / ".ci/setup.sh").read_text()
+    for needed in map(Requirement, metadata.requires("torch") or []):
+        of_gpus = needed.name.startswith(("nvidia-", "cuda-")) or needed.name == "triton"
+        if not of_gpus and (needed.marker is None or needed.marker.evaluate({"extra": ""})):
+            assert str(needed) in described["requires-dist"]
+            assert locked("3.11")[needed.name] in needed.specifier
+
+
+def test_python_versions_agree() -> None:
+    wanted = Requirement(f"python{_PROJECT['project']['requires-python']}").specifier
+    assert [minor for minor in range(30) if f"3.{minor}.1" in wanted] == [int(python[2:]) for python in _PYTHONS]
+    assert f'readonly versions="{" ".join(_PYTHONS)}"' in (_TOP / ".ci/setup.sh").read_text()

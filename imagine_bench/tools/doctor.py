@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.machine import commit, gl_renderer, installed, machine, versions
@@ -20,6 +21,7 @@ from imagine_bench.machine import commit, gl_renderer, installed, machine, versi
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
 _FRAMES = 200
 _NEEDED_DISK_GIB = 1.0
+_LOCK = Path(imagine_bench.__file__).parents[1] / ".ci" / "requirements.lock"
 _REASONS = {
     "mujoco": " MuJoCo 4.0 breaks dm-control 1.0.50: 'MjModel' has no 'flex_vertedge'.",
     "torch": " Results repeat bit for bit only on one version.",
@@ -41,7 +43,8 @@ class Examination:
     notes: tuple[str, ...]
 
     def __str__(self) -> str:
-        lines = [f"{name:16}{value}" for name, value in self.facts]
+        width = max((len(name) for name, _ in self.facts), default=0) + 2
+        lines = [f"{name:{width}}{value}" for name, value in self.facts]
         lines += [f"Note: {note}" for note in self.notes]
         lines += [f"Wrong: {complaint}" for complaint in self.complaints] or ["Everything works."]
         return "\n".join(lines)
@@ -68,7 +71,7 @@ def examine() -> Examination:
         "64x64 frame": frame,
         "free disk": f"{free_gib:.1f} GiB",
     }
-    notes = _notes(here["gpu"], gl)
+    notes = _notes(here["gpu"], gl) + unlocked_versions()
     return Examination(facts=tuple(facts.items()), complaints=tuple(complaints), notes=tuple(notes))
 
 
@@ -91,6 +94,27 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
                 "Run 'make setup' in a fresh .venv."
             )
     return complaints
+
+
+def unlocked_versions(lock: Path = _LOCK, version_of: Callable[[str], str] = installed) -> list[str]:
+    """A sentence that names the packages whose versions are not the lock's, on whose bits results depend; or none.
+
+    Args:
+        lock: The lock of a checkout. Where there is none, versions are the user's own.
+        version_of: As of :func:`unmet_requirements`.
+    """
+    if not lock.exists():
+        return []
+    lines = [Requirement(line.rstrip(" \\")) for line in lock.read_text().splitlines() if "==" in line]
+    here = [line for line in lines if line.marker is None or line.marker.evaluate()]
+    pins = {line.name: str(line.specifier).removeprefix("==") for line in here}
+    others = [f"{name} {version_of(name)} (not {pin})" for name, pin in pins.items() if version_of(name) != pin]
+    if not others:
+        return []
+    return [
+        f"Versions differ from .ci/requirements.lock, and so may the last bits of results: {', '.join(others)}. "
+        "'rm .venv/.ready && make setup' brings them back."
+    ]
 
 
 def _drawing() -> tuple[str, str, str | None]:
@@ -119,8 +143,8 @@ def _notes(gpu: str | None, gl: str) -> list[str]:
     cuda = any((found.name or "").startswith("nvidia-") for found in metadata.distributions())
     if gpu is None and cuda:
         notes.append(
-            "torch is a CUDA build of several GB and there is no NVIDIA GPU: in a new .venv, "
-            "'TORCH_INDEX=https://download.pytorch.org/whl/cpu make setup' takes the CPU build."
+            "torch is a CUDA build of several GB and there is no NVIDIA GPU: 'rm -r .venv && make setup' takes the "
+            "CPU build where it can be reached; TORCH_INDEX names another index of it."
         )
     if gpu is not None and any(name in gl.lower() for name in _SOFTWARE_GL):
         notes.append(f"Frames are drawn in software ({gl}) although there is a GPU; its driver's EGL is not installed.")

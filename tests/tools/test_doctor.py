@@ -17,7 +17,7 @@ from imagine_bench.tools import doctor
 def test_this_installation_works(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
-    for word in ("mujoco", "dm-control", "torch", "GL renderer", "64x64 frame", "processor", "Everything works."):
+    for word in ("mujoco", "torch", "GL renderer", "64x64 frame", "processor", "Everything works."):
         assert word in out
 
 
@@ -78,6 +78,20 @@ def test_a_missing_package_is_named(package: str) -> None:
 
 def test_versions_of_this_machine_satisfy_every_requirement() -> None:
     assert doctor.unmet_requirements() == []
+
+
+def test_versions_that_are_not_the_locks_are_named(tmp_path: Path) -> None:
+    assert doctor.unlocked_versions() == []
+    (note,) = doctor.unlocked_versions(version_of=with_version(numpy="2.2.0", daqp="missing"))
+    assert "results: daqp missing (not 0." in note and ", numpy 2.2.0 (not 2." in note and "make setup" in note
+    assert doctor.unlocked_versions(tmp_path / "no.lock", with_version(numpy="2.2.0")) == []
+
+
+def test_columns_are_wide_enough() -> None:
+    """A package has a longer name than a column once was wide."""
+    facts = (("stable-baselines3", "2.9.2"), ("python", "3.12.1"))
+    found = doctor.Examination(facts=facts, complaints=(), notes=())
+    assert str(found).splitlines()[:2] == ["stable-baselines3  2.9.2", "python             3.12.1"]
 
 
 def test_missing_gl_is_a_complaint_and_exit_code_1(

@@ -1,0 +1,17 @@
+#!/usr/bin/env bash
+# Builds sdist and wheel into dist/ and uses the wheel as a stranger would: .ci/build.sh VENV.
+# The stranger has an environment of their own, an empty folder, and no checkout.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+readonly top=$PWD venv=$1
+empty=$(mktemp -d)
+trap 'rm -rf "$empty"' EXIT
+
+rm -rf dist
+"$venv/bin/uv" build -q --python "$venv/bin/python" --no-build-isolation --out-dir dist
+PYTHON="$top/$venv/bin/python" .ci/setup.sh "$empty/venv" "$(ls "$top"/dist/*.whl)"
+mkdir "$empty/folder" && cd "$empty/folder"
+"$empty/venv/bin/imagine-bench" list >/dev/null
+"$empty/venv/bin/imagine-bench" doctor
+"$empty/venv/bin/imagine-bench" bench --task arrow_puzzle --preset smoke --agents random dqn oracle
+ls "$top"/dist/*
