@@ -68,9 +68,9 @@ def tables(text: str) -> Iterator[Table]:
 
 def unmarked(text: str) -> list[str]:
     """Heads of the tables that no comment describes and that hold a measured number: a decimal, or a share."""
-    found = re.findall(r"(?<!-->\n)^(\|.*\n(?:\|.*\n)+)", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
-    plain = [re.sub(r"`[^`]*`|\]\([^)]*\)", "", table) for table in found]
-    return [table.split("\n")[0] for table in plain if re.search(r"\d\.\d|\d ?%", table)]
+    blocks = re.findall(r"(?:^[^|\n][^\n]*\n)?(?:^\|[^\n]*\n)+", text, re.MULTILINE)
+    plain = [re.sub(r"`[^`]*`|\]\([^)]*\)", "", block) for block in blocks if not block.startswith("<!--")]
+    return [block.split("\n")[0] for block in plain if re.search(r"\d\.\d|\d ?%", block)]
 
 
 def _cells(line: str) -> list[str]:
@@ -129,6 +129,13 @@ def iqm(budget: str, where: str) -> str:
     return interval(statistics.iqm(values), *statistics.bootstrap_interval(values, _rng()))
 
 
+def ahead(budget: str, treated: str, base: str) -> str:
+    """The same; bold where the interval of the difference to the base lies above zero."""
+    text = iqm(budget, treated)
+    better = statistics.difference(scores(budget, treated), scores(budget, base), _rng()).low > 0
+    return f"**{text}**" if better else text
+
+
 def interval(value: float, low: float, high: float) -> str:
     return f"{percent(value)} [{percent(low)}, {percent(high)}]"
 
@@ -179,7 +186,7 @@ def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
 
 
 def reached(where: str, level: str) -> np.ndarray:
-    """The first test of every seed from which on all are at least at a level; NaN where there is none. Shape (seeds,)."""
+    """First test of every seed from which on all reach a level; NaN where there is none. Shape (seeds,)."""
     budgets = sorted(runs(where))
     table = np.stack([scores(str(each), where) for each in budgets], axis=1)
     found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
@@ -197,16 +204,6 @@ def mean_episodes_to(where: str, level: str) -> str:
     return "–" if np.isnan(mean) else f"{mean:.0f}"
 
 
-def cpu(budget: str, where: str) -> str:
-    """CPU seconds of training of a run, mean."""
-    return f"{scores(budget, where, 'train_cpu_s').mean():.0f}"
-
-
-def one_step(budget: str, where: str) -> str:
-    """Share of imagined first steps that were right, %, mean."""
-    return f"{100 * scores(budget, where, 'open_loop/correct_1').mean():.0f}"
-
-
 def first_of(name: str, *arguments: str) -> str:
     """A cell of all arguments but the last: of a row that names two things, the first."""
     return CELLS[name](*arguments[:-1])
@@ -215,14 +212,6 @@ def first_of(name: str, *arguments: str) -> str:
 def last_of(name: str, *arguments: str) -> str:
     """A cell of all arguments but the last but one: of a row that names two things, the second."""
     return CELLS[name](*arguments[:-2], arguments[-1])
-
-
-def chance(task: str) -> str:
-    return percent(_facts(task).chance_level)
-
-
-def optimum(task: str) -> str:
-    return percent(_facts(task).optimum)
 
 
 @functools.cache
@@ -271,10 +260,6 @@ def study_difference(budget: str, folder: str, *variants: str) -> str:
     return "; ".join(texts)
 
 
-def study_cpu(budget: str, folder: str, *variants: str) -> str:
-    return "; ".join(f"{float(_study(folder)[variant, int(budget)][0]['cpu_s']):.0f}" for variant in variants)
-
-
 def _success(folder: str, variant: str, budget: str) -> list[float]:
     return [float(row["success"]) for row in _study(folder)[variant, int(budget)]]
 
@@ -301,21 +286,6 @@ def answers(folder: str, agent: str, path: str) -> str:
 def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
     """One of two answers of which a row speaks."""
     return answers(folder, agent, paths[int(which)])
-
-
-def answer_mean(folder: str, agent: str, path: str) -> str:
-    return percent(_answers(folder, agent, path).mean())
-
-
-def answer_number(folder: str, agent: str, path: str) -> str:
-    """The same of a number that is no share: mean [95 %]."""
-    values = _answers(folder, agent, path)
-    low, high = statistics.bootstrap_interval(values, _rng(), statistic="mean")
-    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]"
-
-
-def answer_count(folder: str, agent: str, path: str) -> str:
-    return f"{_answers(folder, agent, path).mean():.0f}"
 
 
 def policy(agent: str, episodes: str, length: str) -> str:
@@ -380,23 +350,11 @@ def thesis_error(criterion: str, samples: str) -> str:
     return f"*{mean:.2f} ({std:.2f})*"
 
 
-def thesis_ratio(criterion: str, samples: str) -> str:
-    criteria = reference.load("robot_ik")["cumulative_error"]["criteria"]
-    return f"*{criteria[criterion][samples][0] / criteria['random'][samples][0]:.2f}*"
-
-
 def claim(folder: str, network: str, text: str, column: str) -> str:
     """A cell of claims.csv."""
     with (RESULTS / folder / "claims.csv").open() as file:
         (row,) = [row for row in csv.DictReader(file) if (row["network"], row["claim"]) == (network, text)]
     return row[column]
-
-
-def coverage(folder: str, variant: str, level: str) -> str:
-    """Share of truths in the central interval of a level, %: mean over networks."""
-    with (RESULTS / folder / "results.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["variant"] == variant]
-    return f"{100 * np.mean([float(row[f'coverage_{level}']) for row in rows]):.0f}"
 
 
 def speed(machine: str, what: str) -> str:
@@ -425,10 +383,10 @@ def shortest(task: str) -> str:
 CELLS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        iqm, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to, mean_episodes_to, cpu,
-        one_step, chance, optimum, thesis, thesis_mean, thesis_gain, study, study_difference, study_cpu, answers,
-        first_of, last_of, two_answers, thesis_plans, answer_mean, answer_number, answer_count, policy, policy_failure, plans, futures, choice, thesis_error,
-        thesis_ratio, claim, coverage, speed, goals_and_starts, chance_exact, shortest,
+        iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
+        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
+        last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
+        claim, speed, goals_and_starts, chance_exact, shortest,
     )
 }  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 from imagine_bench import reference, statistics
 
 mpl.use("agg")
-from matplotlib import pyplot as plt  # noqa: E402 - after its backend
+from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
