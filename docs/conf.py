@@ -13,11 +13,16 @@ myst_heading_anchors = 4
 exclude_patterns = ["results/**/report"]
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "description"
+autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
-nitpicky = False
+napoleon_use_ivar = True
 
+highlight_language = "none"
 html_theme = "furo"
 html_title = "imagine_bench"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
