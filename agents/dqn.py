@@ -1,16 +1,195 @@
-"""The baseline: a DQN on latents that learns from real transitions alone."""
+"""A DQN on latents (Mnih et al. 2015; thesis 5.2.2); the thesis has no target network, settings may ask for one."""
 
 from __future__ import annotations
 
-from imagine_bench.interfaces import AgentContext
+import copy
+import math
 
-from .encoders.perception import load_perception, prepare_torch
-from .learner import Learner
-from .presets import settings_of
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from . import snapshot
+from .dqn_settings import HYPERPARAMETERS, ControllerSettings, DQNSettings
+from .encoders.perception import Perception, load_perception, prepare_torch
+from .meters import Meters
+from .networks.mlp import mlp
+from .replay import Batch, RealMemory, Transitions
+from .settings import flatten
 
 
-def make(context: AgentContext) -> Learner:
+def epsilon(step: int, settings: ControllerSettings) -> float:
+    """Exploration probability at real step ``step``: equation 3.3, from the maximum down to the minimum."""
+    span = settings.epsilon_max - settings.epsilon_min
+    return settings.epsilon_min + span * math.exp(-settings.epsilon_decay * step)
+
+
+def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: float) -> Tensor:
+    """One-step targets ``r + gamma max_a Q(z', a)`` of rewards (B,), ends (B,) and next values (B, A). Shape (B,).
+
+    Termination stops bootstrapping; truncation does not, since ``terminated`` is 0 there.
+    """
+    return reward + discount * (1.0 - terminated) * q_next.amax(dim=-1)
+
+
+class Controller(nn.Module):
+    """Action values of latents: a network, a slowly updated target network, and Adam.
+
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes and rates.
+        generator: Draws the initial weights; its device is the controller's.
+    """
+
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: ControllerSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.n_actions, self.settings = n_actions, settings
+        self.network = self.target = mlp((latent_size, *settings.hidden, n_actions), generator)
+        if settings.target_rate < 1.0:
+            self.target = copy.deepcopy(self.network).requires_grad_(False)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate, fused=True)
+
+    @torch.no_grad()
+    def values(self, z: Tensor) -> Tensor:
+        """Action values of latents (N, Z). Shape (N, A)."""
+        q: Tensor = self.network(z)
+        return q
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Mean squared Bellman error; no gradient flows through the targets."""
+        with torch.no_grad():
+            q_next = self.target(batch.next_z)
+            target = td_target(batch.reward, batch.terminated, q_next, self.settings.discount)
+        q = self.network(batch.z).gather(1, batch.action.unsqueeze(1)).squeeze(1)  # [B]
+        return functional.mse_loss(q, target)
+
+    def update(self, batch: Batch) -> float:
+        """One step of Adam on a batch; returns the loss before it.
+
+        Raises:
+            DivergedError: The loss is NaN or infinite; the weights are left as they were.
+        """
+        loss = self.loss(batch)
+        value = loss.item()
+        if not math.isfinite(value):
+            raise DivergedError(f"The controller's loss is {value}. Lower controller.learning_rate.")
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        if self.target is not self.network:
+            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
+                slow.lerp_(fast.detach(), self.settings.target_rate)
+        return value
+
+
+class DQN:
+    """Acts epsilon-greedily on mean latents, learns from replay; each consumer of randomness has its own generator.
+
+    Args:
+        perception: Frames to posteriors of latents.
+        n_actions: A.
+        settings: All hyperparameters.
+        seeds: This agent's node of the seed tree.
+        device: Where networks and memories lie.
+    """
+
+    def __init__(
+        self, perception: Perception, n_actions: int, settings: DQNSettings, seeds: SeedTree, device: torch.device
+    ) -> None:
+        self.perception, self.n_actions, self.settings = perception, n_actions, settings
+        self.rng = seeds.child("exploration").generator()
+        self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
+        weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
+        self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
+        self.real = RealMemory(settings.memory.real, perception.latent_size, device)
+        self.meters = Meters()
+        self.steps = 0
+
+    @property
+    def tested(self) -> Controller:
+        """The controller that acts greedily: here the one that explores too."""
+        return self.controller
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        """Values of every macro-action at the mean latents. Shape (A,)."""
+        return self._values(self.tested, observation)
+
+    def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
+        mu, _ = self.perception.posterior(observation.frame)
+        return controller.values(mu.unsqueeze(0))[0].cpu().numpy()
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act epsilon-greedily on the mean latents; greedily, and changing nothing, without ``explore``."""
+        if explore and self.rng.random() < epsilon(self.steps, self.settings.controller):
+            return int(self.rng.integers(self.n_actions))
+        return int(self._values(self.controller if explore else self.tested, observation).argmax())
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Store the transition, learn from replayed ones N_R times, and from what else a subclass has.
+
+        Raises:
+            DivergedError: A loss is no longer finite.
+        """
+        now = self.perception.posterior(transition.observation.frame)
+        then = self.perception.posterior(transition.next_observation.frame)
+        self.real.add(now, transition.action, transition.reward, then, transition.terminated)
+        self.learn_values(self.real, self.settings.controller.updates_per_step)
+        self.learn_more(now[0], episode)
+        self.meters.count("time/controller_s")
+        self.steps += 1
+
+    def learn_more(self, z: Tensor, episode: int) -> None:
+        """What a subclass does after the updates on real transitions, with the mean latents (Z,) it acted in."""
+
+    def learn_values(self, memory: Transitions, updates: int) -> None:
+        """Update the controller on batches of a memory, if that holds anything yet."""
+        with self.meters.cpu_time("time/controller_s"):
+            for _ in range(updates if len(memory) else 0):
+                batch = memory.sample(self.settings.controller.batch_size, self._replay)
+                self.meters.add("loss/bellman", self.controller.update(batch))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
+        now = {"epsilon": epsilon(self.steps, self.settings.controller), "real_transitions": float(self.real.added)}
+        return {**self.meters.read(), **now}
+
+    def state(self) -> AgentState:
+        """A snapshot: weights, moments, memories, generators, counters, measurements."""
+        arrays = snapshot.prefixed("controller", snapshot.training_arrays(self.controller, self.controller.optimiser))
+        arrays |= snapshot.prefixed("real", self.real.arrays())
+        arrays["generator/replay"] = snapshot.generator_array(self._replay)
+        values = {
+            "steps": self.steps, "real_added": self.real.added, "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
+        }  # fmt: skip
+        return AgentState(arrays=arrays, values=values)
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot.
+
+        Raises:
+            ArtefactError: It does not fit this agent; nothing was changed.
+        """
+        snapshot.require_fit(state, self.state())
+        arrays, values = state.arrays, state.values
+        snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
+        snapshot.load_generator(self._replay, arrays["generator/replay"])
+        self.real.load(snapshot.below("real", arrays), values["real_added"])
+        self.meters.restore(values["meters"])
+        self.rng.bit_generator.state, self.steps = values["exploration"], values["steps"]
+
+
+def make(context: AgentContext) -> DQN:
     """The ``dqn`` agent."""
-    settings = settings_of(context)
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     device = prepare_torch(context.device)
-    return Learner(load_perception(context), context.n_actions, settings, context.seeds, device)
+    return DQN(load_perception(context), context.n_actions, settings, context.seeds, device)

@@ -193,3 +193,7 @@ class ImaginedMemory(_Ring):
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """Draw transitions with replacement."""
         return Batch(**self._draw(count, generator))
+
+
+Transitions = RealMemory | ImaginedMemory
+"""Memories that give batches to learn values from."""

@@ -1,167 +1,185 @@
-"""Every hyperparameter of the learners, with its unit and its source. The defaults are the thesis' values of chapter 5.
+"""Settings as data: dataclass fields that carry their ranges, named sets of values, and overrides by dotted name.
 
-Another chapter's values are a family of settings (:mod:`.chapter_3`). A preset is a list of deviations from a family's
-values, each beside its reason; ``thesis`` deviates in nothing, and chapter
-5's ``full`` neither; chapter 3's is its ``quick``.
+An agent declares a frozen dataclass whose fields are :func:`setting` s, or sections of such fields, and one
+:class:`Hyperparameters` beside it. Nothing heavy is imported here, so that settings can be checked before torch loads.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from types import UnionType
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
-START_STATES = ("current", "replayed")
+from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 
+CONFIG_GROUPS = ("chapter_3", "chapter_5")
+"""What a task may name: the chapter of the thesis whose settings it is measured with."""
+SETS = ("minimal", "fast", "published")
+"""Named sets of values: ``published`` is the thesis', ``fast`` what fits minutes, ``minimal`` what only shows that all
+parts work."""
 
-@dataclass(frozen=True, kw_only=True)
-class WorldModelSettings:
-    """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.2).
-
-    Attributes:
-        dynamics_hidden: Units a hidden layer of the dynamics network.
-        components: Gaussians in its mixture, K.
-        members: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble
-            (Lakshminarayanan et al. 2017); the thesis has one.
-        reward_hidden: Units a hidden layer of the reward network.
-        termination_hidden: Units a hidden layer of the termination network.
-        shared_hidden: Units a hidden layer of one network with both outputs, instead of the two (thesis 3.2.2).
-        assessment_input: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
-        reward_scale: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear
-            above, where a rare large reward is hardly heard; the thesis counts in plain units, 1.
-        dropout: Probability of dropping a hidden unit, the same in every network; [0, 1).
-        learning_rate: Of Adam (thesis 3.2.2: 1e-3).
-        max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
-        updates_per_step: Model updates a real step, N_E.
-        batch_size: Transitions an update.
-        spread: Latents of a batch are drawn from N(mu, (spread sigma)^2), anew for each batch; the thesis draws with 1.
-            An encoder whose posteriors are narrower than the looks of one macrostate vary leaves networks to learn the
-            few pictures they saw by heart; a larger spread keeps them from it.
-        balance: How much batches make up for rare outcomes: a transition is drawn in proportion to n ** -balance, with
-            n the number of replayed ones of the same reward and end. The thesis draws all alike, 0. A good policy
-            fails rarely, and a model that has forgotten what fails imagines that nothing does.
-        predict_change: Whether the mixture describes z' - z instead of z'.
-        sigma_floor: Smallest standard deviation of a component, in units of z.
-        gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
-        precision: In which hidden layers train: float32, bfloat16, or auto, which is bfloat16 where the device has
-            instructions for it; the gradients of output layers' weights come in it too. Weights, moments, the values
-            of output layers, losses and predictions are always float32.
-    """
-
-    dynamics_hidden: tuple[int, ...] = (256, 256, 256)
-    components: int = 5
-    members: int = 1
-    reward_hidden: tuple[int, ...] = (512, 512, 512)
-    termination_hidden: tuple[int, ...] = (256, 256)
-    shared_hidden: tuple[int, ...] = ()
-    assessment_input: str = "next_state"
-    reward_scale: float = 1.0
-    dropout: float = 0.5
-    learning_rate: float = 1e-3
-    max_norm: float | None = 3.0
-    updates_per_step: int = 16
-    batch_size: int = 512
-    spread: float = 1.0
-    balance: float = 0.0
-    predict_change: bool = False
-    sigma_floor: float = 0.01
-    gradient_clip: float | None = None
-    precision: str = "auto"
+S = TypeVar("S")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ControllerSettings:
-    """The DQN on latents (thesis 5.2.2).
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A set of values, in words too. NaN satisfies no comparison, so it is never allowed."""
 
-    Attributes:
-        hidden: Units a hidden layer.
-        learning_rate: Of Adam.
-        batch_size: Transitions an update, real or imagined.
-        updates_per_step: Updates on real transitions a real step, N_R.
-        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/deviations.md.
-        target_rate: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no
-            target network (thesis).
-        gradient_clip: Largest gradient norm; None clips nothing.
-        epsilon_min: Exploration probability in the limit.
-        epsilon_max: Exploration probability at step 0.
-        epsilon_decay: Decay rate lambda, a real step.
-    """
-
-    hidden: tuple[int, ...] = (512, 256, 128)
-    learning_rate: float = 1e-3
-    batch_size: int = 64
-    updates_per_step: int = 1
-    discount: float = 0.95
-    target_rate: float = 1.0
-    gradient_clip: float | None = None
-    epsilon_min: float = 0.001
-    epsilon_max: float = 0.8
-    epsilon_decay: float = 0.03
+    holds: Callable[[Any], bool]
+    words: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImaginationSettings:
-    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1).
+def between(low: float, high: float, why: str = "") -> Range:
+    """Numbers from ``low`` to ``high``, both allowed; ``why`` says what is wrong with the others."""
+    return Range(lambda value: low <= value <= high, f"must lie in [{low:g}, {high:g}]" + (why and f": {why}"))
+
+
+PROBABILITY = between(0.0, 1.0)
+INSIDE = Range(lambda value: 0.0 < value < 1.0, "must lie between 0 and 1")
+RATE = Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
+POSITIVE = Range(lambda value: value > 0.0, "must be above 0")
+NOT_NEGATIVE = Range(lambda value: value >= 0.0, "must be at least 0")
+FINITE = Range(lambda value: 0.0 <= value < math.inf, "must be at least 0 and finite")
+COUNT = Range(lambda value: value >= 1, "must be at least 1")
+DROPOUT = Range(
+    lambda value: value == 0.0 or 1 / 256 <= value <= 255 / 256,
+    "must be 0 or lie in [1/256, 255/256]: dropout masks count in 256ths",
+)
+SIZES = Range(lambda sizes: all(size >= 1 for size in sizes), "must be numbers of units, each at least 1")
+LAYERS = Range(lambda sizes: len(sizes) > 0 and SIZES.holds(sizes), f"{SIZES.words}, of one layer or more")
+SWITCH = Range(lambda value: True, "may be true or false")
+
+PRECISIONS = ("auto", "float32", "bfloat16")
+"""Number formats of hidden layers: ``auto`` is bfloat16 where the device has instructions for it, else float32."""
+
+
+def setting(default: Any, allowed: Range | tuple[str, ...]) -> Any:
+    """A dataclass field with a default and the values that it may have: a range, or words."""
+    return field(default=default, metadata={"allowed": allowed})
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A value that is not the published one, and why."""
+
+    value: Any
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigGroup(Generic[S]):
+    """The settings of one chapter of the thesis, or of one kind of agent.
 
     Attributes:
-        start_episode: First training episode that imagines, I_start.
-        end_episode: First training episode that imagines no more; its updates are made on real transitions instead, of
-            which there are enough by then. None: imagination never ends (thesis).
-        start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``,
-            states drawn from the real memory.
-        rehearsal_episodes: Imagined episodes of a controller that is trained in imagination alone (thesis 3.2.2).
-        breadth: Rollouts a real step, I_B.
-        depth: Longest rollout in macro-actions, I_D.
-        updates_per_step: Controller updates on imagined transitions a real step, N_I.
-        temperature: Scale of the component's standard deviation when z' is drawn: 1 the thesis, 0 its mean.
-        exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
-        weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
-        reduction: How the epistemic variances of the latent dimensions become one: sum, mean or max. The thesis has a
-            vector (equation 4.25) and one threshold; see docs/deviations.md for why that is read as max.
-        threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
-        threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
-            epistemic variance of transitions that really happened, a batch of them a real step.
-        reward_threshold: If given, the filter reads the reward network too: the largest standard deviation of a reward
-            over T of its dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
-        termination_threshold: If given, the filter reads the termination network too: the largest probability that
-            passes of what the model thinks less likely, that the episode ends there or that it goes on; in [0, 0.5].
+        published: The values of the publication.
+        sets: By name of a set, what it changes of them, by dotted name.
+        unused: Settings that this group does without: an override of one is checked and left out.
     """
 
-    start_episode: int = 1000
-    end_episode: int | None = None
-    start_states: str = "current"
-    rehearsal_episodes: int = 1000
-    breadth: int = 3
-    depth: int = 10
-    updates_per_step: int = 1
-    temperature: float = 1.0
-    exploration: float = 0.0
-    weight_samples: int = 50
-    reduction: str = "max"
-    threshold: float = 0.3
-    threshold_quantile: float | None = None
-    reward_threshold: float | None = None
-    termination_threshold: float | None = None
+    published: S
+    sets: Mapping[str, Mapping[str, Override]]
+    unused: frozenset[str] = frozenset()
 
 
-@dataclass(frozen=True, kw_only=True)
-class MemorySettings:
-    """How many transitions each memory keeps; the oldest go first (thesis 5.2.2).
+@dataclass(frozen=True, slots=True)
+class Hyperparameters(Generic[S]):
+    """All settings that an agent can have, which the registry names and the bench reads.
 
     Attributes:
-        real: Transitions of the real memory.
-        imagined: Transitions of the imagined memory.
-        starts: Starts of real episodes, for those who imagine whole episodes.
+        groups: Config groups by name.
     """
 
-    real: int = 50_000
-    imagined: int = 3_000
-    starts: int = 1_000
+    groups: Mapping[str, ConfigGroup[S]]
+
+    @classmethod
+    def everywhere(cls, settings: S) -> Hyperparameters[S]:
+        """The same settings in every group and set."""
+        return cls({group: ConfigGroup(settings, {name: {} for name in SETS}) for group in CONFIG_GROUPS})
+
+    def names(self) -> frozenset[str]:
+        """The dotted names of all settings."""
+        return frozenset(flatten(next(iter(self.groups.values())).published))
+
+    def resolve(self, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> S:
+        """The settings of a set, with single ones replaced.
+
+        Args:
+            hyperparameters: Name of a set of the group.
+            overrides: Values by dotted name, such as ``{"controller.discount": 0.9}``.
+            group: A name of :attr:`groups`.
+
+        Raises:
+            UnknownNameError: No such group, set, setting or word; the message lists what exists.
+            InvalidValueError: A value of the wrong type or out of its range.
+        """
+        chosen = self.groups[require_known("config group", group, self.groups)]
+        changes = chosen.sets[require_known("set of hyperparameters", hyperparameters, chosen.sets)]
+        given = checked(chosen.published, overrides)
+        used = {name: value for name, value in given.items() if name not in chosen.unused}
+        return replaced(chosen.published, {**{name: change.value for name, change in changes.items()}, **used})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """All settings of a learner."""
+def flatten(settings: Any) -> dict[str, Any]:
+    """Every setting by dotted name."""
+    return {name: value for name, value, _, _ in _walk(settings)}
 
-    model: WorldModelSettings = field(default_factory=WorldModelSettings)
-    controller: ControllerSettings = field(default_factory=ControllerSettings)
-    imagination: ImaginationSettings = field(default_factory=ImaginationSettings)
-    memory: MemorySettings = field(default_factory=MemorySettings)
+
+def replaced(settings: S, values: Mapping[str, Any]) -> S:
+    """The settings with values replaced by dotted name; a section's own rules are checked once it is whole."""
+    own: dict[str, Any] = {}
+    sections: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        section, _, inner = name.rpartition(".")
+        (sections.setdefault(section, {}) if section else own)[inner] = value
+    own |= {section: replaced(getattr(settings, section), inner) for section, inner in sections.items()}
+    return replace(settings, **own)  # type: ignore[type-var]
+
+
+def checked(settings: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by dotted name, each of its setting's type and within its range; raises as ``resolve``."""
+    declared = {name: (hint, allowed) for name, _, hint, allowed in _walk(settings)}
+    found = {}
+    for name, value in values.items():
+        if name not in declared:
+            raise UnknownNameError("setting", name, declared)
+        hint, allowed = declared[name]
+        found[name] = _typed(name, hint, value)
+        _require_allowed(name, allowed, found[name])
+    return found
+
+
+def _require_allowed(name: str, allowed: Range | tuple[str, ...], value: Any) -> None:
+    if isinstance(allowed, tuple):
+        require_known(f"value of setting {name}:", value, allowed)
+    elif value is not None and not allowed.holds(value):
+        raise InvalidValueError(f"Setting {name} is {value}; it {allowed.words}.")
+
+
+def _walk(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
+    """Name, value, type and range of every setting."""
+    hints = get_type_hints(type(settings))
+    for part in fields(settings):
+        value, name = getattr(settings, part.name), f"{prefix}{part.name}"
+        if is_dataclass(value):
+            yield from _walk(value, f"{name}.")
+        else:
+            yield name, value, hints[part.name], part.metadata["allowed"]
+
+
+def _typed(name: str, hint: Any, value: Any) -> Any:
+    """``value`` as the type ``hint``, where nothing is lost by it."""
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for option in options:
+        if option is type(None) and value is None:
+            return None
+        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        if get_origin(option) is tuple and isinstance(value, list | tuple):
+            if all(type(item) is int for item in value):
+                return tuple(value)
+        elif isinstance(option, type) and type(value) is option:
+            return value
+    wanted = " or ".join(getattr(option, "__name__", str(option)) for option in options)
+    raise InvalidValueError(f"Setting {name!r} was given {value!r}; it takes {wanted}.")

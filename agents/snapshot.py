@@ -1,4 +1,4 @@
-"""Parts of a learner as named numpy arrays, and the check that a snapshot fits before anything is overwritten."""
+"""Parts of an agent as named numpy arrays, and the check that a snapshot fits before anything is overwritten."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 
 Arrays = dict[str, NDArray[Any]]
+_MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
@@ -25,6 +27,27 @@ def below(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """The arrays that lie under ``prefix/``, without it."""
     start = f"{prefix}/"
     return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+
+
+def training_arrays(module: nn.Module, optimiser: torch.optim.Adam) -> Arrays:
+    """Copies of a module's weights and, of those that learn, of Adam's moments and steps, 0 before the first step."""
+    tensors: dict[str, Tensor] = {}
+    for name, weight in module.named_parameters():
+        tensors[f"{name}/weight"] = weight.detach()
+        if weight.requires_grad:
+            blank = {**dict.fromkeys(_MOMENTS, torch.zeros_like(weight)), "step": torch.zeros(())}
+            tensors |= {f"{name}/{kind}": optimiser.state[weight].get(kind, blank[kind]) for kind in blank}
+    return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
+
+
+@torch.no_grad()
+def load_training(module: nn.Module, optimiser: torch.optim.Adam, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Take up the result of :func:`training_arrays`."""
+    for name, weight in module.named_parameters():
+        weight.copy_(torch.tensor(arrays[f"{name}/weight"]))
+        if weight.requires_grad:
+            kinds = (*_MOMENTS, "step")
+            optimiser.state[weight] = {k: torch.tensor(arrays[f"{name}/{k}"], device=weight.device) for k in kinds}
 
 
 def generator_array(generator: torch.Generator) -> NDArray[np.uint8]:
@@ -43,7 +66,7 @@ def jsonable(values: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-_ROWS_VARY = ("real/", "imagination/memory/", "rehearsal/memory/", "starts/", "memory/")
+_ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/")
 
 
 def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = ("filtered", "settings")) -> None:
@@ -52,13 +75,13 @@ def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = 
     Args:
         given: The snapshot.
         own: The agent's present state.
-        equal: Values that must be the same in both.
+        equal: Values that must be the same in both, where there are such.
 
     Raises:
         ArtefactError: It does not fit; the message names the first difference.
     """
     _require_same_names(given.values, own.values)
-    for part in equal:
+    for part in sorted({*equal} & {*own.values}):
         _require_equal(part, given.values[part], own.values[part])
     _require_same_names(given.arrays, own.arrays)
     for name, ours in own.arrays.items():

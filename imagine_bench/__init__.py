@@ -13,4 +13,9 @@ __version__ = "0.1.0"
 
 for _entry in TASKS.values():
     if _entry.env_id not in gymnasium.registry:
-        gymnasium.register(id=_entry.env_id, entry_point=_entry.env, max_episode_steps=_entry.horizon)
+        gymnasium.register(
+            id=_entry.env_id,
+            entry_point=_entry.env,
+            max_episode_steps=_entry.horizon,
+            kwargs=dict(_entry.options),
+        )

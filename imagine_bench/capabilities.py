@@ -1,7 +1,7 @@
-"""What agents may offer beyond :class:`~.interfaces.Agent`: imagination, answers to a probe, training of their own.
+"""What agents may offer beyond :class:`~.interfaces.Agent`: imagination, predictions, training of their own.
 
-The bench asks an agent which of these it has, and offers what the protocol wants only to those that do. Shapes: ``D``
-imagined depth, ``A`` actions, ``M`` coordinates of a macrostate.
+The bench looks which of these an agent has, and uses what the protocol wants of those that do. Shapes: ``D`` imagined
+depth, ``A`` actions, ``M`` coordinates of a macrostate. A probe that reads macrostates is for evaluation only.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ImaginedRollout:
 
     Attributes:
         actions: Macro-actions imagined. Shape (D,), int64.
-        frames: Decoded latents as pictures of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3).
+        frames: Decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3).
         start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
         rewards: Predicted rewards. Shape (D,).
         p_terminated: Predicted probability that the episode ended there. Shape (D,).
@@ -32,7 +32,7 @@ class ImaginedRollout:
         aleatoric: The same for aleatoric. Shape (D,).
         modal: The same for modal. Shape (D,).
         accepted: Whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
-        macrostates: The macrostate an evaluation-only probe reads from each imagined latent. Shape (D, M).
+        macrostates: The macrostate a probe reads from each imagined latent. Shape (D, M).
     """
 
     actions: NDArray[np.int64]
@@ -50,7 +50,7 @@ class ImaginedRollout:
 
 @runtime_checkable
 class ValueReader(Protocol):
-    """An agent that can say what it expects of each action."""
+    """An agent that has action values."""
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Values of every macro-action. Shape (A,)."""
@@ -58,16 +58,13 @@ class ValueReader(Protocol):
 
 @runtime_checkable
 class ModelOnlyTrainer(Protocol):
-    """An agent that practises by itself, without the world, before it is tested."""
+    """An agent that is trained in its model alone before it is tested."""
 
     def train_in_model(self) -> bool:
-        """Practise a little on what has been learned so far, or say that there is nothing left to practise.
+        """Train a little in the model as it is; False, which changes nothing, says that nothing is left to do.
 
-        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that an
-        interrupted rehearsal goes on bit for bit.
-
-        Returns:
-            Whether anything was done; False changes nothing.
+        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that
+        interrupted training goes on bit for bit.
         """
 
 
@@ -77,10 +74,7 @@ OnEpisode = Callable[[bool, int], bool]
 
 @runtime_checkable
 class ExternalTrainer(Protocol):
-    """An agent whose training loop is its own, as a library's is; the bench only watches and tests it.
-
-    It cannot be stopped and taken up again: an interrupted run of it starts anew.
-    """
+    """An agent whose training loop is its own, as a library's is; an interrupted run of it starts anew."""
 
     def train(self, env: Any, *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
         """Train in ``env``, from nothing.
@@ -99,15 +93,15 @@ class TransferLearner(Protocol):
     """An agent that can take what it knows of a world into another task in the same world."""
 
     def reset_for_new_task(self) -> None:
-        """Keep what was learned of how the world moves; what was rewarded and what ended episodes is a hint at most.
+        """Keep what was learned of the dynamics; what was rewarded and what ended episodes is a prior at most.
 
         The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
         """
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What a teacher says of an action that was only imagined: the reward it would bring, and whether it would end
+class Label:
+    """What an oracle says of an action that was only imagined: the reward it would bring, and whether it would end
     the episode.
     """
 
@@ -117,20 +111,20 @@ class Answer:
 
 @runtime_checkable
 class QueryingAgent(Protocol):
-    """An agent that can ask a teacher what actions which it only imagines would bring."""
+    """An agent that can query an oracle about actions that it only imagines."""
 
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
         """Before it acts: the macro-actions whose last one is asked about, from the frame seen, or None to ask nothing.
 
         It changes nothing but the agent's measurements.
 
         Returns:
             Macro-actions (D,) with D of at least 1. The scene is imagined to go on through ends of episodes, so the
-            answer concerns the last one alone.
+            label concerns the last one alone.
         """
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
-        """Take in the answer to :meth:`question`; None says that it is a matter of chance, so that there is none."""
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+        """Take in the label of :meth:`query`; None says that it is a matter of chance, so that there is none."""
 
 
 @runtime_checkable
@@ -153,7 +147,7 @@ class Imaginer(Protocol):
 
 @runtime_checkable
 class MapPredictor(Protocol):
-    """An agent whose model names what it holds likeliest, apart from what it draws when it imagines."""
+    """An agent whose model names what it holds likeliest, apart from what it samples when it imagines."""
 
     def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """The likeliest result of one macro-action from each of N real frames; changes nothing in the agent.
@@ -164,7 +158,7 @@ class MapPredictor(Protocol):
             rng: Draws dropout masks.
 
         Returns:
-            Macrostates, as an evaluation-only probe reads them. Shape (N, M).
+            Macrostates, as a probe reads them. Shape (N, M).
         """
 
 
@@ -173,11 +167,7 @@ class ReplayReader(Protocol):
     """An agent that can say which transitions it learns from."""
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Where it acted, as an evaluation-only probe reads it, and what it did, for each real transition it remembers.
-
-        Returns:
-            Macrostates (N, M) and actions (N,).
-        """
+        """Macrostates (N, M), as a probe reads them, and actions (N,) of the real transitions that it remembers."""
 
 
 def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: int) -> list[int] | None:
@@ -195,7 +185,7 @@ def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: in
 
 
 Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
-"""Macrostates (N, M) that a probe read from imagined latents to macro-actions (N,); a negative one ends there."""
+"""Macrostates (N, M), as a probe reads them from imagined latents, to actions (N,); a negative one ends there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +193,7 @@ class SampledFutures:
     """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held.
 
     Attributes:
-        macrostates: What the evaluation-only probe reads. Shape (D, R, S, M).
+        macrostates: What a probe reads. Shape (D, R, S, M).
         rewards: Predicted rewards, 0 once a future has ended. Shape (D, R, S).
         ended: Whether the model has said, here or before, that the episode is over. Shape (D, R, S).
     """
@@ -215,7 +205,7 @@ class SampledFutures:
 
 @runtime_checkable
 class FutureSampler(Protocol):
-    """An agent that can be asked for many futures of the same beginning; it changes nothing in the agent."""
+    """An agent that can sample many futures of the same start; it changes nothing in the agent."""
 
     def sample_futures(
         self,

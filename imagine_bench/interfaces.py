@@ -21,6 +21,9 @@ Frame = NDArray[np.uint8]
 """What the agent sees. Shape (64, 64, 3), upright, RGB."""
 Macrostate = NDArray[np.int64]
 """The discrete state of a task, one integer a coordinate. Shape (M,)."""
+State = tuple[int, ...]
+"""A macrostate that can be a key. Length M."""
+Floats = NDArray[np.float64]
 
 APPEARANCES = ("clean", "mild", "strong")
 EXECUTIONS = ("physics", "kinematic")
@@ -65,7 +68,7 @@ class Outcome:
     """
 
     probability: float
-    macrostate: tuple[int, ...]
+    macrostate: State
     reward: float
     terminated: bool
     success: bool
@@ -79,28 +82,28 @@ class Rules(Protocol):
         """Number of macro-actions A."""
 
     @property
-    def states(self) -> tuple[tuple[int, ...], ...]:
+    def states(self) -> tuple[State, ...]:
         """Every macrostate the machine knows, terminal ones included."""
 
     @property
-    def start_states(self) -> tuple[tuple[int, ...], ...]:
+    def start_states(self) -> tuple[State, ...]:
         """The macrostates an episode may start in, equally likely."""
 
-    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
         """Every possible result of ``action`` in ``macrostate``, also out of a terminal one: the scene goes on obeying
         its dynamics there, though no episode does.
         """
 
-    def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
+    def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
         """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
 
-    def is_legal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_legal(self, macrostate: State) -> bool:
         """Whether ``macrostate`` breaks no rule."""
 
-    def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_terminal(self, macrostate: State) -> bool:
         """Whether no episode goes on from ``macrostate``."""
 
-    def optimal_action(self, macrostate: tuple[int, ...]) -> int:
+    def optimal_action(self, macrostate: State) -> int:
         """An action of an optimal policy (the lowest index among equals)."""
 
 
@@ -135,7 +138,7 @@ class PerformanceTargets:
     Attributes:
         objects: Bodies of the loose objects; coordinate i of a macrostate is object i's.
         as_ruled: Least share of random macro-actions that end exactly as the rules say.
-        bystander_mm: An object that an action leaves where it stands moves by less.
+        other_objects_mm: An object that an action leaves where it stands moves by less.
         error_mm: The object acted on ends nearer to where a perfect execution leaves it, 99 times of 100; None asks
             for nothing.
         error_deg: The same for its yaw.
@@ -147,7 +150,7 @@ class PerformanceTargets:
 
     objects: tuple[str, ...]
     as_ruled: float
-    bystander_mm: float
+    other_objects_mm: float
     error_mm: float | None = None
     error_deg: float | None = None
     physics_per_cpu_s: float
@@ -224,9 +227,9 @@ class AgentContext:
         preprocessing: Name of the task's declared observation preprocessing.
         encoder: The encoder artefact (``.safetensors``), or None for agents that need none.
         seeds: The agent's node of the seed tree.
-        settings: Name of the settings family, as the task names it.
-        preset: Name of the family's preset (``"smoke"``, ``"quick"``, ``"thesis"``, ``"full"``).
-        overrides: Single settings that replace the preset's, by dotted name.
+        config_group: Name of the config group of settings, as the task names it.
+        hyperparameters: Name of the group's set of values (``"minimal"``, ``"fast"`` or ``"published"``).
+        overrides: Single settings that replace the set's, by dotted name.
         device: A torch device name, ``"cpu"`` or ``"cuda"``.
         optimal_action: The rules' optimal action, only for agents registered as privileged; None for every other.
     """
@@ -235,11 +238,11 @@ class AgentContext:
     preprocessing: str
     encoder: Path | None
     seeds: SeedTree
-    settings: str = "chapter_5"
-    preset: str = "quick"
+    config_group: str = "chapter_5"
+    hyperparameters: str = "fast"
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"
-    optimal_action: Callable[[tuple[int, ...]], int] | None = None
+    optimal_action: Callable[[State], int] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,7 +343,7 @@ class SceneReader(Protocol):
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """A picture of the whole scene with the arm. Shape (height, width, 3)."""
+        """An image of the whole scene with the arm. Shape (height, width, 3)."""
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""

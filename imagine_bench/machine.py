@@ -23,7 +23,7 @@ PACKAGES = (
     "daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
 )  # fmt: skip
 OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "stable-baselines3")
-"""Of the extra ``peers``, and what Python 3.13 has not; named where they are installed."""
+"""Of adapters and of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 """What decides results, in a checkout."""

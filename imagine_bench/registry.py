@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
 from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
-from imagine_bench.regression import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,16 +19,18 @@ class TaskEntry:
     """A registered task.
 
     Attributes:
-        spec: ``"module:attr"`` of its TaskSpec.
+        spec: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it.
         env_id: Gymnasium id, registered by ``import imagine_bench``.
         env: ``"module:attr"`` of the environment's constructor.
         horizon: Macro-actions before truncation.
+        options: Keyword arguments of both, which say which member of a family it is.
     """
 
     spec: str
     env_id: str
     env: str
     horizon: int
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,18 +42,19 @@ class AgentEntry:
         learns: Whether training changes it; others are only evaluated.
         needs_encoder: Whether it sees what an encoder gives.
         encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Module of its settings, with ``names()`` and ``resolve(preset, overrides, family)``.
+        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
+            ``resolve(hyperparameters, overrides, group)``.
         privileged: Whether it is shown the macrostate and the rules (references only).
-        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot rest before its end.
-        title: For headings, legends and tables; by default the registered name.
-        description: One sentence for a reader of the report.
+        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
+        title: For headings, legends and tables; by default the registered name in plain words.
+        description: One sentence for a reader who knows none of this.
     """
 
     make: str
     learns: bool = True
     needs_encoder: bool = True
     encoder_kind: str = "latents"
-    settings: str = "imagine_bench.agents.presets"
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
     privileged: bool = False
     external_training_loop: bool = False
     title: str = ""
@@ -59,30 +62,21 @@ class AgentEntry:
 
 
 TASKS: dict[str, TaskEntry] = {
-    "arrow_puzzle": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:SPEC",
-        env_id="imagine_bench/ArrowPuzzle-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_hard": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:HARD_SPEC",
-        env_id="imagine_bench/ArrowPuzzleHard-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_hard_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_toward": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:TOWARD_SPEC",
-        env_id="imagine_bench/ArrowPuzzleToward-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_toward_env",
-        horizon=10,
-    ),
-    "arrow_puzzle_clockwise": TaskEntry(
-        spec="imagine_bench.tasks.arrow_puzzle.spec:CLOCKWISE_SPEC",
-        env_id="imagine_bench/ArrowPuzzleClockwise-v0",
-        env="imagine_bench.tasks.arrow_puzzle.spec:make_clockwise_env",
-        horizon=10,
-    ),
+    **{
+        name: TaskEntry(
+            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of",
+            env_id=f"imagine_bench/{gymnasium_name}-v0",
+            env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
+            horizon=10,
+            options={"goal": goal},
+        )
+        for name, gymnasium_name, goal in (
+            ("arrow_puzzle", "ArrowPuzzle", "toward_human"),
+            ("arrow_puzzle_hard", "ArrowPuzzleHard", "toward_human_alone"),
+            ("arrow_puzzle_toward", "ArrowPuzzleToward", "toward_agent"),
+            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", "left"),
+        )
+    },
     "pick_place": TaskEntry(
         spec="imagine_bench.tasks.pick_place.spec:SPEC",
         env_id="imagine_bench/PickPlace-v0",
@@ -92,37 +86,82 @@ TASKS: dict[str, TaskEntry] = {
 }
 
 AGENTS: dict[str, AgentEntry] = {
-    "random": AgentEntry(make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False),
-    "oracle": AgentEntry(
-        make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True
+    "random": AgentEntry(
+        make="imagine_bench.agents.baselines:make_random",
+        learns=False,
+        needs_encoder=False,
+        title="random",
+        description="Picks every macro-action by chance: the floor.",
     ),
-    "dqn": AgentEntry(make="imagine_bench.agents.dqn:make"),
-    "imagination": AgentEntry(make="imagine_bench.agents.imagination.agent:make"),
-    "imagination_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.agent:make_uncertainty"),
+    "oracle": AgentEntry(
+        make="imagine_bench.agents.baselines:make_oracle",
+        learns=False,
+        needs_encoder=False,
+        privileged=True,
+        title="oracle",
+        description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
+    ),
+    "dqn": AgentEntry(
+        make="imagine_bench.agents.dqn:make",
+        settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
+        title="DQN",
+        description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
+    ),
+    "imagination": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make",
+        title="imagination",
+        description="DQN that also learns a model of its world and trains on transitions it imagines with it, all of "
+        "them.",
+    ),
+    "imagination_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.agent:make_uncertainty",
+        title="imagination + uncertainty",
+        description="The same, but an imagined transition is thrown away, with the rest of its rollout, where the "
+        "model is unsure.",
+    ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings",
+        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
+        title="factored",
+        description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
+        "every future within reach, explores what is uncertain while it trains, and plans in its model when it is "
+        "tested.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
+        title="SB3 DQN (pixels)",
+        description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn",
         needs_encoder=False,
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
+        title="SB3 QR-DQN (pixels)",
+        description="The same library's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
-        settings="imagine_bench.agents.library.settings",
+        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
+        title="SB3 DQN (latents)",
+        description="The same library's DQN on the latents that the suite's own DQN sees.",
     ),
-    "imagination_only": AgentEntry(make="imagine_bench.agents.imagination.model_only:make"),
-    "imagination_only_uncertainty": AgentEntry(make="imagine_bench.agents.imagination.model_only:make_uncertainty"),
+    "imagination_only": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make",
+        title="imagination only",
+        description="Explores like DQN and learns a model of its world on the side; a fresh controller that never "
+        "meets the world is trained in that model alone, and is what is tested.",
+    ),
+    "imagination_only_uncertainty": AgentEntry(
+        make="imagine_bench.agents.imagination.model_only:make_uncertainty",
+        title="imagination only + uncertainty",
+        description="The same, but an imagined episode ends where the model is unsure.",
+    ),
 }
 
 
@@ -178,10 +217,25 @@ REGRESSORS: dict[str, RegressorEntry] = {
 }
 
 
+TASK_TYPES = {
+    "control": "imagine_bench.bench.control:CONTROL",
+    "regression": "imagine_bench.regression.task_type:REGRESSION",
+}
+"""The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
+
+OBSERVERS = tuple(
+    f"imagine_bench.cli.observers:{name}"
+    for name in ("OpenLoopObserver", "FuturesObserver", "ExamplesObserver", "RecordingObserver")
+)
+"""What looks at every control run, in this order, each the ``"module:attr"`` of a
+:class:`.bench.runner.RunObserver` without arguments."""
+
+
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
     module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    found = importlib.import_module(module)
+    return getattr(found, attribute) if attribute else found
 
 
 def agents() -> dict[str, AgentEntry]:
@@ -248,24 +302,24 @@ def agent_entry(name: str) -> AgentEntry:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    names: frozenset[str] = load(f"{agent_entry(agent).settings}:names")()
+    names: frozenset[str] = load(agent_entry(agent).settings).names()
     return names
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a protocol's overrides that this agent has settings for; the others are some other agent's."""
+    """Those of a protocol's overrides that this agent has settings for; the others are another agent's."""
     names = setting_names(agent) if overrides else frozenset()
     return {name: value for name, value in overrides.items() if name in names}
 
 
-def settings(agent: str, preset: str, overrides: Mapping[str, Any], family: str) -> Any:
+def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
     """An agent's settings, a dataclass, with those of the overrides that it has.
 
     Raises:
-        UnknownNameError: No such preset or family.
+        UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(f"{agent_entry(agent).settings}:resolve")(preset, own_settings(agent, overrides), family)
+    return load(agent_entry(agent).settings).resolve(hyperparameters, own_settings(agent, overrides), group)
 
 
 def task(name: str) -> TaskSpec:
@@ -276,8 +330,9 @@ def task(name: str) -> TaskSpec:
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
-    spec: TaskSpec = load(entry.spec)
-    for field, ours, theirs in (
+    loaded = load(entry.spec)
+    spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
+    for what, ours, theirs in (
         ("id", name, spec.id),
         ("env_id", entry.env_id, spec.env_id),
         ("horizon", entry.horizon, spec.horizon),
@@ -287,7 +342,7 @@ def task(name: str) -> TaskSpec:
     ):
         if ours != theirs:
             raise InvalidValueError(
-                f"{entry.spec} says {field} {theirs!r} where the registry line or the rules of {name} say {ours!r}; "
+                f"{entry.spec} says {what} {theirs!r} where the registry line or the rules of {name} say {ours!r}; "
                 "make them one."
             )
     return spec
@@ -299,7 +354,7 @@ def _numbers_of_values(rules: Rules) -> tuple[int, ...]:
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:
-    """A new agent of a registered kind."""
+    """A new agent by its registered name."""
     make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
     return make(context)
 
@@ -324,6 +379,6 @@ def regressor_entry(name: str) -> RegressorEntry:
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
-    """A new regressor of a registered kind."""
+    """A new regressor by its registered name."""
     make: Callable[[RegressorContext], Regressor] = load(regressor_entry(name).make)
     return make(context)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import RuleFacts, Rules
+from imagine_bench.interfaces import Floats, RuleFacts, Rules, State
 
 _SWEEPS = 10_000
 _VALUE_TOLERANCE = 1e-12
@@ -30,11 +30,11 @@ class RuleTables:
         success: Probability of ending here as a success. Shape (A, S).
     """
 
-    index: dict[tuple[int, ...], int]
+    index: dict[State, int]
     starts: NDArray[np.int64]
-    alive: NDArray[np.float64]
-    reward: NDArray[np.float64]
-    success: NDArray[np.float64]
+    alive: Floats
+    reward: Floats
+    success: Floats
 
 
 def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -85,7 +85,7 @@ def tabulate(rules: Rules) -> RuleTables:
     return RuleTables(index=index, starts=starts, alive=alive, reward=reward, success=success)
 
 
-def optimal_values(tables: RuleTables) -> NDArray[np.float64]:
+def optimal_values(tables: RuleTables) -> Floats:
     """Action values of the largest undiscounted return without a horizon, by value iteration. Shape (A, S).
 
     Raises:
@@ -93,7 +93,7 @@ def optimal_values(tables: RuleTables) -> NDArray[np.float64]:
     """
     values = np.full(tables.reward.shape[1], tables.reward.min(initial=0.0))
     for _ in range(_SWEEPS):
-        action_values: NDArray[np.float64] = tables.reward + tables.alive @ values  # [A, S]
+        action_values: Floats = tables.reward + tables.alive @ values  # [A, S]
         best = action_values.max(axis=0)
         if np.abs(best - values).max() < _VALUE_TOLERANCE:
             return action_values
@@ -109,7 +109,7 @@ def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyFacts:
+class PolicyValues:
     """What a policy reaches within a horizon, from each macrostate. Shapes (S,).
 
     Attributes:
@@ -119,13 +119,13 @@ class PolicyFacts:
         length: Expected number of actions.
     """
 
-    success: NDArray[np.float64]
-    failure: NDArray[np.float64]
-    returns: NDArray[np.float64]
-    length: NDArray[np.float64]
+    success: Floats
+    failure: Floats
+    returns: Floats
+    length: Floats
 
 
-def evaluate(tables: RuleTables, policy: NDArray[np.float64], horizon: int) -> PolicyFacts:
+def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     """Evaluate a stationary policy exactly.
 
     Args:
@@ -145,10 +145,65 @@ def evaluate(tables: RuleTables, policy: NDArray[np.float64], horizon: int) -> P
         failures = failure + alive @ failures
         returns = reward + alive @ returns
         length = 1.0 + alive @ length
-    return PolicyFacts(success=successes, failure=failures, returns=returns, length=length)
+    return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
 
 
-def greedy(policy: NDArray[np.int64], n_actions: int) -> NDArray[np.float64]:
+Belief = dict[tuple[State, bool], float]
+"""Probability of each (macrostate, whether the episode ended there)."""
+
+
+def advance(rules: Rules, belief: Belief, action: int | None) -> tuple[Belief, float]:
+    """The belief after one more macro-action, and the reward expected of it; what has ended stays where it is.
+
+    Args:
+        rules: The machine.
+        belief: What may be the case now.
+        action: The macro-action; None for the optimal one in each macrostate.
+    """
+    after: Belief = {}
+    reward = 0.0
+    for (state, over), weight in belief.items():
+        if over:
+            after[state, True] = after.get((state, True), 0.0) + weight
+            continue
+        for outcome in rules.outcomes(state, rules.optimal_action(state) if action is None else action):
+            share, key = weight * outcome.probability, (outcome.macrostate, outcome.terminated)
+            after[key] = after.get(key, 0.0) + share
+            reward += share * outcome.reward
+    return after, reward
+
+
+def by_macrostate(belief: Belief) -> dict[State, float]:
+    """Probability of each macrostate, whether or not the episode ended there."""
+    shares: dict[State, float] = {}
+    for (state, _), share in belief.items():
+        shares[state] = shares.get(state, 0.0) + share
+    return shares
+
+
+def is_random(rules: Rules) -> bool:
+    """Whether some macro-action may lead to one thing or another."""
+    return any(len(rules.outcomes(state, action)) > 1 for state in rules.states for action in range(rules.n_actions))
+
+
+def fewest_actions(rules: Rules, start: State) -> int:
+    """The fewest macro-actions after which the rules can give a success; exact where the rules are deterministic.
+
+    Raises:
+        InvalidValueError: No success can be reached from ``start``.
+    """
+    reached, seen, steps = {start}, {start}, 0
+    while reached:
+        steps += 1
+        outcomes = [o for state in reached for action in range(rules.n_actions) for o in rules.outcomes(state, action)]
+        if any(outcome.success for outcome in outcomes):
+            return steps
+        reached = {outcome.macrostate for outcome in outcomes if not outcome.terminated} - seen
+        seen |= reached
+    raise InvalidValueError(f"The rules allow no success from {start}.")
+
+
+def greedy(policy: NDArray[np.int64], n_actions: int) -> Floats:
     """A deterministic policy (S,) as action probabilities (A, S)."""
     return np.asarray(np.eye(n_actions)[:, policy])
 

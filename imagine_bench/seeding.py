@@ -68,7 +68,7 @@ def is_tuning_seed(seed: int) -> bool:
 
 
 def evaluation_split(seed: int) -> Purpose:
-    """What a run of this seed is tested on: a run that is_tuning_seed never meets an evaluation seed, and the reverse."""
+    """What a run of this seed is tested on; a run for choosing settings meets no start of a reported one."""
     return "tuning" if is_tuning_seed(seed) else "evaluation"
 
 

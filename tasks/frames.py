@@ -1,4 +1,4 @@
-"""Frames of macrostates that nobody acted for: one scene and one eye a thread, world and appearance level."""
+"""Frames of macrostates that nobody acted for: one scene and one renderer a thread, world and appearance level."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Rules
 from imagine_bench.rules import require_macrostates
 
-from .macro_env import FRAME_PX, World, agent_eye
+from .macro_env import FRAME_PX, World, agent_camera
 from .rendering import Renderer
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
@@ -21,9 +21,9 @@ MakeWorld = Callable[[Appearance], World]
 
 
 @functools.lru_cache(maxsize=8)
-def _studio(make_world: MakeWorld, level: Appearance, thread: int) -> tuple[World, Renderer]:
+def _frame_renderer(make_world: MakeWorld, level: Appearance, thread: int) -> tuple[World, Renderer]:
     world = make_world(level)
-    return world, agent_eye(world.model)
+    return world, agent_camera(world.model)
 
 
 def frames_of(
@@ -46,10 +46,10 @@ def frames_of(
         InvalidValueError: Macrostates of another shape or type, or none of the rules'.
     """
     macrostates = require_macrostates(rules, macrostates)
-    world, eye = _studio(make_world, appearance_level(appearance), threading.get_ident())
+    world, camera = _frame_renderer(make_world, appearance_level(appearance), threading.get_ident())
     frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
     for row, macrostate in enumerate(macrostates.tolist()):
         world.place(tuple(macrostate), rng)
         world.vary(rng)
-        frames[row] = eye.frame(world.data)
+        frames[row] = camera.frame(world.data)
     return frames

@@ -1,9 +1,9 @@
-"""The one Gymnasium environment: exact rules, a world that acts and can be read, and pictures of it."""
+"""The one Gymnasium environment: exact rules, a world that acts and can be read, and images of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from .motion.executor import MacroResult
 
 FRAME_PX = 64
-MAX_PICTURE_PX = 4096
+MAX_IMAGE_PX = 4096
 _ANSWER_S = 0.05
 """People answer a macro-action so long after it, in a recording."""
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
 
-def picture_view(camera: str, width: int, height: int) -> View:
+def human_camera_view(camera: str, width: int, height: int) -> View:
     """A view for people: everything in it, soft edges, shadows and sky."""
     groups = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
     return View(
@@ -62,7 +62,7 @@ class World(Protocol):
         """Start anew from ``macrostate``; nothing of the time before remains."""
 
     def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's looks."""
+        """Draw this frame's appearance."""
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
@@ -102,7 +102,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     Raises:
         UnknownNameError: An unknown execution, appearance, render mode or camera.
-        InvalidValueError: A picture size out of range.
+        InvalidValueError: An image size out of range.
 
     Version History: v0, the first.
     """
@@ -129,9 +129,9 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._world = make_world(appearance_level(appearance))
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
-        self._eye = Renderer(self._world.model, _AGENT_VIEW)
-        self._picture = Renderer(self._world.model, picture_view(camera, *_picture_size(width, height)))
-        self._human: Renderer | None = None
+        self._agent_camera = Renderer(self._world.model, _AGENT_VIEW)
+        self._render_camera = Renderer(self._world.model, human_camera_view(camera, *_image_size(width, height)))
+        self._human_camera: Renderer | None = None
         self.capture_motion_hz = 0.0
         self._begun, self._macrostate = False, self._starts[0]
         self._latest: MacroResult | None = None
@@ -196,11 +196,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self._picture.frame(self._world.data)
+        return None if self.render_mode is None else self._render_camera.frame(self._world.data)
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again. Only the thread that drew can: in another they stay."""
-        for renderer in (self._eye, self._picture, self._human):
+        for renderer in (self._agent_camera, self._render_camera, self._human_camera):
             if renderer is not None:
                 renderer.close()
 
@@ -227,33 +227,54 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self._eye.frame(self._world.data)
+        return self._agent_camera.frame(self._world.data)
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """A picture of the whole scene with the arm. Shape (height, width, 3)."""
-        view = picture_view(HUMAN_CAMERA, *_picture_size(width, height))
-        if self._human is None or self._human.view != view:
-            if self._human is not None:
-                self._human.close()
-            self._human = Renderer(self._world.model, view)
-        return self._human.frame(self._world.data)
+        """An image of the whole scene with the arm. Shape (height, width, 3)."""
+        view = human_camera_view(HUMAN_CAMERA, *_image_size(width, height))
+        if self._human_camera is None or self._human_camera.view != view:
+            if self._human_camera is not None:
+                self._human_camera.close()
+            self._human_camera = Renderer(self._world.model, view)
+        return self._human_camera.frame(self._world.data)
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Pictures of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        return np.stack([self.human_view(width, height) for _ in self.replay()])
+
+    # --- MuJoCo --------------------------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+        return self._world.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The scene's state; only to be read."""
+        return self._world.data
+
+    def replay(self) -> Iterator[float]:
+        """Set the scene to each captured sample of the latest macro-action in turn; at the end it stands as before.
+
+        Yields:
+            Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
+        """
         world, latest = self._world, self._latest
         if latest is None or not len(latest.time_s):
-            return self.human_view(width, height)[None]
+            yield 0.0
+            return
         standing, people = world.data.qpos.copy(), self._mocap()
-        pictures = []
-        world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
-        for qpos in latest.qpos:
-            world.data.qpos[:] = qpos
+        try:
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
+            for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
+                world.data.qpos[:] = qpos
+                mujoco.mj_kinematics(world.model, world.data)
+                yield time_s
+        finally:
+            world.data.qpos[:] = standing
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = people
             mujoco.mj_kinematics(world.model, world.data)
-            pictures.append(self.human_view(width, height))
-        world.data.qpos[:] = standing
-        world.data.mocap_pos[:], world.data.mocap_quat[:] = people
-        mujoco.mj_kinematics(world.model, world.data)
-        return np.stack(pictures)
 
     # --- details -------------------------------------------------------------------------------------------------
 
@@ -324,13 +345,13 @@ def _known_render_mode(name: str) -> str:
     return require_known("render mode", name, MacroEnv.metadata["render_modes"])
 
 
-def _picture_size(width: int, height: int) -> tuple[int, int]:
+def _image_size(width: int, height: int) -> tuple[int, int]:
     for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_PICTURE_PX:
-            raise InvalidValueError(f"Picture {name} {value!r} must be an integer from 1 to {MAX_PICTURE_PX} pixels.")
+        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
+            raise InvalidValueError(f"Image {name} {value!r} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
     return int(width), int(height)
 
 
-def agent_eye(model: mujoco.MjModel) -> Renderer:
+def agent_camera(model: mujoco.MjModel) -> Renderer:
     """The agent's view of a model."""
     return Renderer(model, _AGENT_VIEW)

@@ -1,6 +1,6 @@
-"""The only owner of OpenGL: pictures of a MuJoCo scene, from contexts that are made late and closed with care.
+"""The only owner of OpenGL: images of a MuJoCo scene, from contexts that are made late and closed with care.
 
-- A context is made at the first picture, in the process that draws it; one inherited through a fork is dropped.
+- A context is made at the first image, in the process that draws it; one inherited through a fork is dropped.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
 """
@@ -38,7 +38,7 @@ _CHOICES = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", "PYOPENGL_PLATFORM")
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What a picture shows and how well.
+    """What an image shows and how well.
 
     Attributes:
         camera: Name of a camera of the model.
@@ -190,10 +190,10 @@ def _close_all_at_exit() -> None:
 
 
 class Renderer:
-    """Pictures of one model from one view.
+    """Images of one model from one view.
 
     Args:
-        model: The scene. Changes of its colours, lights and cameras show in the next picture.
+        model: The scene. Changes of its colors, lights and cameras show in the next image.
         view: What to show.
 
     Raises:

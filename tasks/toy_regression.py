@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.regression import SCORES, Dataset, Floats, Predict, RegressionSpec
+from imagine_bench.regression.interfaces import SCORES, Dataset, Floats, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 DOMAIN = (-30.0, 30.0)

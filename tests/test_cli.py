@@ -12,15 +12,15 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
 
-from imagine_bench import registry
-from imagine_bench.bench.launchers import LAUNCHERS, LocalPool
-from imagine_bench.bench.studies import STUDIES
+from imagine_bench.bench.launchers import LAUNCHERS
+from imagine_bench.bench.local import LocalPool
 from imagine_bench.cli import main, parse_settings
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.protocols.task_types import task_types
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.task_types import TASK_TYPES
+from imagine_bench.studies.catalogue import STUDIES
 
 _HERE = Path(__file__).parent / "fakes"
 
@@ -67,9 +67,9 @@ def bench_words(out: Path, *more: str) -> list[str]:
             "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: ",
         ),
         (["--set", "controller.discount"], "--set 'controller.discount' is not of the form name=value"),
-        (["--set", "a=1", "--set", "b=2"], "--set comes 2 times; give all its values behind one."),
-        (["--set=a=1", "--set=b=2"], "--set comes 2 times; give all its values behind one."),
-        (["--set", "a=1", "--set=b=2"], "--set comes 2 times; give all its values behind one."),
+        (["--set", "a=1", "--set=a=2"], "--set names 'a' twice; give it once."),
+        (["--set", "controller.discount=0.9", "--set=b=2"], "No setting 'b'. Known: "),
+        (["--set", "--workers", "1"], "--set has no value; give at least one behind it, or leave it out."),
         (["--agents="], "--agents has no value; give at least one behind it, or leave it out."),
         (["--seeds", "--workers", "1"], "--seeds has no value; give at least one behind it, or leave it out."),
         (["--workers", "1", "--agents"], "--agents has no value; give at least one behind it, or leave it out."),
@@ -91,7 +91,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
 def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, sentence in (
         (["report", "--out", str(tmp_path)], "There is no bench below"),
-        (["report", "a", "--beside", "b", "--beside", "c"], "--beside comes 2 times; give all its values behind one."),
+        (["report", "a", "--merge"], "--merge has no value; give at least one behind it, or leave it out."),
         (["plan", str(tmp_path), "--max-epistemic", "nan"], "more epistemic uncertainty than nan: give at least 0."),
         (["plan", str(tmp_path), "--max-epistemic=-1"], "more epistemic uncertainty than -1.0: give at least 0."),
         (
@@ -199,8 +199,8 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     out = capsys.readouterr().out
     words = set(re.split(r"[\s,]+", out))
-    for kind in TASK_TYPES.values():
-        assert words >= {*kind.tasks, *kind.learners(), *registry.load(kind.presets)}
+    for kind in task_types().values():
+        assert words >= {*kind.tasks, *kind.learners(), *kind.presets}
     assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
     assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}
 

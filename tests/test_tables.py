@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from doc_tables import PAGES, RESULTS, ROOT, rewritten, tables, unmarked
 
+from imagine_bench.registry import TASKS
 from imagine_bench.store.archive import load_archive
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.results import BenchResult
-from imagine_bench.task_types import TASK_TYPES
 
 KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json"))
 
@@ -49,7 +49,7 @@ def test_kept_benches_are_read(folder: Path) -> None:
     facts = json.loads((folder / "bench.json").read_text())
     assert list(facts) == ["protocol", "protocol_hash", "environment", "sessions"]
     assert read_protocol(folder).as_dict() == facts["protocol"]
-    if facts["protocol"]["task"] in TASK_TYPES["control"].tasks:
+    if facts["protocol"]["task"] in TASKS:
         result = load_archive(folder)
         assert isinstance(result, BenchResult) and result.protocol_hash == facts["protocol_hash"]
 

@@ -18,7 +18,7 @@ from .training import draw_frames, train_encoder
 
 
 def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path) -> str:
-    """Make an encoder and leave artefact, card and picture in ``out``.
+    """Make an encoder and leave artefact, card and figure in ``out``.
 
     Args:
         spec: The task.
@@ -35,7 +35,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         UnknownNameError: An unknown recipe or appearance.
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes found no part with two values in so few or such like frames.
+        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
     """
     recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)

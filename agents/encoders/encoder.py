@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -19,8 +20,8 @@ from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueE
 from imagine_bench.interfaces import Frame
 from imagine_bench.preprocessing import PREPROCESSING, join_strips, preprocess
 
-from .factors import PartsCoder
-from .network import Coder
+from .discrete_encoder import DiscreteEncoder
+from .network import EncoderNetwork
 from .probe import Probe
 from .recipes import Recipe
 from .vae import Vae, build_vae
@@ -53,7 +54,7 @@ class EncoderCard:
         reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
         probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
             ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
-        code_sizes: Where latents are one-hot codes of parts: the number of values of each part; else empty.
+        code_sizes: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     """
 
     task: str
@@ -104,18 +105,18 @@ class Encoder:
     """Frames to latents and back, with no gradient and no randomness.
 
     Args:
-        coder: The trained network.
+        network: The trained network.
         probe: The evaluation-only reader of the macrostate.
         card: Its origin.
         device: A torch device name.
     """
 
-    def __init__(self, coder: Coder, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
+    def __init__(self, network: EncoderNetwork, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
         self.card = card
         self.latent_size = card.latent_size
         self.device = torch.device(device)
-        self._coder = coder.to(self.device).requires_grad_(False).eval()
-        self._probe = probe.to(self.device).requires_grad_(False).eval()
+        self.network = network.to(self.device).requires_grad_(False).eval()
+        self.probe = probe.to(self.device).requires_grad_(False).eval()
         self._preprocess = preprocess(card.preprocessing)
 
     @torch.no_grad()
@@ -136,44 +137,35 @@ class Encoder:
                 f"The encoder got frames of type {frames.dtype} and shape {frames.shape}; "
                 "give uint8 of shape (N, 64, 64, 3)."
             )
-        parts = [self._encode_chunk(frames[i : i + _CHUNK]) for i in range(0, len(frames), _CHUNK)]
-        if len(parts) == 1:
-            return parts[0]
+        chunks = [self._encode_chunk(frames[i : i + _CHUNK]) for i in range(0, len(frames), _CHUNK)]
+        if len(chunks) == 1:
+            return chunks[0]
         empty = torch.empty((0, self.latent_size), device=self.device)
-        mu, sigma = zip((empty, empty), *parts, strict=True)
+        mu, sigma = zip((empty, empty), *chunks, strict=True)
         return torch.cat(mu), torch.cat(sigma)
 
     def _encode_chunk(self, frames: Frame) -> tuple[Tensor, Tensor]:
-        pictures = torch.from_numpy(self._preprocess(frames)).to(self.device)
-        mu, log_variance = self._coder.posterior(pictures)
+        images = torch.from_numpy(self._preprocess(frames)).to(self.device)
+        mu, log_variance = self.network.posterior(images)
         return mu, (0.5 * log_variance).exp()
 
-    def codes(self, frame: Frame) -> tuple[int, ...]:
-        """The value of each part of one frame (64, 64, 3), where latents are codes; P integers.
-
-        Raises:
-            InvalidValueError: Its latents are continuous.
-        """
-        if not self.card.code_sizes:
-            raise InvalidValueError(
-                f"This agent reads codes of parts, and the encoder {self.card.recipe.name!r} of {self.card.task} gives "
-                "continuous latents; give one made with `imagine-bench encoder --recipe codes`."
-            )
-        hot = self.encode(frame[None])[0][0]
-        return tuple(int(part.argmax()) for part in hot.split(self.card.code_sizes))
+    def latents(self, frame: Frame) -> NDArray[np.float32]:
+        """Posterior means (Z,) of one frame (64, 64, 3)."""
+        mu: NDArray[np.float32] = self.encode(frame[None])[0][0].cpu().numpy()
+        return mu
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.float32]:
-        """One picture of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
-        _, height, width = picture_shape(self.card.preprocessing)
-        return view(self._coder.picture(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
+        """One image of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
+        _, height, width = image_shape(self.card.preprocessing)
+        return view(self.network.decode(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
 
     def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
         """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
-        return self._probe.read(latents.to(self.device))
+        return self.probe.read(latents.to(self.device))
 
     def save(self, path: Path) -> None:
-        """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``).
+        """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``), each whole or not at all.
 
         Raises:
             ArtefactError: Either file exists already; it is left untouched.
@@ -182,14 +174,15 @@ class Encoder:
         refuse_existing(path, card_path)
         tensors = {
             f"{name}.{key}": value.half().contiguous().cpu()
-            for name, module in (("vae", self._coder), ("probe", self._probe))
+            for name, module in (("vae", self.network), ("probe", self.probe))
             for key, value in module.state_dict().items()
         }
         path.parent.mkdir(parents=True, exist_ok=True)
-        with card_path.open("x") as file:
-            file.write(self.card.to_json() + "\n")
-        with path.open("xb") as file:
-            file.write(save(tensors, metadata={"card": self.card.to_json()}))
+        artefact = save(tensors, metadata={"card": self.card.to_json()})
+        for target, content in ((card_path, f"{self.card.to_json()}\n".encode()), (path, artefact)):
+            unfinished = target.with_name(f".{target.name}.unfinished")
+            unfinished.write_bytes(content)
+            os.replace(unfinished, target)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> Encoder:
@@ -204,16 +197,16 @@ class Encoder:
             with safe_open(path, framework="pt") as file:
                 card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
                 tensors = {key: file.get_tensor(key).float() for key in file.keys()}
-            coder = empty_coder(card)
-            if coder.latent_size != card.latent_size:
-                raise InvalidValueError(f"its card says {card.latent_size} latents, its network {coder.latent_size}")
-            probe = empty_probe(coder.latent_size, card.cardinalities)
-            _fill(coder, tensors, "vae.")
+            network = empty_network(card)
+            if network.latent_size != card.latent_size:
+                raise InvalidValueError(f"its card says {card.latent_size} latents, its network {network.latent_size}")
+            probe = empty_probe(network.latent_size, card.cardinalities)
+            _fill(network, tensors, "vae.")
             _fill(probe, tensors, "probe.")
         except (OSError, SafetensorError, RuntimeError, TypeError, ValueError, ImagineBenchError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
-        return cls(coder, probe, card, device)
+        return cls(network, probe, card, device)
 
 
 def bundled_encoder(name: str) -> Path:
@@ -232,31 +225,31 @@ def refuse_existing(*paths: Path) -> None:
             raise ArtefactError(f"{path} exists already and is never overwritten; choose another folder or remove it.")
 
 
-def picture_shape(preprocessing: str) -> tuple[int, int, int]:
+def image_shape(preprocessing: str) -> tuple[int, int, int]:
     """(C, H, W) of what a preprocessing gives."""
     shape = preprocess(preprocessing)(np.zeros((1, *_FRAME_SHAPE), dtype=np.uint8)).shape
     return shape[1], shape[2], shape[3]
 
 
-def view(pictures: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
-    """One image of the whole view from preprocessed pictures: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
+def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
+    """One image of the whole view from preprocessed images: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
     if preprocessing == "gray_strips":
-        return join_strips(pictures)
-    return np.ascontiguousarray(np.moveaxis(pictures, 1, -1), dtype=np.float32)
+        return join_strips(images)
+    return np.ascontiguousarray(np.moveaxis(images, 1, -1), dtype=np.float32)
 
 
-def empty_coder(card: EncoderCard) -> Coder:
+def empty_network(card: EncoderCard) -> EncoderNetwork:
     """The network that a card describes, on the meta device."""
     if card.recipe.kind == "latents":
         return empty_vae(card.recipe, card.preprocessing)
     with torch.device("meta"):
-        return PartsCoder(card.code_sizes, *picture_shape(card.preprocessing))
+        return DiscreteEncoder(card.code_sizes, *image_shape(card.preprocessing))
 
 
 def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:
     """The VAE of a recipe on the meta device: shapes without weights, and no random numbers drawn."""
     with torch.device("meta"):
-        return build_vae(recipe, *picture_shape(preprocessing))
+        return build_vae(recipe, *image_shape(preprocessing))
 
 
 def empty_probe(latent_size: int, cardinalities: tuple[int, ...], hidden: int = PROBE_HIDDEN) -> Probe:

@@ -1,4 +1,4 @@
-"""One picture of what an encoder keeps: real views, their reconstructions, and what the probe reads from them."""
+"""One figure of what an encoder keeps: real views, their reconstructions, and what the probe reads from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .encoder import Encoder, view
 from .probe import Latents
 
 COLUMNS = 8
-_CELL = 192  # pixels, edge of a picture
+_CELL = 192  # pixels, edge of an image
 _GAP = 8  # pixels
 _HEADING = 80  # pixels
 _LABEL = 150  # pixels, left of the rows
@@ -52,11 +52,11 @@ def sample_sheet(
     sheet = Image.new("RGB", (_LABEL + cell * len(frames), _HEADING + cell * len(rows) + _CAPTION), _PAPER)
     draw = ImageDraw.Draw(sheet)
     _write_heading(draw, encoder)
-    for row, (label, pictures) in enumerate(rows.items()):
+    for row, (label, images) in enumerate(rows.items()):
         top = _HEADING + row * cell
         draw.text((_GAP, top + cell / 2), label, fill=_MUTED, font=_font(16))
-        for column, picture in enumerate(pictures):
-            sheet.paste(_enlarged(picture), (_LABEL + column * cell, top))
+        for column, image in enumerate(images):
+            sheet.paste(_enlarged(image), (_LABEL + column * cell, top))
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
         words = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
         names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
@@ -84,11 +84,10 @@ def _short(name: str) -> str:
     return name.replace("_", " ").split()[-1]
 
 
-def _enlarged(picture: NDArray[Any]) -> Image.Image:
-    if picture.dtype != np.uint8:
-        picture = np.rint(picture * 255.0).astype(np.uint8)
-    image = Image.fromarray(picture).convert("RGB")
-    return image.resize((_CELL, _CELL), Image.Resampling.NEAREST)
+def _enlarged(pixels: NDArray[Any]) -> Image.Image:
+    if pixels.dtype != np.uint8:
+        pixels = np.rint(pixels * 255.0).astype(np.uint8)
+    return Image.fromarray(pixels).convert("RGB").resize((_CELL, _CELL), Image.Resampling.NEAREST)
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

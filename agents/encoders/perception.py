@@ -1,4 +1,4 @@
-"""Frames to latents for one learner: the encoder, and a memory of the last two frames it saw."""
+"""Frames to latents for one learner: the encoder, and a cache of the last two frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from imagine_bench.interfaces import DEVICES, AgentContext, Frame
 from ..networks.allocator import keep_freed_memory
 from .encoder import Encoder
 
-_KEPT = 2
+_CACHED = 2
 
 
 class Perception:
@@ -38,7 +38,7 @@ class Perception:
         if key not in self._recent:
             mu, sigma = self.encoder.encode(frame[None])
             self._recent[key] = (mu[0], sigma[0])
-            if len(self._recent) > _KEPT:
+            if len(self._recent) > _CACHED:
                 self._recent.popitem(last=False)
         return self._recent[key]
 
@@ -46,8 +46,7 @@ class Perception:
 def prepare_torch(device: str) -> torch.device:
     """Set torch up for small networks: one thread, freed memory kept, and denormals flushed.
 
-    Denormals make Adam's moments 10 times slower on some processors. In a cohort, as in every bench, joint updates run
-    on a stack of their own, whose register this does not set: :func:`agents.networks.joint.gradients` does.
+    Denormals make Adam's moments 10 times slower on some processors.
 
     Raises:
         UnknownNameError: No such device name.

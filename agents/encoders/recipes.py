@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from imagine_bench.errors import InvalidValueError, require_known
 
-ARCHITECTURES = ("ha_schmidhuber", "strips", "picture")
-"""Of networks; recipes of codes have another: ``"parts"``."""
+ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors")
+"""Of networks; ``"factors"`` gives codes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,9 +17,9 @@ class Recipe:
     Attributes:
         name: Name in its chapter's :data:`RECIPES`.
         architecture: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel
-            on its own, ``"picture"`` all together; or ``"parts"``: one categorical code a part of the scene, which has
-            no gradient steps and no number of latents to choose.
-        latents: Latents of the whole picture, or of each strip.
+            on its own, ``"image"`` all together; or ``"factors"``: one categorical value a factor of the scene, which
+            has no gradient steps and no number of latents to choose.
+        latents: Latents of the whole image, or of each strip.
         widths: Hidden units of the small network, from the pixels to the latents.
         pixel_std: Standard deviation of Gaussian pixels, in units of the contrast.
         beta: Weight of the KL term against a SUM over pixels.
@@ -51,10 +51,10 @@ class Recipe:
     @property
     def kind(self) -> str:
         """What the encoder gives: ``"latents"`` (continuous) or ``"codes"`` (categorical)."""
-        return "codes" if self.architecture == "parts" else "latents"
+        return "codes" if self.architecture == "factors" else "latents"
 
     def __post_init__(self) -> None:
-        require_known("encoder architecture", self.architecture, (*ARCHITECTURES, "parts"))
+        require_known("encoder architecture", self.architecture, ARCHITECTURES)
         if min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps) < 1:
             raise InvalidValueError(
                 f"Encoder recipe {self.name!r} has a count below 1; latents, frames, held_out_frames, steps, batch and "
@@ -83,9 +83,9 @@ _STRIPS = Recipe(
     cosine=True,  # ends in a lower loss within a fixed number of steps
     probe_steps=2500,
 )
-_PICTURE = replace(
+_IMAGE = replace(
     _STRIPS,
-    architecture="picture",
+    architecture="image",
     latents=4,  # as in section 3.2.2
     widths=(128, 64),  # the artefact stays below 2 MB
     beta=8.0,  # leaves light and jitter out of the latents that the macrostate does not need
@@ -104,19 +104,19 @@ _CHAPTER_3 = Recipe(
 _JOINT = replace(
     _STRIPS,
     name="joint",  # as many latents as in the thesis and, as there, none that belongs to one cube
-    architecture="picture",
+    architecture="image",
     beta=4.0,
 )
 _CODES = Recipe(
     name="codes",
-    architecture="parts",
-    frames=8000,  # parts and values are found in 6000 of them
+    architecture="factors",
+    frames=8000,  # factors and values are found in 6000 of them
     held_out_frames=4000,
     probe_steps=1000,  # one-hot codes are easy to read
 )
 
 RECIPES: dict[str, dict[str, Recipe]] = {
-    "chapter_3": {"thesis": _CHAPTER_3, "default": _PICTURE, "codes": _CODES},
+    "chapter_3": {"thesis": _CHAPTER_3, "default": _IMAGE, "codes": _CODES},
     "chapter_5": {"thesis": Recipe(name="thesis"), "default": _STRIPS, "joint": _JOINT, "codes": _CODES},
 }
 """By the family of settings that a task names."""

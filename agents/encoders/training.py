@@ -1,4 +1,4 @@
-"""Make an encoder: render frames, train the VAE or discover the parts, fit the evaluation-only probe, measure.
+"""Make an encoder: render frames, train the VAE or discover the factors, fit the evaluation-only probe, measure.
 
 Every measurement is on fresh frames.
 """
@@ -23,9 +23,10 @@ from imagine_bench.preprocessing import preprocess
 from imagine_bench.seeding import SeedTree
 
 from ..networks.weights import initialise
+from .discrete_encoder import DiscreteEncoder, discover
 from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
-from .factors import PartsCoder, discover
-from .network import Coder
+from .network import EncoderNetwork
+from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
 from .recipes import Recipe, recipe_named
 from .vae import MlpVae, Vae
@@ -34,7 +35,7 @@ Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
 
 _CHUNK = 500  # frames rendered at once, to bound memory
-_CHECK_EVERY = 50  # steps between looks for NaN
+_CHECK_EVERY = 50  # steps between checks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
 _Network = TypeVar("_Network", bound=torch.nn.Module)
@@ -45,16 +46,16 @@ class FrameSet:
     """Labelled frames, preprocessed, with 8 bits a value to quarter the memory.
 
     Attributes:
-        pictures: Shape (N, C, H, W), uint8.
+        images: Shape (N, C, H, W), uint8.
         macrostates: Shape (N, M).
     """
 
-    pictures: Tensor
+    images: Tensor
     macrostates: NDArray[np.int64]
 
     def batch(self, rows: Tensor) -> Tensor:
-        """The pictures of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""
-        return self.pictures[rows].float() / 255.0
+        """The images of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""
+        return self.images[rows].float() / 255.0
 
 
 def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
@@ -67,14 +68,14 @@ def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generato
 def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator, progress: Progress) -> FrameSet:
     """Render ``n`` labelled frames of uniformly drawn macrostates."""
     prepare = preprocess(spec.preprocessing)
-    pictures: list[Tensor] = []
+    images: list[Tensor] = []
     labels: list[NDArray[np.int64]] = []
     for start in range(0, n, _CHUNK):
         frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
-        pictures.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
+        images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
         labels.append(macrostates)
         progress("frames", min(start + _CHUNK, n) / n)
-    return FrameSet(pictures=torch.cat(pictures), macrostates=np.concatenate(labels))
+    return FrameSet(images=torch.cat(images), macrostates=np.concatenate(labels))
 
 
 def beta_at(recipe: Recipe, step: int) -> float:
@@ -98,7 +99,7 @@ def train_vae(vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generat
         DivergedError: The loss is not finite any more; the message names the step.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
-    n, order = len(data.pictures), torch.empty(0, dtype=torch.int64)
+    n, order = len(data.images), torch.empty(0, dtype=torch.int64)
     for step in range(recipe.steps):
         while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
@@ -130,13 +131,12 @@ def train_encoder(
     Raises:
         UnknownNameError: An unknown recipe or appearance.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes found no part with two values in so few or such like frames.
+        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
     """
     recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
     require_known("appearance", appearance, APPEARANCES)
     progress = progress or (lambda stage, done: None)
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
+    prepare_torch("cpu")
     seeds = SeedTree(seed)
     train_seeds, probe_seeds = (
         seeds.child(name, spec.id, appearance) for name in ("encoder_training", "encoder_probe")
@@ -147,25 +147,25 @@ def train_encoder(
     held_out = frame_set(spec, appearance, recipe.held_out_frames, probe_seeds.generator(), progress)
     clock.lap("frames")
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
-    coder: Coder
+    network: EncoderNetwork
     if recipe.kind == "codes":
-        coder = _rounded_to_half(discover(data.batch(torch.arange(recipe.frames)), generator))
+        network = _rounded_to_half(discover(data.batch(torch.arange(recipe.frames)), generator))
     else:
-        coder = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
+        network = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
     clock.lap("training")
     cardinalities = tuple(len(values) for values in spec.macrostate_values)
-    latents = latents_of(coder, data)
+    latents = latents_of(network, data)
     probe, linear = (
-        _trained_probe(coder.latent_size, hidden, cardinalities, latents, data, recipe, generator)
+        _trained_probe(network.latent_size, hidden, cardinalities, latents, data, recipe, generator)
         for hidden in (PROBE_HIDDEN, 0)
     )
     clock.lap("probe")
     progress("probe", 1.0)
     noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
-    measured = _measure(coder, probe, linear, held_out, noise)
-    sizes = coder.code_sizes if isinstance(coder, PartsCoder) else ()
-    measured |= {"latent_size": coder.latent_size, "code_sizes": sizes, "cpu_s": clock.seconds()}
-    return Encoder(coder, probe, _card(spec, recipe, appearance, seed, **measured))
+    measured = _measure(network, probe, linear, held_out, noise)
+    sizes = network.code_sizes if isinstance(network, DiscreteEncoder) else ()
+    measured |= {"latent_size": network.latent_size, "code_sizes": sizes, "cpu_s": clock.seconds()}
+    return Encoder(network, probe, _card(spec, recipe, appearance, seed, **measured))
 
 
 def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured: Any) -> EncoderCard:
@@ -206,7 +206,7 @@ def _trained_vae(
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
     if isinstance(vae, MlpVae):
-        vae.remember_looks(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
+        vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
     train_vae(vae, data, recipe, generator, progress)
     return _rounded_to_half(vae)
 
@@ -234,22 +234,22 @@ def _rounded_to_half(network: _Network) -> _Network:
 
 
 @torch.no_grad()
-def latents_of(coder: Coder, data: FrameSet) -> Latents:
+def latents_of(network: EncoderNetwork, data: FrameSet) -> Latents:
     """The latents of every frame."""
-    parts = [coder.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK)]
-    mu, log_variance = (torch.cat(column) for column in zip(*parts, strict=True))
+    chunks = [network.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.images)), _CHUNK)]
+    mu, log_variance = (torch.cat(column) for column in zip(*chunks, strict=True))
     return Latents(mu=mu, sigma=(0.5 * log_variance).exp())
 
 
 def _measure(
-    coder: Coder, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
+    network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
 ) -> dict[str, Any]:
     """What the card says of an encoder on frames that no training saw."""
-    latents, right = latents_of(coder, held_out), held_out.macrostates
-    kl = coder.information(latents.mu, 2.0 * latents.sigma.log())
+    latents, right = latents_of(network, held_out), held_out.macrostates
+    kl = network.information(latents.mu, 2.0 * latents.sigma.log())
     return {
         "kl_nats": round(kl.mean().item(), 3),
-        "reconstruction": _squared_error(coder, held_out, latents),
+        "reconstruction": _squared_error(network, held_out, latents),
         "probe": {
             "linear": accuracy(linear, latents.mu, right),
             "mlp": accuracy(probe, latents.mu, right),
@@ -259,10 +259,10 @@ def _measure(
 
 
 @torch.no_grad()
-def _squared_error(coder: Coder, data: FrameSet, latents: Latents) -> float:
-    """Squared error of the mean latents' pictures, mean a pixel."""
+def _squared_error(network: EncoderNetwork, data: FrameSet, latents: Latents) -> float:
+    """Squared error of the mean latents' images, mean a pixel."""
     total = 0.0
-    for rows in torch.split(torch.arange(len(data.pictures)), _CHUNK):
-        pictures = data.batch(rows)
-        total += (coder.mean(latents.mu[rows]) - coder.target(pictures)).square().sum().item()
-    return total / coder.target(data.batch(torch.arange(1))).numel() / len(data.pictures)
+    for rows in torch.split(torch.arange(len(data.images)), _CHUNK):
+        images = data.batch(rows)
+        total += (network.mean(latents.mu[rows]) - network.target(images)).square().sum().item()
+    return total / network.target(data.batch(torch.arange(1))).numel() / len(data.images)

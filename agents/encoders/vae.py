@@ -1,6 +1,6 @@
-"""Variational autoencoders: pictures to a Gaussian over latents, and back (thesis 2.1.4 and 5.2.2).
+"""Variational autoencoders: images to a Gaussian over latents, and back (thesis 2.1.4 and 5.2.2).
 
-Shapes: ``N`` pictures, ``C`` channels, ``H x W`` pixels, ``Z`` latents of the whole picture. All randomness is
+Shapes: ``N`` images, ``C`` channels, ``H x W`` pixels, ``Z`` latents of the whole image. All randomness is
 the noise that the caller passes in.
 """
 
@@ -16,15 +16,15 @@ from torch.nn import functional
 
 from imagine_bench.errors import require_known
 
-from .network import Coder
+from .network import EncoderNetwork
 from .recipes import ARCHITECTURES, Recipe
 
-_LEAST_CONTRAST = 0.005  # of full scale; parts about as flat as this are amplified less
+_LEAST_CONTRAST = 0.005  # of full scale; inputs about as flat as this are amplified less
 _SIDE = 64  # pixels; input and output of the Ha & Schmidhuber network
 
 
 class Elbo(NamedTuple):
-    """The terms of a VAE's loss, in nats a picture, averaged over a batch. Each of shape ()."""
+    """The terms of a VAE's loss, in nats a image, averaged over a batch. Each of shape ()."""
 
     loss: Tensor
     reconstruction: Tensor
@@ -46,7 +46,7 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
     return -0.5 * (1.0 + log_variance - mu.square() - log_variance.exp()).sum(dim=1)  # [N]
 
 
-class Vae(Coder):
+class Vae(EncoderNetwork):
     """What the two architectures share."""
 
     @abc.abstractmethod
@@ -54,7 +54,7 @@ class Vae(Coder):
         """Parameters of the pixels' distribution given ``latents`` (N, Z), as :meth:`log_loss` takes them."""
 
     def mean(self, latents: Tensor) -> Tensor:
-        """The expected picture given ``latents`` (N, Z), in the units of :meth:`target`."""
+        """The expected image given ``latents`` (N, Z), in the units of :meth:`target`."""
         return self.generate(latents)
 
     @abc.abstractmethod
@@ -65,92 +65,88 @@ class Vae(Coder):
         """KL from the standard normal."""
         return kl_from_standard_normal(mu, log_variance)
 
-    def elbo(self, pictures: Tensor, noise: Tensor, beta: float) -> Elbo:
+    def elbo(self, images: Tensor, noise: Tensor, beta: float) -> Elbo:
         """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of a batch.
 
         Args:
-            pictures: Shape (N, C, H, W), in [0, 1].
+            images: Shape (N, C, H, W), in [0, 1].
             noise: Standard normal, for the reparametrisation. Shape (N, Z).
             beta: Weight of the KL term.
         """
-        mu, log_variance = self.posterior(pictures)  # [N, Z]
+        mu, log_variance = self.posterior(images)  # [N, Z]
         latents = mu + (0.5 * log_variance).exp() * noise  # [N, Z]
-        reconstruction = self.log_loss(self.generate(latents), self.target(pictures)).mean()
+        reconstruction = self.log_loss(self.generate(latents), self.target(images)).mean()
         kl = kl_from_standard_normal(mu, log_variance).mean()
         return Elbo(reconstruction + beta * kl, reconstruction, kl)
 
 
-def standardise(parts: Tensor) -> Tensor:
-    """Give every row mean 0 and standard deviation 1, so that light matters less.
-
-    Args:
-        parts: Shape (..., P), in [0, 1].
-    """
+def standardise(pixels: Tensor) -> Tensor:
+    """Give every row (..., pixels) mean 0 and standard deviation 1, so that light matters less."""
     # One fused operation, since a single frame must be quick.
-    return functional.layer_norm(parts, parts.shape[-1:], eps=_LEAST_CONTRAST**2)
+    return functional.layer_norm(pixels, pixels.shape[-1:], eps=_LEAST_CONTRAST**2)
 
 
 class MlpVae(Vae):
-    """One small network that reads a picture whole, or each of its channels on its own.
+    """One small network that reads a image whole, or each of its channels on its own.
 
     Channels that are strips hold one cube each: sharing the weights triples the data and lets no cube crowd out
-    another. The latents of part p are ``[p * L, (p + 1) * L)``.
+    another. The latents of group g are ``[g * L, (g + 1) * L)``.
 
     Args:
-        recipe: Widths, latents a part and pixel noise.
+        recipe: Widths, latents a group and pixel noise.
         channels: Channels C.
         height: Pixels of a channel.
         width: Pixels of a channel.
-        parts: C where every channel is read on its own, 1 where all are read together.
+        groups: C where every channel is read on its own, 1 where all are read together.
     """
 
     brightness: Tensor
     contrast: Tensor
 
-    def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, parts: int) -> None:
+    def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, groups: int) -> None:
         super().__init__()
-        self.latent_size = parts * recipe.latents
-        self._parts = parts
-        self._picture = (channels, height, width)
+        self.latent_size = groups * recipe.latents
+        self._groups = groups
+        self._image_shape = (channels, height, width)
         self._precision = recipe.pixel_std**-2
-        sizes = (channels // parts * height * width, *recipe.widths)
+        sizes = (channels // groups * height * width, *recipe.widths)
         self.encoder = _mlp(*sizes, 2 * recipe.latents)
         self.decoder = _mlp(recipe.latents, *reversed(sizes))
-        # The looks a person expects: the mean brightness and contrast of the training pictures.
+        # What a person expects to see: the mean brightness and contrast of the training images.
         self.register_buffer("brightness", torch.tensor(0.5))
         self.register_buffer("contrast", torch.tensor(0.2))
 
-    def _split(self, pictures: Tensor) -> Tensor:
-        """Standardised parts, a row each. Shape (N * parts, pixels)."""
-        return standardise(pictures.reshape(len(pictures) * self._parts, -1))
+    def _split(self, images: Tensor) -> Tensor:
+        """Standardised groups of channels, a row each. Shape (N * groups, pixels)."""
+        return standardise(images.reshape(len(images) * self._groups, -1))
 
-    def target(self, pictures: Tensor) -> Tensor:
-        """Pictures whose parts are standardised."""
-        return self._split(pictures).reshape(pictures.shape)
+    def target(self, images: Tensor) -> Tensor:
+        """Images whose groups of channels are standardised."""
+        return self._split(images).reshape(images.shape)
 
-    def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Each part encoded on its own, their latents side by side. Two tensors of shape (N, Z)."""
-        mu, log_variance = self.encoder(self._split(pictures)).chunk(2, dim=1)  # [N * parts, L]
-        return mu.reshape(len(pictures), self.latent_size), log_variance.reshape(len(pictures), self.latent_size)
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Each group encoded on its own, their latents side by side. Two tensors of shape (N, Z)."""
+        mu, log_variance = self.encoder(self._split(images)).chunk(2, dim=1)  # [N * groups, L]
+        return mu.reshape(len(images), self.latent_size), log_variance.reshape(len(images), self.latent_size)
 
     def generate(self, latents: Tensor) -> Tensor:
         """Means of the standardised pixels. Shape (N, C, H, W)."""
-        apart = latents.reshape(len(latents) * self._parts, self.latent_size // self._parts)
-        parts: Tensor = self.decoder(apart)  # [N * parts, pixels]
-        return parts.reshape(len(latents), *self._picture)
+        apart = latents.reshape(len(latents) * self._groups, self.latent_size // self._groups)
+        pixels: Tensor = self.decoder(apart)  # [N * groups, pixels]
+        return pixels.reshape(len(latents), *self._image_shape)
 
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
         """Gaussian pixels of a fixed standard deviation."""
         return 0.5 * self._precision * (generated - target).square().sum(dim=(1, 2, 3))  # [N]
 
-    def remember_looks(self, pictures: Tensor) -> None:
-        """Take brightness and contrast for :meth:`picture` from training pictures (N, C, H, W)."""
-        parts = pictures.reshape(len(pictures) * self._parts, -1)
-        self.brightness.copy_(pictures.mean())
-        self.contrast.copy_(parts.std(dim=1, correction=0).mean())
+    def fit_appearance(self, images: Tensor) -> None:
+        """Take brightness and contrast for :meth:`decode` from training images (N, C, H, W)."""
+        rows = images.reshape(len(images) * self._groups, -1)
+        self.brightness.copy_(images.mean())
+        self.contrast.copy_(rows.std(dim=1, correction=0).mean())
 
-    def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
-        """At the mean brightness and contrast of the training pictures: latents do not hold the light."""
+    def decode(self, latents: Tensor, height: int, width: int) -> Tensor:
+        """At the mean brightness and contrast of the training images: latents do not hold the light."""
         return (self.brightness + self.contrast * self.generate(latents)).clamp(0.0, 1.0)
 
 
@@ -184,13 +180,13 @@ class HaSchmidhuberVae(Vae):
             nn.ConvTranspose2d(32, channels, kernel_size=6, stride=2),
         )
 
-    def target(self, pictures: Tensor) -> Tensor:
-        """Pictures resampled to 64 x 64."""
-        return _resize(pictures, _SIDE, _SIDE)
+    def target(self, images: Tensor) -> Tensor:
+        """Images resampled to 64 x 64."""
+        return _resize(images, _SIDE, _SIDE)
 
-    def posterior(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """All channels encoded jointly. Two tensors of shape (N, Z)."""
-        mu, log_variance = self.encoder(self.target(pictures)).chunk(2, dim=1)
+        mu, log_variance = self.encoder(self.target(images)).chunk(2, dim=1)
         return mu, log_variance
 
     def generate(self, latents: Tensor) -> Tensor:
@@ -206,20 +202,20 @@ class HaSchmidhuberVae(Vae):
         """Bernoulli pixels: cross-entropy (thesis 2.1.4)."""
         return functional.binary_cross_entropy_with_logits(generated, target, reduction="none").sum(dim=(1, 2, 3))
 
-    def picture(self, latents: Tensor, height: int, width: int) -> Tensor:
+    def decode(self, latents: Tensor, height: int, width: int) -> Tensor:
         """Resampled to the size of the strips."""
         return _resize(self.mean(latents), height, width)
 
 
 def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
-    """The VAE of a recipe for pictures of shape (C, H, W), with whatever weights torch initialises it to.
+    """The VAE of a recipe for images of shape (C, H, W), with whatever weights torch initialises it to.
 
     Raises:
         UnknownNameError: The recipe names an unknown architecture.
     """
     if require_known("encoder architecture", recipe.architecture, ARCHITECTURES) == "ha_schmidhuber":
         return HaSchmidhuberVae(recipe, channels)
-    return MlpVae(recipe, channels, height, width, parts=channels if recipe.architecture == "strips" else 1)
+    return MlpVae(recipe, channels, height, width, groups=channels if recipe.architecture == "strips" else 1)
 
 
 def _mlp(*sizes: int) -> nn.Sequential:
@@ -230,7 +226,7 @@ def _mlp(*sizes: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _resize(pictures: Tensor, height: int, width: int) -> Tensor:
-    if pictures.shape[2:] == (height, width):
-        return pictures
-    return functional.interpolate(pictures, size=(height, width), mode="bilinear", align_corners=False)
+def _resize(images: Tensor, height: int, width: int) -> Tensor:
+    if images.shape[2:] == (height, width):
+        return images
+    return functional.interpolate(images, size=(height, width), mode="bilinear", align_corners=False)

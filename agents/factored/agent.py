@@ -1,13 +1,11 @@
-"""The agent ``factored``: sees codes, learns a structured model of them, plans in it, and goes where it is in doubt."""
+"""The agent ``factored``: sees codes, learns a structured model of them, plans in it, and explores what is unknown."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, ImaginedRollout, planned_actions
+from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -16,44 +14,42 @@ from .. import snapshot
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from ..meters import Meters
-from ..presets import flatten
-from .experience import CodeMemory, CodeTransition
-from .images import Imagined, one_hot, picture
-from .model import StructuredModel, as_codes
+from ..settings import flatten
+from .exploration import last_step, query
+from .factors import Code, CodeReplay, CodeTransition, Floats
+from .model import FactoredModel
+from .perception import CodePerception, ImaginedStep
 from .planner import Planner
-from .queries import last_step, question
-from .settings import ImagineSettings, resolve
+from .settings import HYPERPARAMETERS, FactoredSettings
 
-_SURE = 0.9
-"""A transition held less probable than this is a surprise, as is any that would still attract curiosity."""
+_EXPECTED = 0.9
+"""A transition held less probable than this is unexpected, as is any that would still be explored."""
 _TERMINAL = 0.5
 """Predicted probability above which an imagined episode ends."""
 _TIE = 1e-9
 
 
-class ImagineAgent:
-    """Learns from codes alone; every transition is replayed, and the model is a function of what is replayed.
+class FactoredAgent:
+    """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory.
 
     Args:
-        encoder: Frames to codes of parts.
+        encoder: Frames to codes of factors.
         n_actions: A.
         settings: All hyperparameters.
         seeds: This agent's node of the seed tree.
     """
 
-    def __init__(self, encoder: Encoder, n_actions: int, settings: ImagineSettings, seeds: SeedTree) -> None:
-        self.encoder, self.n_actions, self.settings = encoder, n_actions, settings
+    def __init__(self, encoder: Encoder, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
+        self.n_actions, self.settings = n_actions, settings
         self.rng = seeds.child("exploration").generator()
-        sizes = encoder.card.code_sizes
-        self.sizes = sizes if settings.dynamics.factored else (int(np.prod(sizes)),)
-        self.memory = CodeMemory(len(self.sizes))
+        self.perception = CodePerception(encoder, factored=settings.dynamics.factored)
+        self.replay = CodeReplay(len(self.perception.sizes))
         self.meters = Meters()
-        self._seen: tuple[bytes, tuple[int, ...]] | None = None
-        self._start_anew()
+        self._reset_model()
 
-    def _start_anew(self) -> None:
+    def _reset_model(self) -> None:
         """An empty model; the first ``learned`` of the replayed transitions are in it."""
-        self.model = StructuredModel(self.sizes, self.n_actions, self.settings)
+        self.model = FactoredModel(self.perception.sizes, self.n_actions, self.settings)
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
         self.tasks: list[int] = []
@@ -64,113 +60,88 @@ class ImagineAgent:
         """Whether anything is known of what this task rewards, so that there is something to plan for."""
         return self.model.outcomes.causes is not None
 
-    def code(self, frame: Frame) -> tuple[int, ...]:
-        """The code of a frame, one value a part; remembers the last one, which often is asked for twice."""
-        key = frame.tobytes()
-        if self._seen is None or self._seen[0] != key:
-            self._seen = (key, self.encoder.codes(frame))
-        return self._seen[1]
-
-    def _modelled(self, code: tuple[int, ...]) -> tuple[int, ...]:
-        """The code as the model takes it."""
-        if self.settings.dynamics.factored:
-            return code
-        return (int(np.ravel_multi_index(code, self.encoder.card.code_sizes)),)
-
-    def _observed(self, code: tuple[int, ...]) -> tuple[int, ...]:
-        """The inverse of :meth:`_modelled`."""
-        if self.settings.dynamics.factored:
-            return code
-        return tuple(int(value) for value in np.unravel_index(code[0], self.encoder.card.code_sizes))
+    def _values(self, code: Code) -> Floats:
+        return self.planner.values(code) if self._ready else np.zeros(self.n_actions)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """The action of the largest worth; exploring, that which leads to the most unknown as long as there is any."""
+        """The action of the largest value; exploring, that which leads to the most unknown as long as there is any."""
         if not self._ready:
             return int(self.rng.integers(self.n_actions)) if explore else 0
-        code = self._modelled(self.code(observation.frame))
+        code = self.perception.code(observation.frame)
         if not explore:
-            return int(self.planner.worth(code).argmax())
-        values = self._exploring(code)
+            return int(self._values(code).argmax())
+        values = self._exploring_values(code)
         return int(self.rng.choice(np.flatnonzero(values >= values.max() - _TIE)))
 
-    def _exploring(self, code: tuple[int, ...]) -> NDArray[np.float64]:
+    def _exploring_values(self, code: Code) -> Floats:
         planning = self.settings.planning
         if planning.exploration == "optimism":
-            return self.planner.optimistic(code)
+            return self.planner.values(code, "optimistic")
         if planning.exploration == "random":
-            random = self.rng.random() < planning.epsilon
-            return np.zeros(self.n_actions) if random else self.planner.worth(code)
-        novelty = self.planner.novelty(code)
-        curious = novelty.max() >= planning.boredom
-        self.meters.add("curiosity/share", float(curious))
-        self.meters.add("curiosity/novelty", float(novelty.max()))
-        return novelty if curious else self.planner.worth(code)
+            return np.zeros(self.n_actions) if self.rng.random() < planning.epsilon else self._values(code)
+        novelty = self.planner.values(code, "novelty")
+        curious = novelty.max() >= planning.exploration_threshold
+        self.meters.add("exploration/share", float(curious))
+        self.meters.add("exploration/novelty", float(novelty.max()))
+        return novelty if curious else self._values(code)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember the transition; if it was a surprise, learn from all since the last one, and forget all plans."""
+        """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
         with self.meters.cpu_time("time/model_s"):
             row = CodeTransition(
-                code=self._modelled(self.code(transition.observation.frame)),
+                code=self.perception.code(transition.observation.frame),
                 action=transition.action,
-                following=self._modelled(self.code(transition.next_observation.frame)),
+                following=self.perception.code(transition.next_observation.frame),
                 reward=transition.reward,
                 terminated=transition.terminated,
             )
-            chance, unknown = self.model.expected(row)
-            surprise = chance < _SURE or unknown > self.settings.planning.boredom
-            self.memory.add(row)
-            if surprise:
-                self._learn(len(self.memory))
-        self.meters.add("model/surprise", float(surprise))
+            probability, unknown = self.model.probability(row)
+            unexpected = probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold
+            self.replay.add(row)
+            if unexpected:
+                self.learn()
+        self.meters.add("model/unexpected", float(unexpected))
         self.meters.count("time/model_s")
 
-    def _learn(self, upto: int) -> None:
-        """Bring the model from the first ``learned`` transitions to the first ``upto``, and plan anew."""
-        for row in itertools.islice(self.memory.since(self.learned), upto - self.learned):
+    def learn(self, end: int | None = None) -> None:
+        """Bring the model from the first ``learned`` transitions to the first ``end``, or all, and plan anew."""
+        for row in self.replay.rows(self.learned, end):
             self.model.add(row)
         self.model.outcomes.fit()
-        self.planner.forget()
-        self.learned = upto
+        self.planner.clear()
+        self.learned = len(self.replay) if end is None else end
 
     def reset_for_new_task(self) -> None:
-        """Keep the dynamics, and of what was rewarded no more than hints; see :meth:`.outcomes.Outcomes.reset_for_new_task`."""
-        self._learn(len(self.memory))
+        """Keep the dynamics, and earlier causes as priors; see :meth:`.outcomes.OutcomeModel.reset_for_new_task`."""
+        self.learn()
         self._begin_task()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
 
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
-        self.model.reset_for_new_task()
-        self.planner.forget()
+        self.model.outcomes.reset_for_new_task()
+        self.planner.clear()
 
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
-        """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.questions`."""
-        planning = self.settings.planning
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
+        """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.exploration`."""
         with self.meters.cpu_time("time/model_s"):
-            return question(
-                self.model,
-                self._modelled(self.code(observation.frame)),
-                depth=planning.depth,
-                codes=planning.states,
-                least=planning.boredom,
-                without=self.memory.in_vain,
-            )
+            code = self.perception.code(observation.frame)
+            return query(self.model, code, self.settings.planning, without=self.replay.without_label)
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
-        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no answer."""
-        code, action, following = last_step(self.model, self._modelled(self.code(observation.frame)), actions)
-        reward, terminated = (0.0, False) if answer is None else (answer.reward, answer.terminated)
-        self.memory.add(
-            CodeTransition(code, action, following, reward, terminated, moves=False, pays=answer is not None)
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no label."""
+        code, action, following = last_step(self.model, self.perception.code(observation.frame), actions)
+        reward, terminated = (0.0, False) if label is None else (label.reward, label.terminated)
+        labelled = label is not None
+        self.replay.add(
+            CodeTransition(code, action, following, reward, terminated, has_dynamics=False, has_reward=labelled)
         )
         with self.meters.cpu_time("time/model_s"):
-            self._learn(len(self.memory))
+            self.learn()
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
-        """Worth of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
-        if not self._ready:
-            return np.zeros(self.n_actions, dtype=np.float32)
-        return self.planner.worth(self._modelled(self.code(observation.frame))).astype(np.float32)
+        """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
+        return self._values(self.perception.code(observation.frame)).astype(np.float32)
 
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
@@ -184,56 +155,47 @@ class ImagineAgent:
             InvalidValueError: No depth to imagine, or actions that are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
-        start = self.encoder.codes(frame)
-        steps: list[Imagined] = []
-        code = self._modelled(start)
+        start = code = self.perception.code(frame)
+        steps: list[ImaginedStep] = []
         for index in range(depth if planned is None else len(planned)):
             steps.append(self._imagined(code, None if planned is None else planned[index], rng))
             if planned is None and steps[-1].p_terminated > _TERMINAL:
                 break
-            code = self._modelled(steps[-1].code)
-        return picture(self.encoder, start, steps)
+            code = steps[-1].code
+        return self.perception.rollout(start, steps)
+
+    def _imagined(self, code: Code, action: int | None, rng: np.random.Generator) -> ImaginedStep:
+        """One imagined step of ``action``, or of the greedy one."""
+        values = self._values(code)
+        chosen = int(values.argmax()) if action is None else action
+        if not self._ready:
+            return ImaginedStep(
+                action=chosen, code=code, reward=0.0, p_terminated=0.0, values=values, unknown=1.0, p_other=0.0
+            )
+        following, p_likeliest = self.model.sample(code, chosen, rng)
+        return ImaginedStep(
+            action=chosen,
+            code=following,
+            reward=float(self.planner.reward(code)[chosen]),
+            p_terminated=float(self.planner.p_terminated(code)[chosen]),
+            values=values,
+            unknown=float(self.planner.unknown(code)[chosen]),
+            p_other=1.0 - p_likeliest,
+        )
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What it did, answers of a teacher not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""
-        rows = [row for row in self.memory.since(0) if row.moves]
-        codes = np.array([self._observed(row.code) for row in rows], dtype=np.int64)
-        sizes = self.encoder.card.code_sizes
-        macrostates = self.encoder.read_macrostate(one_hot(codes.reshape(-1, len(sizes)), sizes))
+        """What it did, labels of an oracle not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""
+        rows = [row for row in self.replay.rows() if row.has_dynamics]
+        macrostates = self.perception.macrostates([row.code for row in rows])
         return macrostates, np.array([row.action for row in rows], dtype=np.int64)
-
-    def _imagined(self, code: tuple[int, ...], action: int | None, rng: np.random.Generator) -> Imagined:
-        """One imagined step of ``action``, or of the greedy one."""
-        worth = self.planner.worth(code) if self._ready else np.zeros(self.n_actions)
-        chosen = int(worth.argmax()) if action is None else action
-        if not self._ready:
-            return Imagined(
-                action=chosen,
-                code=self._observed(code),
-                reward=0.0,
-                p_terminated=0.0,
-                values=worth,
-                unknown=1.0,
-                otherwise=0.0,
-            )
-        following, sure = self.model.sample(as_codes(code), chosen, rng)
-        return Imagined(
-            action=chosen,
-            code=self._observed(tuple(following.tolist())),
-            reward=float(self.planner.reward(code)[chosen]),
-            p_terminated=float(self.planner.terminates(code)[chosen]),
-            values=worth,
-            unknown=float(self.planner.unknown(code)[chosen]),
-            otherwise=1.0 - sure,
-        )
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         began = self.tasks[-1] if self.tasks else 0
         counters = {
-            "real_transitions": self.memory.real(since=began),
-            "teacher/answers": self.memory.told(since=began),
-            "model/outcomes": len(self.model.outcomes.kinds),
+            "real_transitions": self.replay.count_real(began),
+            "oracle/labels": self.replay.count_labels(began),
+            "model/outcomes": len(self.model.outcomes.outcomes),
         }
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
@@ -245,41 +207,41 @@ class ImagineAgent:
             "exploration": self.rng.bit_generator.state,
             "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
-            "code_sizes": list(self.sizes),
+            "code_sizes": list(self.perception.sizes),
             "n_actions": self.n_actions,
         }
-        return AgentState(arrays=snapshot.prefixed("memory", self.memory.arrays()), values=values)
+        return AgentState(arrays=snapshot.prefixed("replay", self.replay.arrays()), values=values)
 
     def restore(self, state: AgentState) -> None:
-        """Take up a snapshot by living through what is replayed once more.
+        """Take up a snapshot by learning from all that is replayed once more.
 
         Raises:
             ArtefactError: It does not fit this agent; nothing was changed.
         """
         snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
-        self.memory.load(snapshot.below("memory", state.arrays))
-        self._start_anew()
+        self.replay.load(snapshot.below("replay", state.arrays))
+        self._reset_model()
         for began in state.values["tasks"]:
-            self._learn(began)
+            self.learn(began)
             self._begin_task()
         if state.values["learned"] > self.learned:
-            self._learn(state.values["learned"])
+            self.learn(state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
 
 
-def make(context: AgentContext) -> ImagineAgent:
+def make(context: AgentContext) -> FactoredAgent:
     """The ``factored`` agent.
 
     Raises:
         InvalidValueError: The context's encoder gives no codes.
     """
-    settings = resolve(context.preset, context.overrides, context.settings)
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     prepare_torch(context.device)
     encoder = load_perception(context).encoder
     if not encoder.card.code_sizes:
         raise InvalidValueError(
-            f"Agent 'factored' reads codes of parts, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
-            "give one made with `imagine-bench encoder --recipe codes`."
+            f"Agent 'factored' reads codes of factors, and encoder {encoder.card.recipe.name!r} gives continuous "
+            "latents; give one made with `imagine-bench encoder --recipe codes`."
         )
-    return ImagineAgent(encoder, context.n_actions, settings, context.seeds)
+    return FactoredAgent(encoder, context.n_actions, settings, context.seeds)

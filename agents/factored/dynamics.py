@@ -1,9 +1,9 @@
-"""What an action does to each part of a code: a factored, categorical dynamics model with learned structure.
+"""What an action does to each factor of a code: a factored, categorical dynamics model with learned structure.
 
-Each part's next value depends on a few parts only (factored MDPs: Boutilier, Dearden & Goldszmidt 2000; Kearns &
-Koller 1999). Which ones is learned, a part and an action, by Bayesian averaging over sets of parents that hold the part
-itself, with Dirichlet tables whose evidence is closed (Cooper & Herskovits 1992; Heckerman et al. 1995), and over the
-hypothesis that the action leaves the part alone. Outcomes that vary are simply tables with several entries.
+Each factor's next value depends on a few factors only (factored MDPs: Boutilier, Dearden & Goldszmidt 2000; Kearns &
+Koller 1999). Which ones is learned, a factor and an action, by Bayesian averaging over sets of parents that hold the
+factor itself, with Dirichlet tables whose evidence is closed (Cooper & Herskovits 1992; Heckerman et al. 1995), and
+over the hypothesis that the action leaves the factor alone. Stochastic results are tables with several entries.
 """
 
 from __future__ import annotations
@@ -14,43 +14,43 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .factors import Codes, Floats, strides, table_size
 from .settings import DynamicsSettings
 
-Codes = NDArray[np.int64]
 _LARGEST_TABLE = 1 << 16
 """Parent sets whose table would have more rows are not considered."""
 
 
 @dataclass(frozen=True, slots=True)
-class PartPrediction:
-    """What each action would make of one part in N codes.
+class FactorPrediction:
+    """What each action would make of one factor in N codes.
 
     Attributes:
         expected: Predictive probability of each value. Shape (N, A, K).
-        seen: The same from what was observed alone: that the action leaves the part as it is, if it was ever tried, and
-            frequencies; zeros where nothing was. Shape (N, A, K).
+        seen: The same from observations alone: that the action leaves the factor as it is, if it was ever tried, and
+            frequencies; zeros where nothing was observed. Shape (N, A, K).
         unknown: Weight of the prior in ``expected``. Shape (N, A).
     """
 
-    expected: NDArray[np.float64]
-    seen: NDArray[np.float64]
-    unknown: NDArray[np.float64]
+    expected: Floats
+    seen: Floats
+    unknown: Floats
 
 
 class Table:
-    """A Dirichlet table: counts of a part's next values for every action and every setting of its parents.
+    """A Dirichlet table: counts of a factor's next values for every action and every setting of its parents.
 
     Args:
         parents: Indices of the parents.
-        sizes: Values of every part of the code.
+        sizes: Values of every factor.
         n_actions: A.
-        values: Values K of the part itself.
+        values: Values K of the factor itself.
     """
 
     def __init__(self, parents: tuple[int, ...], sizes: tuple[int, ...], n_actions: int, values: int) -> None:
         self.parents = list(parents)
         self.strides = strides(parents, sizes)
-        self.counts = np.zeros((n_actions, int(np.prod([sizes[part] for part in parents])), values))
+        self.counts = np.zeros((n_actions, table_size(parents, sizes), values))
 
     def row(self, codes: Codes) -> NDArray[np.int64]:
         """The row of each code (N, P). Shape (N,)."""
@@ -58,63 +58,53 @@ class Table:
         return rows
 
 
-def strides(parts: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.int64]:
-    """Multipliers that number the joint values of ``parts``, the last one fastest."""
-    return np.array([int(np.prod([sizes[part] for part in parts[i + 1 :]])) for i in range(len(parts))], dtype=np.int64)
-
-
-class PartDynamics:
-    """How one part changes.
+class FactorDynamics:
+    """How one factor changes.
 
     Args:
-        part: Its index.
-        sizes: Values of every part.
+        factor: Its index.
+        sizes: Values of every factor.
         n_actions: A.
         settings: Priors.
     """
 
-    def __init__(self, part: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
-        self.part, self.values, self.settings = part, sizes[part], settings
-        sets = [
-            parents
-            for parents in _parent_sets(part, len(sizes), settings.parents)
-            if _rows(parents, sizes) <= _LARGEST_TABLE
-        ]
-        self.tables = [Table(parents, sizes, n_actions, self.values) for parents in sets or [(part,)]]
-        fewer = [sum(len(table.parents) == len(other.parents) for other in self.tables) for table in self.tables]
+    def __init__(self, factor: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
+        self.factor, self.values, self.settings = factor, sizes[factor], settings
+        others = [other for other in range(len(sizes)) if other != factor]
+        sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
+        sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
+        self.tables = [Table(parents, sizes, n_actions, self.values) for parents in sets]
+        same_size = [sum(len(parents) == len(other) for other in sets) for parents in sets]
         prior = np.array(
-            [
-                settings.parent_factor ** (len(table.parents) - 1) / same
-                for table, same in zip(self.tables, fewer, strict=True)
-            ]
+            [settings.parent_decay ** (len(parents) - 1) / n for parents, n in zip(sets, same_size, strict=True)]
         )
         prior *= (1.0 - settings.persistence) / prior.sum()
         self.evidence = np.tile(np.log([settings.persistence, *prior]), (n_actions, 1))
-        """Log prior plus log evidence that the action leaves the part alone, then of each table. Shape (A, 1 + T)."""
+        """Log prior plus log evidence that the action leaves the factor alone, then of each table. Shape (A, 1 + T)."""
         self._tried = np.zeros(n_actions)
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
         slip, concentration = self.settings.slip, self.settings.concentration
-        stayed = value == code[self.part]
+        stayed = value == code[self.factor]
         self._tried[action] = 1.0
         self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / max(1, self.values - 1))
         for index, table in enumerate(self.tables):
             counts = table.counts[action, int(table.row(code[None])[0])]
-            chance = (counts[value] + concentration) / (counts.sum() + concentration * self.values)
-            self.evidence[action, 1 + index] += np.log(chance)
+            probability = (counts[value] + concentration) / (counts.sum() + concentration * self.values)
+            self.evidence[action, 1 + index] += np.log(probability)
             counts[value] += 1.0
 
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> Floats:
         """Posterior probability of each structure, an action. Shape (A, 1 + tables)."""
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
-        normalised: NDArray[np.float64] = weight / weight.sum(axis=1, keepdims=True)
+        normalised: Floats = weight / weight.sum(axis=1, keepdims=True)
         return normalised
 
-    def predict(self, codes: Codes) -> PartPrediction:
+    def predict(self, codes: Codes) -> FactorPrediction:
         """What every action would lead to in ``codes`` (N, P)."""
         weight, prior = self.weights(), self.settings.concentration
-        stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.part]][:, None, :]  # [N, A, K]
+        stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]  # [N, A, K]
         expected, seen, unknown = stay, stay * self._tried[:, None], np.zeros(stay.shape[:2])
         for index, table in enumerate(self.tables):
             counts = table.counts[:, table.row(codes)].transpose(1, 0, 2)  # [N, A, K]
@@ -123,35 +113,26 @@ class PartDynamics:
             expected = expected + own * (counts + prior) / known
             seen = seen + own * counts / np.maximum(total, 1.0)
             unknown += (own * prior * self.values / known)[..., 0]
-        return PartPrediction(expected, seen, unknown)
-
-
-def _parent_sets(part: int, parts: int, largest: int) -> list[tuple[int, ...]]:
-    others = [other for other in range(parts) if other != part]
-    return [(part, *more) for size in range(largest) for more in itertools.combinations(others, size)]
-
-
-def _rows(parents: tuple[int, ...], sizes: tuple[int, ...]) -> int:
-    return int(np.prod([sizes[part] for part in parents]))
+        return FactorPrediction(expected, seen, unknown)
 
 
 class Dynamics:
-    """How every part changes.
+    """How every factor changes.
 
     Args:
-        sizes: Values of each of the P parts.
+        sizes: Values of each of the P factors.
         n_actions: A.
         settings: Priors.
     """
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
-        self.parts = [PartDynamics(part, sizes, n_actions, settings) for part in range(len(sizes))]
+        self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in range(len(sizes))]
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
         """Learn from one transition between codes (P,)."""
-        for part, value in zip(self.parts, following.tolist(), strict=True):
-            part.add(code, action, value)
+        for factor, value in zip(self.factors, following.tolist(), strict=True):
+            factor.add(code, action, value)
 
-    def predict(self, codes: Codes) -> list[PartPrediction]:
-        """What every action would make of each part in ``codes`` (N, P)."""
-        return [part.predict(codes) for part in self.parts]
+    def predict(self, codes: Codes) -> list[FactorPrediction]:
+        """What every action would make of each factor in ``codes`` (N, P)."""
+        return [factor.predict(codes) for factor in self.factors]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from typing import TypeVar
 
 import numpy as np
@@ -11,24 +12,98 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.capabilities import Follow, ImaginedRollout, SampledFutures, planned_actions
-from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.interfaces import AgentContext, AgentState, Frame
+from imagine_bench.seeding import SeedTree
 
-from ..controller import Controller
-from ..encoders.perception import load_perception, prepare_torch
-from ..learner import Learner
+from .. import snapshot
+from ..dqn import DQN, Controller, epsilon
+from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
-from ..presets import settings_of
+from ..networks.precision import settle
 from .futures import sample_futures
 from .rollouts import TERMINAL, Imagination, Imagined
+from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
 
-_Kind = TypeVar("_Kind", bound="ImaginingLearner")
+_Kind = TypeVar("_Kind", bound="ImaginingAgent")
 
 
-class ImaginingLearner(Learner):
-    """A learner whose imagination can be looked at."""
+class ImaginingAgent(DQN):
+    """Algorithm 1: a DQN that also learns a world model, and from what that imagines.
 
-    imagination: Imagination
+    Args:
+        perception: Frames to posteriors of latents.
+        n_actions: A.
+        settings: All hyperparameters.
+        seeds: This agent's node of the seed tree.
+        device: Where networks and memories lie.
+        filtered: Whether transitions of too large an epistemic uncertainty are discarded.
+    """
+
+    settings: Settings
+
+    def __init__(
+        self,
+        perception: Perception,
+        n_actions: int,
+        settings: Settings,
+        seeds: SeedTree,
+        device: torch.device,
+        *,
+        filtered: bool,
+    ) -> None:
+        super().__init__(perception, n_actions, settings, seeds, device)
+        size, node = perception.latent_size, seeds.child("imagination")
+        self.imagination = Imagination(size, n_actions, settings, filtered=filtered, seeds=node, device=device)
+
+    def learn_more(self, z: Tensor, episode: int) -> None:
+        """N_E model updates; from ``start_episode`` on, imagine from ``z`` (Z,) and make N_I updates on that.
+
+        After the last episode that imagines, these updates are made on real transitions.
+        """
+        self.learn_model()
+        settings = self.settings.imagination
+        if episode >= settings.start_episode:
+            ended = settings.end_episode is not None and episode >= settings.end_episode
+            if not ended:
+                self._imagine(z)
+            self.learn_values(self.real if ended else self.imagination.memory, settings.updates_per_step)
+        self.meters.count("time/imagination_s")
+
+    def learn_model(self) -> None:
+        """N_E updates of the world model on real transitions."""
+        with self.meters.cpu_time("time/model_s"):
+            for losses in self.imagination.learn(self.real):
+                for name, value in asdict(losses).items():
+                    self.meters.add(f"loss/{name}", value)
+        self.meters.count("time/model_s")
+
+    def _imagine(self, z: Tensor) -> None:
+        chance = epsilon(self.steps, self.settings.controller)
+        with self.meters.cpu_time("time/imagination_s"):
+            counts = self.imagination.rollouts(self.controller, z, self.real, chance)
+        self.meters.add("imagination/acceptance_rate", counts.accepted, counts.predicted)
+        self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
+
+    def diagnostics(self) -> dict[str, float]:
+        """As of the DQN, with how many transitions were imagined so far."""
+        return {**super().diagnostics(), "imagined_transitions": float(self.imagination.memory.added)}
+
+    def state(self) -> AgentState:
+        """A snapshot, world model and imagined memory included."""
+        base, own = super().state(), self.imagination
+        arrays = {**base.arrays, **snapshot.prefixed("imagination", own.arrays())}
+        values = {**base.values, "filtered": own.filtered, "imagined_added": own.memory.added}
+        return AgentState(arrays=arrays, values=values)
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot.
+
+        Raises:
+            ArtefactError: It does not fit this agent; nothing was changed.
+        """
+        super().restore(state)
+        self.imagination.load(snapshot.below("imagination", state.arrays), state.values["imagined_added"])
 
     def reset_for_new_task(self) -> None:
         """Keep the network of the dynamics; see :class:`imagine_bench.capabilities.TransferLearner`.
@@ -53,7 +128,7 @@ class ImaginingLearner(Learner):
         planned = planned_actions(actions, depth, self.n_actions)
         start, _ = self.perception.posterior(frame)
         steps = list(self._unroll(start.unsqueeze(0), planned, depth, rng))
-        return self._picture(start.unsqueeze(0), steps)
+        return self._rollout(start.unsqueeze(0), steps)
 
     def sample_futures(
         self,
@@ -98,16 +173,16 @@ class ImaginingLearner(Learner):
                 return
             z = step.next_z
 
-    def _picture(self, start: Tensor, steps: list[tuple[Tensor, Tensor, Imagined]]) -> ImaginedRollout:
+    def _rollout(self, start: Tensor, steps: list[tuple[Tensor, Tensor, Imagined]]) -> ImaginedRollout:
         values, actions, imagined = zip(*steps, strict=True)
         encoder, imagination = self.perception.encoder, self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
         kept = torch.cat([imagination.keeps(step) for step in imagined]).cpu().numpy()  # [D]
 
-        doubts = [decompose(step.samples) for step in imagined]
+        parts = [decompose(step.samples) for step in imagined]
 
         def reduced(cause: str) -> NDArray[np.float32]:
-            return torch.cat([imagination.score(getattr(doubt, cause)) for doubt in doubts]).cpu().numpy()
+            return torch.cat([imagination.score(getattr(part, cause)) for part in parts]).cpu().numpy()
 
         return ImaginedRollout(
             actions=torch.cat(actions).cpu().numpy(),
@@ -125,25 +200,19 @@ class ImaginingLearner(Learner):
 
 
 def build(kind: type[_Kind], context: AgentContext, *, filtered: bool) -> _Kind:
-    """An imagining learner of a kind, with or without the filter."""
-    settings = settings_of(context)
+    """An imagining agent of a kind, with or without the filter; the precision is that of its device."""
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    precision = settle(settings.model.precision, context.device)
+    settings = replace(settings, model=replace(settings.model, precision=precision))
     device, perception = prepare_torch(context.device), load_perception(context)
-    imagination = Imagination(
-        perception.latent_size,
-        context.n_actions,
-        settings,
-        filtered=filtered,
-        seeds=context.seeds.child("imagination"),
-        device=device,
-    )
-    return kind(perception, context.n_actions, settings, context.seeds, device, imagination)
+    return kind(perception, context.n_actions, settings, context.seeds, device, filtered=filtered)
 
 
-def make(context: AgentContext) -> ImaginingLearner:
+def make(context: AgentContext) -> ImaginingAgent:
     """The ``imagination`` agent: algorithm 1 without the filter."""
-    return build(ImaginingLearner, context, filtered=False)
+    return build(ImaginingAgent, context, filtered=False)
 
 
-def make_uncertainty(context: AgentContext) -> ImaginingLearner:
+def make_uncertainty(context: AgentContext) -> ImaginingAgent:
     """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
-    return build(ImaginingLearner, context, filtered=True)
+    return build(ImaginingAgent, context, filtered=True)

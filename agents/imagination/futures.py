@@ -72,8 +72,8 @@ def _predict(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""
     model, settings = imagination.model, imagination.settings
-    drawn = model.members * (1 if weights.dynamics is None else settings.weight_samples)
-    size = max(1, _PREDICTIONS // drawn)
+    samples = model.members * (1 if weights.dynamics is None else settings.weight_samples)
+    size = max(1, _PREDICTIONS // samples)
     parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)
     steps = [imagination.step(*part, weights, generator) for part in parts]
     next_z, reward, p_terminated = (

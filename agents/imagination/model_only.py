@@ -1,28 +1,128 @@
-"""Chapter 3's second controller: the world model is learned on the side, and who is tested has never met the world.
+"""Chapter 3's second controller: trained in the world model alone, as if that were the world (thesis 3.2.2).
 
-A first controller explores the world like a DQN and is not tested. Before each test a fresh one is trained in the
-learned model alone, for ``imagination.rehearsal_episodes`` episodes however many real ones there were.
+A first controller explores the world like a DQN and is not tested. Before each test a new one is trained in the
+learned model, for ``imagination.model_only_episodes`` episodes however many real ones there were. Imagined episodes
+begin where real ones did and go on, one macro-action and one update at a time, until the model says that they end; no
+real transition is ever learned from.
 """
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from imagine_bench.interfaces import AgentContext, AgentState, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
-from ..controller import Controller
+from ..dqn import Controller, epsilon
 from ..encoders.perception import Perception
-from ..replay import StartMemory
-from ..settings import Settings
-from .agent import ImaginingLearner, build
-from .rehearsal import Rehearsal
-from .rollouts import Imagination
+from ..meters import Meters
+from ..replay import Batch, ImaginedMemory, RealMemory, StartMemory
+from .agent import ImaginingAgent, build
+from .rollouts import TERMINAL, Imagination
+from .settings import Settings
+
+_STARTS = 1_000
+"""Starts of real episodes that are kept."""
 
 
-class ImaginationOnly(ImaginingLearner):
-    """Explores with one controller, rehearses with another, and is tested with that one.
+class ModelOnlyTraining:
+    """Trains a new controller in a world model, an imagined episode at a time.
+
+    Every training draws from generators of its own, named by the real step that it begins at, so it is the same whether
+    earlier ones took place or not.
+
+    Args:
+        imagination: The world model that stands for the world, and its filter; only a threshold that moves is changed.
+        n_actions: A.
+        settings: All hyperparameters of the agent.
+        seeds: This training's node of the seed tree.
+        device: Where networks and memory lie.
+    """
+
+    def __init__(
+        self, imagination: Imagination, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device
+    ) -> None:
+        self.imagination, self._n_actions, self.settings = imagination, n_actions, settings
+        self._seeds, self._device = seeds, device
+        self.begin(0)
+
+    def begin(self, real_step: int) -> None:
+        """Forget everything and start with a new controller, for what was learned up to ``real_step``."""
+        seeds, device, size = self._seeds.child(real_step), self._device, self.imagination.model.latent_size
+        self.real_step, self.episodes, self.steps = real_step, 0, 0
+        self._generator = torch.Generator(device).manual_seed(seeds.child("episodes").integer())
+        weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
+        self.controller = Controller(size, self._n_actions, self.settings.controller, weights)
+        self._memory = ImaginedMemory(self.settings.memory.imagined, size, device)
+
+    def episode(self, starts: StartMemory, real: RealMemory, meters: Meters) -> None:
+        """Imagine one episode from a replayed start, learning at every step of it.
+
+        The filter, where there is one, ends it before the first transition that it discards.
+
+        Args:
+            starts: Where real episodes began.
+            real: Read by a moving threshold only, not learned from.
+            meters: Told the losses, and how much was kept.
+
+        Raises:
+            DivergedError: The controller's loss is no longer finite.
+        """
+        imagination, settings, generator = self.imagination, self.settings.imagination, self._generator
+        weights = imagination.draw_weights(generator)
+        imagination.move_threshold(real, weights, generator)
+        z, predicted, kept = starts.sample(1, generator), 0, 0
+        while kept < settings.depth:
+            chance = max(epsilon(self.steps, self.settings.controller), settings.exploration)
+            action = imagination.act(self.controller, z, chance, generator)
+            step = imagination.step(z, action, weights, generator)
+            predicted += 1
+            if not bool(imagination.keeps(step)):
+                break
+            terminated = step.p_terminated > TERMINAL
+            self._memory.add(Batch(z, action, step.reward, step.next_z, terminated.float()))
+            self._learn(meters)
+            kept, z = kept + 1, step.next_z
+            if bool(terminated):
+                break
+        meters.add("imagination/acceptance_rate", kept, predicted)
+        meters.add("imagination/mean_depth", kept)
+        self.episodes += 1
+
+    def _learn(self, meters: Meters) -> None:
+        for _ in range(self.settings.controller.updates_per_step):
+            batch = self._memory.sample(self.settings.controller.batch_size, self._generator)
+            meters.add("loss/bellman_imagined", self.controller.update(batch))
+        self.steps += 1
+
+    def values(self) -> dict[str, int]:
+        """Counters, JSON-serialisable."""
+        counters = {"real_step": self.real_step, "episodes": self.episodes, "steps": self.steps}
+        return {**counters, "imagined": self._memory.added}
+
+    def arrays(self) -> snapshot.Arrays:
+        """Copies of weights, moments, target network, memory and generator."""
+        controller = snapshot.training_arrays(self.controller, self.controller.optimiser)
+        return {
+            **snapshot.prefixed("controller", controller),
+            **snapshot.prefixed("memory", self._memory.arrays()),
+            "generator": snapshot.generator_array(self._generator),
+        }
+
+    def load(self, arrays: snapshot.Arrays, values: dict[str, int]) -> None:
+        """Take up the results of :meth:`arrays` and :meth:`values`."""
+        self.begin(values["real_step"])
+        self.episodes, self.steps = values["episodes"], values["steps"]
+        controller = self.controller
+        snapshot.load_training(controller, controller.optimiser, snapshot.below("controller", arrays))
+        self._memory.load(snapshot.below("memory", arrays), values["imagined"])
+        snapshot.load_generator(self._generator, arrays["generator"])
+
+
+class ModelOnlyAgent(ImaginingAgent):
+    """Explores with one controller, and is tested with another that was trained in the world model alone.
 
     Args:
         perception: Frames to posteriors of latents.
@@ -30,7 +130,7 @@ class ImaginationOnly(ImaginingLearner):
         settings: All hyperparameters.
         seeds: This agent's node of the seed tree.
         device: Where networks and memories lie.
-        imagination: The world model that is rehearsed in, and its filter.
+        filtered: Whether imagined episodes end where the epistemic uncertainty is too large.
     """
 
     def __init__(
@@ -40,20 +140,19 @@ class ImaginationOnly(ImaginingLearner):
         settings: Settings,
         seeds: SeedTree,
         device: torch.device,
-        imagination: Imagination,
+        *,
+        filtered: bool,
     ) -> None:
-        super().__init__(perception, n_actions, settings, seeds, device, imagination)
-        self.rehearsal = Rehearsal(imagination, n_actions, settings, seeds.child("rehearsal"), device)
-        self._starts = StartMemory(settings.memory.starts, perception.latent_size, device)
+        super().__init__(perception, n_actions, settings, seeds, device, filtered=filtered)
+        node = seeds.child("model_only")
+        self.training = ModelOnlyTraining(self.imagination, n_actions, settings, node, device)
+        self._starts = StartMemory(_STARTS, perception.latent_size, device)
         self._episode = -1
 
     @property
     def tested(self) -> Controller:
-        """The controller that was trained in imagination alone."""
-        return self.rehearsal.controller
-
-    def _practises_in(self, episode: int) -> bool:
-        return False
+        """The controller that was trained in the model alone."""
+        return self.training.controller
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember where episodes begin, and learn as the DQN and its world model do.
@@ -65,45 +164,47 @@ class ImaginationOnly(ImaginingLearner):
             self._starts.add(self.perception.posterior(transition.observation.frame))
             self._episode = episode
         super().observe(transition, episode=episode)
-        self.meters.count("time/rehearsal_s")
+
+    def learn_more(self, z: Tensor, episode: int) -> None:
+        """N_E model updates; what is imagined is left to :meth:`train_in_model`."""
+        self.learn_model()
+        self.meters.count("time/model_only_s")
 
     def reset_for_new_task(self) -> None:
-        """As every imagining learner; starts and rehearsal begin anew too."""
+        """As every imagining agent; starts and training begin anew too."""
         super().reset_for_new_task()
         self._starts.clear()
         self._episode = -1
-        self.rehearsal.begin(0)
+        self.training.begin(0)
 
     def train_in_model(self) -> bool:
-        """One imagined episode; see :class:`imagine_bench.capabilities.ModelOnlyTrainer`. Real steps call for a new rehearsal.
+        """Imagine one episode and learn from it, if any is left; real steps make training begin anew.
 
         Raises:
             DivergedError: The controller's loss is no longer finite.
         """
         if self.steps == 0:
             return False  # nothing was learned and no start was seen
-        if self.rehearsal.real_step != self.steps:
-            self.rehearsal.begin(self.steps)
-        if self.rehearsal.episodes >= self.settings.imagination.rehearsal_episodes:
+        if self.training.real_step != self.steps:
+            self.training.begin(self.steps)
+        if self.training.episodes >= self.settings.imagination.model_only_episodes:
             return False
-        with self.meters.cpu_time("time/rehearsal_s"):
-            self.rehearsal.episode(self._starts, self.real, self.meters)
+        with self.meters.cpu_time("time/model_only_s"):
+            self.training.episode(self._starts, self.real, self.meters)
         return True
 
     def diagnostics(self) -> dict[str, float]:
-        """As every learner, where what is imagined is rehearsed; ``time/rehearsal_s`` too is spread over real steps."""
-        base = super().diagnostics()
-        base.pop("time/imagination_s", None)  # rehearsals are all that it imagines
-        return {**base, "imagined_transitions": float(self.rehearsal.steps)}
+        """As every imagining agent; ``time/model_only_s`` too is spread over real steps."""
+        return {**super().diagnostics(), "imagined_transitions": float(self.training.steps)}
 
     def state(self) -> AgentState:
-        """A snapshot, rehearsal and starts included."""
+        """A snapshot, model-only training and starts included."""
         base = super().state()
         arrays = {
-            **snapshot.prefixed("rehearsal", self.rehearsal.arrays()),
+            **snapshot.prefixed("model_only", self.training.arrays()),
             **snapshot.prefixed("starts", self._starts.arrays()),
         }
-        values = {"rehearsal": self.rehearsal.values(), "starts_added": self._starts.added, "episode": self._episode}
+        values = {"model_only": self.training.values(), "starts_added": self._starts.added, "episode": self._episode}
         return AgentState(arrays={**base.arrays, **arrays}, values={**base.values, **values})
 
     def restore(self, state: AgentState) -> None:
@@ -113,16 +214,16 @@ class ImaginationOnly(ImaginingLearner):
             ArtefactError: It does not fit this agent; nothing was changed.
         """
         super().restore(state)
-        self.rehearsal.load(snapshot.below("rehearsal", state.arrays), state.values["rehearsal"])
+        self.training.load(snapshot.below("model_only", state.arrays), state.values["model_only"])
         self._starts.load(snapshot.below("starts", state.arrays), state.values["starts_added"])
         self._episode = state.values["episode"]
 
 
-def make(context: AgentContext) -> ImaginationOnly:
+def make(context: AgentContext) -> ModelOnlyAgent:
     """The ``imagination_only`` agent."""
-    return build(ImaginationOnly, context, filtered=False)
+    return build(ModelOnlyAgent, context, filtered=False)
 
 
-def make_uncertainty(context: AgentContext) -> ImaginationOnly:
-    """The ``imagination_only_uncertainty`` agent: imagined episodes end where the model is unsure."""
-    return build(ImaginationOnly, context, filtered=True)
+def make_uncertainty(context: AgentContext) -> ModelOnlyAgent:
+    """The ``imagination_only_uncertainty`` agent: imagined episodes end where the model is uncertain."""
+    return build(ModelOnlyAgent, context, filtered=True)

@@ -2,8 +2,8 @@
 
 From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
 dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
-Dynamics may be sure of a place where nobody has been and no reward was ever seen, so the filter can also read how much
-T weight samples of the reward network disagree there.
+Dynamics may be certain of a place where no reward was ever seen, so the filter can also read how much T weight samples
+of the reward network disagree there.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
-from ..controller import Controller
-from ..networks.mlp import Masks, dropout_bits
+from ..dqn import Controller
+from ..networks.mlp import Masks
 from ..replay import Batch, ImaginedMemory, RealMemory
-from ..settings import Settings
 from . import mixture as mdn
 from .mixture import Mixture
+from .settings import Settings
 from .uncertainty import decompose, reduction
 from .world_model import ModelLosses, WorldModel
 
@@ -103,7 +103,7 @@ class Imagination:
         seeds: SeedTree,
         device: torch.device,
     ) -> None:
-        samples = settings.imagination.weight_samples if dropout_bits(settings.model.dropout) else 1
+        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
         if filtered and samples * settings.model.members == 1:
             raise InvalidValueError(
                 "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
@@ -163,16 +163,16 @@ class Imagination:
         _require_numbers(predicted.log_weights)
         next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-_BEYOND, _BEYOND)
         _require_numbers(next_z)
-        reward, p_terminated = model.assess(z, action, next_z)
-        doubt = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
-        return Imagined(next_z, reward, p_terminated, samples, doubt)
+        reward, p_terminated = model.predict_outcome(z, action, next_z)
+        reward_std = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
+        return Imagined(next_z, reward, p_terminated, samples, reward_std)
 
     def likeliest(self, z: Tensor, action: Tensor, weights: Weights) -> Tensor:
-        """What :meth:`step` would draw least surprisingly: the mean of the likeliest component. Shape (N, Z)."""
+        """The mean of the likeliest component of what :meth:`step` samples from. Shape (N, Z)."""
         return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
 
     def score(self, variances: Tensor) -> Tensor:
-        """Reduce variances (..., Z) as the filter does; one that overflowed is doubt without bound. Shape (...)."""
+        """Reduce variances (..., Z) as the filter does; one that overflowed is infinite. Shape (...)."""
         return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def keeps(self, step: Imagined) -> Tensor:
@@ -227,12 +227,12 @@ class Imagination:
         return real.sample(self.settings.breadth, self._generators["replay"]).z
 
     def move_threshold(self, real: RealMemory, weights: Weights, generator: torch.Generator) -> None:
-        """Let the threshold follow the model's doubt about what really happened, where the settings want that."""
+        """Where the settings want it, set the threshold to a quantile of the uncertainty about real transitions."""
         quantile = self.settings.threshold_quantile
         if self.filtered and quantile is not None:
             known = real.sample(_CALIBRATION, generator)
-            doubts = self.score(decompose(self.model.predict(known.z, known.action, weights.dynamics)).epistemic)
-            self.threshold = float(doubts.quantile(quantile))
+            epistemic = self.score(decompose(self.model.predict(known.z, known.action, weights.dynamics)).epistemic)
+            self.threshold = float(epistemic.quantile(quantile))
 
     @staticmethod
     def act(controller: Controller, z: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
@@ -247,7 +247,7 @@ class Imagination:
         """Copies of weights, moments, memory and generators."""
         generators = {name: snapshot.generator_array(generator) for name, generator in self._generators.items()}
         return {
-            **snapshot.prefixed("model", self.model.optimiser.arrays()),
+            **snapshot.prefixed("model", snapshot.training_arrays(self.model, self.model.optimiser)),
             **snapshot.prefixed("memory", self.memory.arrays()),
             **snapshot.prefixed("generator", generators),
             "threshold": np.array(self.threshold),
@@ -255,7 +255,7 @@ class Imagination:
 
     def load(self, arrays: snapshot.Arrays, added: int) -> None:
         """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
-        self.model.optimiser.load(snapshot.below("model", arrays))
+        snapshot.load_training(self.model, self.model.optimiser, snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)
         self.threshold = float(arrays["threshold"])
         for name, generator in self._generators.items():

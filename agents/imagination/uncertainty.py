@@ -50,7 +50,7 @@ def component_variance(samples: Mixture, members: int = 1) -> Tensor:
 
     The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
     :func:`decompose` it does not count that there are other components, which says nothing about a value that was
-    drawn from this one.
+    sampled from this one.
 
     Args:
         samples: Mixtures whose first axis is the weight sample, member by member, (E T, ..., K, Z).
@@ -64,14 +64,14 @@ def component_variance(samples: Mixture, members: int = 1) -> Tensor:
     return torch.cat((noise + means.var(dim=1, correction=0)).unbind(0), dim=-2)
 
 
-def drawn_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
-    """:func:`component_variance` of the components that drawn values came from, summed over dimensions.
+def sampled_component_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
+    """:func:`component_variance` of the components that sampled values came from, summed over dimensions.
 
     Each component counts by its posterior probability of having been the one.
 
     Args:
         samples: As in :func:`component_variance`.
-        predictive: Their average, which the values were drawn from.
+        predictive: Their average, which the values were sampled from.
         values: Shape (..., Z).
         members: As in :func:`component_variance`.
 
@@ -84,8 +84,8 @@ def drawn_variance(samples: Mixture, predictive: Mixture, values: Tensor, member
     return (log_joint.softmax(dim=-1) * own).sum(dim=-1)
 
 
-def surprise(samples: Mixture, values: Tensor) -> Tensor:
-    """Negative log density of drawn values under all weight samples together, in nats: (..., Z) to (...)."""
+def nll(samples: Mixture, values: Tensor) -> Tensor:
+    """Negative log-likelihood of sampled values under all weight samples together, in nats: (..., Z) to (...)."""
     log_p = mdn.log_likelihood(samples, values.unsqueeze(0))  # [T, ...]
     return math.log(len(log_p)) - torch.logsumexp(log_p, dim=0)
 

@@ -1,32 +1,29 @@
-"""The environment model: a mixture density network for the dynamics, and what the next state means (thesis 5.2.2).
+"""The environment model: where a macro-action leads, what that earns and whether the episode ends (thesis 5.2.2).
 
-``p(z' | z, a)`` says where a macro-action leads; :mod:`.assessment` what it earns and whether the episode ends there.
-Networks share no weights (but reward and termination, where they have one trunk); one backward pass through the sum of
-the losses trains them all. The dynamics may be an ensemble of E networks, which a leading member axis trains as one.
+A mixture density network gives ``p(z' | z, a)``; reward and termination networks read the next state. Networks share no
+weights (but reward and termination, where they have one trunk); one backward pass through the sum of the losses trains
+them all. The dynamics may be an ensemble of E networks, which a leading member axis trains as one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.bench.cohort import answer_each, together
 from imagine_bench.errors import DivergedError
 
-from ..networks import joint
-from ..networks.flat_adam import FlatAdam
-from ..networks.mlp import Masks, MemberMLP, Parameters, by_network, clip_unit_norms
+from ..networks.mlp import Masks, MemberMLP, clip_unit_norms
 from ..networks.precision import hidden_dtype
+from ..networks.weight_samples import sample_outputs
 from ..replay import Batch
-from ..settings import WorldModelSettings
 from . import mixture as mdn
 from .mixture import Mixture
-from .reward_termination import RewardTerminationHead
+from .settings import WorldModelSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,23 +41,49 @@ def log_cosh(x: Tensor) -> Tensor:
     return size + functional.softplus(-2.0 * size) - math.log(2.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Update:
-    """A model, the batch that it learns from now, and what draws its dropout masks."""
+class RewardTerminationHead(nn.Module):
+    """Reward and termination networks, or one network with both outputs.
 
-    model: WorldModel
-    batch: Batch
-    dropout: torch.Generator
+    The thesis reads both from the next state alone, ``r(z')`` and ``d(z')``. Where a right and a wrong macro-action
+    lead to frames that are alike, that cannot tell the two apart; reading the whole transition can.
 
+    Args:
+        latent_size: Z.
+        n_actions: A.
+        settings: Sizes, and what is read.
+        generator: Draws the initial weights; its device is the networks'.
+    """
 
-def update_together(updates: Sequence[Update]) -> list[ModelLosses | Exception]:
-    """Update models of one shape by one joint gradient; see :meth:`WorldModel.update`."""
-    models = [update.model for update in updates]
-    terms, gradients = joint.gradients(
-        [model.optimiser for model in models], lambda parameters: models[0].losses(updates, parameters)
-    )
-    losses = [ModelLosses(*values) for values in terms.T.tolist()]
-    return answer_each(WorldModel.descend, list(zip(models, losses, gradients, strict=True)))
+    def __init__(
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self._reads_transition = settings.head_input == "transition"
+        n_in = 2 * latent_size + n_actions if self._reads_transition else latent_size
+        outputs = [(settings.reward_hidden, 1), (settings.termination_hidden, 1)]
+        if settings.shared_hidden:
+            outputs = [(settings.shared_hidden, 2)]
+        self.networks = nn.ModuleList(_member_mlp((n_in, *hidden, n), 1, settings, generator) for hidden, n in outputs)
+        self._one_hot = torch.eye(n_actions, device=generator.device)
+
+    @property
+    def reward_network(self) -> MemberMLP:
+        """The network whose first output is the reward."""
+        return self.networks[0]  # type: ignore[return-value]
+
+    def inputs(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """What the networks read of N transitions. Shape (N, in)."""
+        return torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._reads_transition else next_z
+
+    def forward(
+        self, z: Tensor, action: Tensor, next_z: Tensor, masks: Sequence[Masks | None] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Rewards and termination logits of N transitions, two of shape (N,); without ``masks`` deterministic."""
+        read = self.inputs(z, action, next_z).unsqueeze(0)  # [1, N, in]
+        drawn = [None] * len(self.networks) if masks is None else masks
+        outputs = [network(read, mask)[0] for network, mask in zip(self.networks, drawn, strict=True)]
+        reward, logit = torch.cat(outputs, dim=-1).unbind(dim=-1)  # [N, 2] to [N] and [N]
+        return reward, logit
 
 
 class WorldModel(nn.Module):
@@ -79,63 +102,22 @@ class WorldModel(nn.Module):
         super().__init__()
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
         self.members = settings.members
-        outputs = mdn.output_size(settings.components, latent_size)
-        sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
-        self.dynamics = MemberMLP(
-            sizes,
-            members=self.members,
-            dropout=settings.dropout,
-            generator=generator,
-            hidden_dtype=hidden_dtype(settings.precision, generator.device.type),
-        )
-        self.assessment = RewardTerminationHead(latent_size, n_actions, settings, generator)
-        self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.assessment.networks)
-        self.optimiser = FlatAdam(
-            self.networks, learning_rate=settings.learning_rate, gradient_clip=settings.gradient_clip
-        )
+        sizes = (latent_size + n_actions, *settings.dynamics_hidden, mdn.output_size(settings.components, latent_size))
+        self.dynamics = _member_mlp(sizes, self.members, settings, generator)
+        self.head = RewardTerminationHead(latent_size, n_actions, settings, generator)
+        self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.head.networks)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
-    def _mixture(
-        self, z: Tensor, action: Tensor, masks: Iterable[Tensor] | None, parameters: Parameters | None = None
-    ) -> Mixture:
-        """``p(z' | z, a)`` of every row (S, N) by every member of the seed's ensemble, with leading axes (S E, N)."""
-        settings = self.settings
-        inputs = self._to_members(torch.cat([z, self._one_hot[action]], dim=-1))  # [S E, N, Z + A]
-        outputs = self.dynamics(inputs, masks, parameters)  # [S E, N, K (1 + 2 Z)]
-        mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
-        if not settings.predict_change:
-            return mixture
-        return replace(mixture, means=mixture.means + self._to_members(z).unsqueeze(-2))
-
-    def _to_members(self, rows: Tensor) -> Tensor:
-        """Rows of S seeds (S, N, ...) for each of their E members. Shape (S E, N, ...)."""
-        return rows.unsqueeze(1).expand(-1, self.members, *rows.shape[1:]).flatten(0, 1)
-
-    def losses(self, updates: Sequence[Update], parameters: Parameters) -> Tensor:
-        """Mean losses of dynamics (summed over members), reward and termination, under fresh dropout masks.
-
-        Args:
-            updates: Those of S models of this shape.
-            parameters: Theirs, one network after the other, with a leading axis of S E.
-
-        Returns:
-            Shape (3, S).
-        """
-        rows, seeds = len(updates[0].batch.action), len(updates)
-        batch = joint.batches([update.batch for update in updates])
-        draws = [update.dropout for update in updates]
-        dynamics, *assessment = [joint.masks(network, rows, draws) for network in self.networks]
-        own, *others = by_network(self.networks, parameters)
-        mixture = self._mixture(batch.z, batch.action, dynamics, own)
-        read = batch.z, batch.action, batch.next_z
-        reward, logit = self.assessment(*read, assessment, others)
-        likelihood = mdn.log_likelihood(mixture, self._to_members(batch.next_z)).mean(dim=1)  # [S E]
-        return torch.stack(
-            [
-                -likelihood.view(seeds, -1).sum(dim=1),  # no member's loss reads another; a clip does
-                log_cosh(reward - batch.reward / self.settings.reward_scale).mean(dim=1),
-                functional.binary_cross_entropy_with_logits(logit, batch.terminated, reduction="none").mean(dim=1),
-            ]
+    def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean losses of dynamics (summed over members), reward and termination, under new dropout masks."""
+        masks, *head_masks = [network.draw_masks(len(batch.action), dropout) for network in self.networks]
+        likelihood = mdn.log_likelihood(self._mixture(batch.z, batch.action, masks), batch.next_z)  # [E, B]
+        reward, logit = self.head(batch.z, batch.action, batch.next_z, head_masks)
+        return (
+            -likelihood.mean(dim=1).sum(),  # no member's loss reads another
+            log_cosh(reward - batch.reward / self.settings.reward_scale).mean(),
+            functional.binary_cross_entropy_with_logits(logit, batch.terminated),
         )
 
     def update(self, batch: Batch, dropout: torch.Generator) -> ModelLosses:
@@ -144,25 +126,38 @@ class WorldModel(nn.Module):
         Raises:
             DivergedError: A loss is NaN or infinite; the weights are left as they were.
         """
-        kind = (self.settings, self.latent_size, self.n_actions)
-        return together(update_together, Update(self, batch, dropout), kind=kind)
-
-    def descend(self, losses: ModelLosses, gradient: Tensor) -> ModelLosses:
-        """What follows from the gradient (P,) of losses: Adam and the max-norm constraint. Raises as :meth:`update`."""
-        if not all(map(math.isfinite, (losses.dynamics, losses.reward, losses.termination))):
+        terms = torch.stack(self.losses(batch, dropout))
+        losses = ModelLosses(*terms.tolist())
+        if not all(map(math.isfinite, astuple(losses))):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
-        self.optimiser.descend(gradient)
-        if self.settings.max_norm is not None:
-            clip_unit_norms(self.networks, self.settings.max_norm)
+        self.optimiser.zero_grad()
+        terms.sum().backward()
+        for network in self.networks:
+            if self.settings.gradient_clip is not None:
+                nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
+        self.optimiser.step()
+        for network in self.networks:
+            if self.settings.max_norm is not None:
+                clip_unit_norms(network, self.settings.max_norm)
         return losses
 
+    def _mixture(self, z: Tensor, action: Tensor, masks: Sequence[Tensor] | None) -> Mixture:
+        """``p(z' | z, a)`` of N rows by every member, with leading axes (E, N)."""
+        settings = self.settings
+        inputs = torch.cat([z, self._one_hot[action]], dim=-1).expand(self.members, -1, -1)  # [E, N, Z + A]
+        outputs = self.dynamics(inputs, masks)  # [E, N, K (1 + 2 Z)]
+        mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
+        return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
+
+    @torch.no_grad()
     def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
         """Draw T weight samples of each member: masks (E, T, H) that every state of a prediction shares."""
         return self.dynamics.draw_masks(count, dropout)
 
+    @torch.no_grad()
     def draw_reward_weights(self, count: int, dropout: torch.Generator) -> Masks | None:
         """Draw T weight samples of the reward network: masks (1, T, H)."""
-        return self.assessment.reward_network.draw_masks(count, dropout)
+        return self.head.reward_network.draw_masks(count, dropout)
 
     @torch.no_grad()
     def predict(self, z: Tensor, action: Tensor, weights: Masks | None) -> Mixture:
@@ -176,17 +171,18 @@ class WorldModel(nn.Module):
         Returns:
             Mixtures with leading axes (E T, N).
         """
-        rows = len(z)
-        samples = 1 if weights is None else weights[0].shape[1]
-        masks = None if weights is None else tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
-        mixture = self._mixture(z.repeat(1, samples, 1), action.repeat(1, samples), masks)  # [E, T N, ...]
+        if weights is None:
+            return self._mixture(z, action, None)
+        rows, samples = len(z), weights[0].shape[1]
+        masks = tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
+        mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [E, T N, ...]
         return mixture.map(lambda values: values.reshape(-1, rows, *values.shape[2:]))
 
     @torch.no_grad()
-    def assess(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:
+    def predict_outcome(self, z: Tensor, action: Tensor, next_z: Tensor) -> tuple[Tensor, Tensor]:
         """Predicted rewards and termination probabilities of N transitions, without dropout: two of shape (N,)."""
-        reward, logit = self.assessment(z.unsqueeze(0), action.unsqueeze(0), next_z.unsqueeze(0))
-        return reward.squeeze(0) * self.settings.reward_scale, logit.squeeze(0).sigmoid()
+        reward, logit = self.head(z, action, next_z)
+        return reward * self.settings.reward_scale, logit.sigmoid()
 
     @torch.no_grad()
     def reward_std(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
@@ -198,5 +194,13 @@ class WorldModel(nn.Module):
             next_z: Shape (N, Z).
             weights: From :meth:`draw_reward_weights`.
         """
-        samples = self.assessment.sample_rewards(z, action, next_z, weights)  # [T, N]
-        return samples.std(dim=0, correction=0) * self.settings.reward_scale
+        inputs, masks = self.head.inputs(z, action, next_z), [mask.squeeze(0) for mask in weights]
+        rewards = sample_outputs(self.head.reward_network, inputs, masks)[..., 0]  # [T, N]
+        return rewards.std(dim=0, correction=0) * self.settings.reward_scale
+
+
+def _member_mlp(
+    sizes: Sequence[int], members: int, settings: WorldModelSettings, generator: torch.Generator
+) -> MemberMLP:
+    dtype = hidden_dtype(settings.precision, generator.device.type)
+    return MemberMLP(sizes, members=members, dropout=settings.dropout, generator=generator, hidden_dtype=dtype)

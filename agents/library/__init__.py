@@ -1,1 +1,1 @@
-"""Agents from other people's libraries, trained by their own loops."""
+"""Agents of Stable-Baselines3, trained by the library's own loop."""

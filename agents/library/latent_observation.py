@@ -41,8 +41,7 @@ class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Any, F
 
     def observation(self, observation: Frame) -> NDArray[np.float32]:
         """Latents (Z,) of one frame (64, 64, 3)."""
-        latents: NDArray[np.float32] = self.encoder.encode(observation[None])[0][0].cpu().numpy()
-        return latents
+        return self.encoder.latents(observation)
 
 
 def _path(encoder: Path | str) -> Path:

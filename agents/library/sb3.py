@@ -1,6 +1,6 @@
-"""Agents from a library, as any user would train them: Stable-Baselines3 (Raffin et al. 2021) through Gymnasium.
+"""Agents of Stable-Baselines3 (Raffin et al. 2021) through Gymnasium, trained by the library's own loop.
 
-The library's own loop plays and learns; it sees the environment's frames, or our latents of them, and nothing else.
+They see the environment's frames, or an encoder's latents of them, and nothing else.
 """
 
 from __future__ import annotations
@@ -11,16 +11,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.capabilities import OnEpisode
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from .latent_observation import LatentObservation
-from .settings import PeerSettings, resolve
+from .settings import HYPERPARAMETERS, LibrarySettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -38,7 +37,7 @@ class LibraryAgent:
     """
 
     def __init__(
-        self, algorithm: Any, settings: PeerSettings, *, seed: int, device: str, encoder: Encoder | None
+        self, algorithm: Any, settings: LibrarySettings, *, seed: int, device: str, encoder: Encoder | None
     ) -> None:
         self.settings = settings
         self._algorithm, self._device, self._encoder = algorithm, device, encoder
@@ -69,14 +68,10 @@ class LibraryAgent:
             ArtefactError: It was not trained.
         """
         if self._model is None:
-            raise ArtefactError("This agent trains itself; it has no policy before it is trained.")
-        return int(self._model.predict(self._seen(observation.frame), deterministic=not explore)[0])
-
-    def _seen(self, frame: Frame) -> NDArray[Any]:
-        if self._encoder is None:
-            return frame
-        latents: NDArray[Any] = self._encoder.encode(frame[None])[0][0].cpu().numpy()
-        return latents
+            raise ArtefactError("This agent has no policy before its training loop has run; train it first.")
+        frame = observation.frame
+        seen = frame if self._encoder is None else self._encoder.latents(frame)
+        return int(self._model.predict(seen, deterministic=not explore)[0])
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Learn nothing: the library learns in its own loop."""
@@ -107,7 +102,7 @@ def _make(context: AgentContext, target: str) -> LibraryAgent:
     prepare_torch(context.device)
     return LibraryAgent(
         _algorithm(target),
-        resolve(context.preset, context.overrides, context.settings),
+        HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group),
         seed=context.seeds.child("library").integer(),
         device=context.device,
         encoder=None if context.encoder is None else load_perception(context).encoder,

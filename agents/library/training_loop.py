@@ -1,4 +1,4 @@
-"""The one place that speaks to the training loop of Stable-Baselines3: it is told of episodes, and told to stop."""
+"""The training loop of Stable-Baselines3, with a callback that counts episodes and ends training."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 While training, activations are kept as units x rows: standardising a unit over its batch is then layer normalisation
 over the last axis, which torch has as one fused operation. For prediction the standardisation is folded into the
-weights, so what predicts is an ordinary :class:`~.layers.MemberMLP`. Shapes: ``E`` members, ``H`` units, ``N`` rows.
+weights, so what predicts is an ordinary :class:`~.mlp.MemberMLP`. Shapes: ``E`` members, ``H`` units, ``N`` rows.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from .mlp import MemberMLP, dropout_mask, kept_scale
+from .mlp import MemberMLP, dropout_mask
 
 EPSILON = 1e-5
 """Added to every variance (the default of PyTorch): little, as decay makes units small."""
@@ -70,13 +70,12 @@ class NormedMLP(nn.Module):
         hidden = self.sizes[1:-2]
         if self.dropout == 0.0 or not hidden:
             return None
-        masks = torch.empty(self.members, sum(hidden), rows, dtype=self.precision, device=generators[0].device)
-        for mask, generator in zip(masks, generators, strict=True):
-            mask.copy_(dropout_mask(mask.shape, self.dropout, generator))
-        return masks.mul_(-kept_scale(self.dropout)).split(hidden, dim=1)
+        shape = sum(hidden), rows
+        masks = torch.stack([dropout_mask(shape, self.dropout, draws, self.precision) for draws in generators])
+        return masks.split(hidden, dim=1)
 
     def forward(self, x: Tensor, masks: Sequence[Tensor] | None) -> Tensor:
-        """Map a training batch (E, in, N) to (E, out, N); :meth:`note` takes its statistics for :meth:`folded`."""
+        """Map a training batch (E, in, N) to (E, out, N), and keep its statistics for :meth:`update_running_stats`."""
         last = len(self.weights) - 1
         self._statistics = []
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -103,7 +102,7 @@ class NormedMLP(nn.Module):
         return bias + rounded + rounding
 
     @torch.no_grad()
-    def note(self) -> None:
+    def update_running_stats(self) -> None:
         """Move the running means and variances toward those of the last batch; the first batches count equally.
 
         On a CPU those of a bfloat16 layer come in bfloat16.

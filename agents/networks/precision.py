@@ -1,11 +1,8 @@
-"""In which number format the world model's hidden layers train, and which formats a device multiplies quickly."""
+"""In which number format hidden layers train, and which formats a device multiplies quickly."""
 
 from __future__ import annotations
 
 import torch
-
-PRECISIONS = ("auto", "float32", "bfloat16")
-"""What ``model.precision`` may be: ``auto`` is bfloat16 where the device has instructions for it, else float32."""
 
 
 def settle(precision: str, device: str) -> str:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,41 +19,11 @@ from imagine_bench.errors import DivergedError
 
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
-from ..networks.member_adam import MemberAdam
-from ..networks.mlp import MemberMLP
+from ..networks.mlp import MemberMLP, clip_member_gradients
 from ..networks.normed_mlp import NormedMLP
 from ..networks.precision import hidden_dtype
 from ..networks.weight_samples import sample_outputs
-
-
-@dataclass(frozen=True, kw_only=True)
-class MDNSettings:
-    """A Bayesian mixture density network; the defaults are the thesis' (4.5.1).
-
-    Attributes:
-        hidden: Units a hidden layer.
-        components: Gaussians in the mixture, K.
-        dropout: Probability of dropping a unit of a hidden layer that another one follows; [0, 1).
-        weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
-            ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
-            leave the data as ``w`` shrinks, and a third of the first layer die.
-        learning_rate: Of Adam.
-        gradient_clip: Largest gradient norm of each network.
-        sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
-        sigma_ceiling: Largest, in the same units.
-        precision: Products between hidden layers while training: float32, bfloat16, or auto for what the device does
-            fast.
-    """
-
-    hidden: tuple[int, ...] = (256, 256, 256)
-    components: int = 10
-    dropout: float = 0.2
-    weight_decay: float = 0.02
-    learning_rate: float = 1e-3
-    gradient_clip: float = 10.0
-    sigma_floor: float = 1e-3
-    sigma_ceiling: float = 10.0
-    precision: str = "float32"
+from .settings import MDNSettings
 
 
 class BayesianMDN:
@@ -73,10 +44,9 @@ class BayesianMDN:
         precision = hidden_dtype(settings.precision, generators[0].device.type)
         self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
         hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
-        self.optimiser = MemberAdam(
-            self.network, hidden, learning_rate=settings.learning_rate,
-            weight_decay=settings.weight_decay, gradient_clip=settings.gradient_clip,
-        )  # fmt: skip
+        output = [self.network.weights[-1], self.network.biases[-1]]
+        groups: list[dict[str, Any]] = [{"params": hidden, "weight_decay": settings.weight_decay}, {"params": output}]
+        self.optimiser = torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
     def _mixture(self, outputs: Tensor) -> Mixture:
         settings = self.settings
@@ -105,8 +75,15 @@ class BayesianMDN:
                 f"The likelihood of network {wrong[0]} of {len(losses)} is no longer finite "
                 f"({losses[wrong[0]].item()}). Lower learning_rate or raise sigma_floor."
             )
-        self.optimiser.step(losses.sum())
-        self.network.note()
+        self.optimiser.zero_grad()
+        losses.sum().backward()
+        norms = clip_member_gradients(self.network, self.settings.gradient_clip)
+        if not bool(norms.isfinite().all()):
+            raise DivergedError(
+                f"Gradients are no longer finite: their norms are {norms.tolist()}. Lower learning_rate."
+            )
+        self.optimiser.step()
+        self.network.update_running_stats()
         return losses.detach()
 
     def trained(self) -> TrainedMDN:

@@ -17,21 +17,30 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.regression import Dataset, Floats, Mixtures, Prediction, RegressorContext
+from imagine_bench.regression.interfaces import Dataset, Floats, Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
-from ..imagination.uncertainty import decompose, drawn_variance, surprise
+from ..imagination.uncertainty import decompose, nll, sampled_component_variance
 from ..networks.mlp import dropout_mask
 from ..networks.precision import settle
-from ..snapshot import generator_array, jsonable, load_generator, require_fit
+from ..snapshot import (
+    below,
+    generator_array,
+    jsonable,
+    load_generator,
+    load_training,
+    prefixed,
+    require_fit,
+    training_arrays,
+)  # fmt: skip
 from .bayesian_mdn import BayesianMDN, TrainedMDN, rescaled
-from .settings import RegressorSettings, resolve
+from .settings import HYPERPARAMETERS, RegressorSettings
 from .stationarity import jensen_shannon
 
 _ROWS = 256
-"""Rows assessed at a time: T mixtures of each are in memory."""
+"""Rows predicted at a time: T mixtures of each are in memory."""
 
 
 class MixtureRegressor:
@@ -82,7 +91,8 @@ class MixtureRegressor:
         batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
         owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
         for _ in range(epochs):
-            self._model.optimiser.set_learning_rate(self._rate())
+            for group in self._model.optimiser.param_groups:
+                group["lr"] = self._rate()
             orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._order])
             losses = []
             for batch in orders.tensor_split(batches, dim=1):
@@ -101,11 +111,11 @@ class MixtureRegressor:
         return {"loss/likelihood": float(np.mean(losses))} if losses else {}
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
-        """Predict and say how sure that is; see :class:`imagine_bench.regression.Regressor`."""
+        """Predict, with uncertainties; see :class:`imagine_bench.regression.interfaces.Regressor`."""
         self._require_inputs(inputs)
         generator = self._generator(int(rng.integers(2**62)))
         return _joined([
-            _joined([self._assess_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
+            _joined([self._predict_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
             for e in range(self.networks)
         ])  # fmt: skip
 
@@ -122,7 +132,7 @@ class MixtureRegressor:
 
     def state(self) -> AgentState:
         """Weights, moments, running statistics, generators, epochs."""
-        arrays = {f"optimiser/{name}": array for name, array in self._model.optimiser.arrays().items()}
+        arrays = prefixed("network", training_arrays(self._model.network, self._model.optimiser))
         arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
         for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
             arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
@@ -139,8 +149,8 @@ class MixtureRegressor:
             ArtefactError: The snapshot does not fit.
         """
         require_fit(state, self.state(), equal=("settings",))
-        arrays, names = state.arrays, ("value", "exp_avg", "exp_avg_sq", "step")
-        self._model.optimiser.load({name: arrays[f"optimiser/{name}"] for name in names})
+        arrays = state.arrays
+        load_training(self._model.network, self._model.optimiser, below("network", arrays))
         for name, buffer in self._model.network.named_buffers():
             buffer.copy_(torch.tensor(arrays[f"statistics/{name}"]))
         for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
@@ -171,16 +181,16 @@ class MixtureRegressor:
         samples = self._trained.weight_samples(part, x, masks)
         return rescaled(samples, self._shift[network], self._scale[network])
 
-    def _assess_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
+    def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
         samples = self._weight_samples(network, x)
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
-        drawn = drawn_variance(samples, predictive, prediction, self.settings.members)
+        sampled = sampled_component_variance(samples, predictive, prediction, self.settings.members)
         return Prediction(
             prediction=prediction.double().cpu().numpy(),
-            drawn=drawn.double().cpu().numpy(),
-            surprise=surprise(samples, prediction).double().cpu().numpy(),
+            sampled_variance=sampled.double().cpu().numpy(),
+            nll=nll(samples, prediction).double().cpu().numpy(),
             mean=mdn.mean(samples).mean(dim=0).double().cpu().numpy(),
             epistemic=parts.epistemic.double().cpu().numpy(),
             aleatoric=parts.aleatoric.double().cpu().numpy(),
@@ -226,7 +236,7 @@ def _numpy(mixture: Mixture) -> Mixtures:
 
 
 def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
-    """Assessments joined along rows, or stacked as networks where no axis is given."""
+    """Predictions joined along rows, or stacked as networks where no axis is given."""
     join = np.stack if axis is None else np.concatenate
 
     def field(owner: Sequence[object], name: str) -> Floats:
@@ -240,9 +250,9 @@ def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:
     """The ``mc_dropout`` regressor: one network a dataset, its weight samples are dropout masks (thesis 4.5)."""
-    return MixtureRegressor(context, resolve(context.preset, context.overrides, ensemble=False))
+    return MixtureRegressor(context, HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, "mc_dropout"))
 
 
 def make_ensemble(context: RegressorContext) -> MixtureRegressor:
     """The ``ensemble`` regressor: M networks a dataset without dropout, each of them a weight sample."""
-    return MixtureRegressor(context, resolve(context.preset, context.overrides, ensemble=True))
+    return MixtureRegressor(context, HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, "ensemble"))

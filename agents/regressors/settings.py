@@ -1,24 +1,78 @@
-"""Settings of the regressors of chapter 4: the thesis' values, and how presets and regressors deviate from them."""
+"""Settings of the regressors of chapter 4; the defaults are the thesis' (4.5.1)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, get_type_hints
+from dataclasses import dataclass
+from typing import Any
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.errors import InvalidValueError
 
-from ..config_groups import Deviation
-from ..networks.mlp import dropout_bits
-from ..networks.precision import PRECISIONS
-from ..presets import checked
-from ..ranges import NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, Range, between, require_ranges
-from .bayesian_mdn import MDNSettings
+from ..settings import (
+    COUNT,
+    LAYERS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PRECISIONS,
+    PROBABILITY,
+    RATE,
+    ConfigGroup,
+    Hyperparameters,
+    Override,
+    Range,
+    between,
+    setting,
+)
+
+_DROPOUT = Range(
+    lambda value: value == 0.0 or 1 / 256 <= value <= 0.95,
+    "must be 0 or lie in [1/256, 0.95]: dropout masks count in 256ths",
+)
+_BATCH_SIZE = Range(lambda value: value >= 8, "must be at least 8: layers are standardised over a batch")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDNSettings:
+    """A Bayesian mixture density network.
+
+    Attributes:
+        hidden: Units a hidden layer.
+        components: Gaussians in the mixture, K.
+        dropout: Probability of dropping a unit of a hidden layer that another one follows.
+        weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
+            ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
+            leave the data as ``w`` shrinks, and a third of the first layer die.
+        learning_rate: Of Adam.
+        gradient_clip: Largest gradient norm of each network.
+        sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
+        sigma_ceiling: Largest, in the same units.
+        precision: Products between hidden layers while training.
+
+    Raises:
+        InvalidValueError: Dropout without two hidden layers.
+    """
+
+    hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
+    components: int = setting(10, between(1, 1_000))
+    dropout: float = setting(0.2, _DROPOUT)
+    weight_decay: float = setting(0.02, NOT_NEGATIVE)
+    learning_rate: float = setting(1e-3, RATE)
+    gradient_clip: float = setting(10.0, POSITIVE)
+    sigma_floor: float = setting(1e-3, between(1e-9, 1.0))
+    sigma_ceiling: float = setting(10.0, between(1.0, 1e9))
+    precision: str = setting("float32", PRECISIONS)
+
+    def __post_init__(self) -> None:
+        if self.dropout > 0.0 and len(self.hidden) < 2:
+            raise InvalidValueError(
+                f"Setting hidden is {self.hidden}; dropout acts between hidden layers, so it needs at least two of "
+                "them. Add one."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressorSettings(MDNSettings):
-    """A regressor: its networks and how long they train. The defaults are the thesis' (4.5.1).
+    """A regressor: its networks and how long they train.
 
     Attributes:
         epochs: Passes over the data.
@@ -27,131 +81,86 @@ class RegressorSettings(MDNSettings):
         batch_size: Rows an update, at most; None for all, as the thesis names none.
         members: Networks of an ensemble, M; 1 is a single network with dropout.
         weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
-        divergence_draws: Values drawn from each weight sample's mixture to estimate their divergence.
-    """
-
-    epochs: int = 3000
-    final_rate: float = 1.0
-    batch_size: int | None = None
-    members: int = 1
-    weight_samples: int = 50
-    divergence_draws: int = 1
-
-
-_BATCH = Deviation(1000, "where there are more data: few epochs, more steps (all at once was not tried here)")
-_FALLING = Deviation(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
-
-PRESETS: dict[str, dict[str, Deviation]] = {
-    "smoke": {
-        "epochs": Deviation(20, "shows that every part works, within a minute"),
-        "batch_size": _BATCH,
-        "learning_rate": Deviation(3e-3, "so few epochs want larger steps"),
-        "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
-    },
-    "quick": {
-        "epochs": Deviation(600, "CPU time"),
-        "batch_size": _BATCH,
-        "learning_rate": Deviation(3e-3, "fewer epochs want larger steps"),
-        "final_rate": _FALLING,
-        "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
-    },
-    "thesis": {
-        "final_rate": _FALLING,
-        "precision": Deviation("auto", "CPU time; see docs/uncertainty.md for what it changes"),
-    },
-    "full": {"final_rate": _FALLING},
-}
-"""What each preset changes of the thesis' values."""
-
-ENSEMBLE: dict[str, Deviation] = {
-    "members": Deviation(5, "as many as Lakshminarayanan et al. (2017) recommend"),
-    "dropout": Deviation(0.0, "in an ensemble the members are the weight samples"),
-    "batch_size": Deviation(250, "so few epochs want more steps in each"),
-    "divergence_draws": Deviation(10, "five members then give as many values as 50 dropout samples"),
-}
-"""What a deep ensemble changes of every preset; its epochs are those of :func:`_ensemble_epochs`."""
-ENSEMBLE_SHARE = 10
-"""Five members for a tenth of the epochs cost half of one network with dropout: as preset it must not win by
-arithmetic. Epochs that are set are each member's."""
-ENSEMBLE_EPOCHS = 120
-"""Below so many epochs members have hardly learned; they get them where that costs no more than the one network."""
-
-_RANGES = {
-    "dropout": between(0.0, 0.95),
-    "weight_decay": NOT_NEGATIVE,
-    "learning_rate": RATE,
-    "final_rate": PROBABILITY,
-    "gradient_clip": POSITIVE,
-    "sigma_floor": between(1e-9, 1.0),
-    "sigma_ceiling": between(1.0, 1e9),
-    "weight_samples": between(2, 1_000, "the spread of one sample is 0"),
-    "components": between(1, 1_000),
-    "members": between(1, 1_000),
-    "batch_size": Range(lambda value: value >= 8, "must be at least 8: layers are standardised over a batch"),
-}
-"""Ranges of the numbers; every other number is a count of at least 1."""
-
-
-def resolve(preset: str, overrides: Mapping[str, Any], *, ensemble: bool) -> RegressorSettings:
-    """The settings of a preset, with single ones replaced.
-
-    Args:
-        preset: A name of :data:`PRESETS`.
-        overrides: Values by name, such as ``{"epochs": 100}``, for every regressor; but ``dropout`` is the one
-            network's and ``members`` the ensemble's, and the other goes without.
-        ensemble: Whether they are for a deep ensemble.
+        divergence_draws: Values sampled from each weight sample's mixture to estimate their divergence.
 
     Raises:
-        UnknownNameError: No such preset or setting; the message lists what exists.
-        InvalidValueError: A value of the wrong type or out of its range.
+        InvalidValueError: All weight samples would be the same.
     """
-    require_known("preset", preset, PRESETS)
-    values = {name: deviation.value for name, deviation in PRESETS[preset].items()}
-    if ensemble:
-        epochs = values.get("epochs", RegressorSettings().epochs)
-        values |= {name: deviation.value for name, deviation in ENSEMBLE.items()}
-        values["epochs"] = _ensemble_epochs(epochs)
-    known = {field.name for field in fields(RegressorSettings)}
-    hints = get_type_hints(RegressorSettings)
-    for name, value in overrides.items():
-        if name not in known:
-            raise UnknownNameError("setting", name, sorted(known))
-        given = checked(name, hints[name], value)
-        if name != ("dropout" if ensemble else "members"):
-            values[name] = given
-    settings = replace(RegressorSettings(), **values)
-    _require_ranges(settings)
-    _require_samples(settings, ensemble=ensemble)
-    return settings
+
+    epochs: int = setting(3000, COUNT)
+    final_rate: float = setting(1.0, PROBABILITY)
+    batch_size: int | None = setting(None, _BATCH_SIZE)
+    members: int = setting(1, between(1, 1_000))
+    weight_samples: int = setting(50, between(2, 1_000, "the spread of one sample is 0"))
+    divergence_draws: int = setting(1, COUNT)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.members == 1 and self.dropout == 0.0:
+            raise InvalidValueError(
+                "Settings members is 1 and dropout is 0: all weight samples would be the same, and their spread 0. "
+                "Give mc_dropout a dropout of at least 1/256, or ensemble at least 2 members."
+            )
 
 
-def resolve_all(preset: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, RegressorSettings]:
-    """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
-    return resolve(preset, overrides, ensemble=False), resolve(preset, overrides, ensemble=True)
+_BATCH = Override(1000, "where there are more data: few epochs, more steps (all at once was not tried here)")
+_FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
+_FORMAT = Override("auto", "CPU time; see docs/uncertainty.md for what it changes")
+
+_SETS: dict[str, dict[str, Override]] = {
+    "minimal": {
+        "epochs": Override(20, "shows that every part works, within a minute"),
+        "batch_size": _BATCH,
+        "learning_rate": Override(3e-3, "so few epochs want larger steps"),
+        "precision": _FORMAT,
+    },
+    "fast": {
+        "epochs": Override(600, "CPU time"),
+        "batch_size": _BATCH,
+        "learning_rate": Override(3e-3, "fewer epochs want larger steps"),
+        "final_rate": _FALLING,
+        "precision": _FORMAT,
+    },
+    "published": {"final_rate": _FALLING, "precision": _FORMAT},
+}
+"""What each set changes of the thesis' values for one network with dropout."""
+
+_ENSEMBLE: dict[str, Override] = {
+    "members": Override(5, "as many as Lakshminarayanan et al. (2017) recommend"),
+    "dropout": Override(0.0, "in an ensemble the members are the weight samples"),
+    "batch_size": Override(250, "so few epochs want more steps in each"),
+    "divergence_draws": Override(10, "five members then give as many values as 50 dropout samples"),
+}
+"""What a deep ensemble changes of every set, beside its epochs."""
 
 
 def _ensemble_epochs(epochs: int) -> int:
-    """Epochs of each member where one network trains for ``epochs``: all preset members together cost no more."""
-    fair = max(1, epochs // ENSEMBLE["members"].value)
-    return min(fair, max(ENSEMBLE_EPOCHS, epochs // ENSEMBLE_SHARE))
+    """Epochs of each of five members where one network trains for ``epochs``.
+
+    A tenth of them, so that the ensemble costs half: it must not win by arithmetic. But at least 120, below which
+    members have hardly learned, where that costs no more than the one network.
+    """
+    return min(max(1, epochs // 5), max(120, epochs // 10))
 
 
-def _require_ranges(settings: RegressorSettings) -> None:
-    require_known("precision", settings.precision, PRECISIONS)
-    if settings.dropout > 0.0 and len(settings.hidden) < 2:
-        raise InvalidValueError(
-            f"Setting hidden is {settings.hidden}; dropout acts between hidden layers, so it needs at least two of "
-            "them. Add one."
-        )
-    require_ranges({field.name: getattr(settings, field.name) for field in fields(settings)}, _RANGES)
+def _of_ensemble(changes: Mapping[str, Override]) -> dict[str, Override]:
+    epochs = changes["epochs"].value if "epochs" in changes else 3000
+    fewer = Override(_ensemble_epochs(epochs), "five members together must not cost more than one network")
+    return {**changes, **_ENSEMBLE, "epochs": fewer}
 
 
-def _require_samples(settings: RegressorSettings, *, ensemble: bool) -> None:
-    """Epistemic uncertainty is what weight samples disagree about, so there must be different ones."""
-    if ensemble and settings.members < 2:
-        raise InvalidValueError("Setting members is 1 in an ensemble; it must be at least 2: the spread of one is 0.")
-    if not ensemble and dropout_bits(settings.dropout) == 0:
-        raise InvalidValueError(
-            f"Setting dropout is {settings.dropout}, which counts as 0 (in steps of 1/256): all weight samples of one "
-            "network would be the same. Give at least 0.002; the regressor 'ensemble' goes without by itself."
-        )
+HYPERPARAMETERS = Hyperparameters(
+    {
+        "mc_dropout": ConfigGroup(RegressorSettings(), _SETS, unused=frozenset({"members"})),
+        "ensemble": ConfigGroup(
+            RegressorSettings(),
+            {name: _of_ensemble(changes) for name, changes in _SETS.items()},
+            unused=frozenset({"dropout"}),
+        ),
+    }
+)
+
+
+def resolve_all(hyperparameters: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, ...]:
+    """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
+    return tuple(HYPERPARAMETERS.resolve(hyperparameters, overrides, group) for group in HYPERPARAMETERS.groups)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from imagine_bench.bench.cohort import cpu_time_s
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
+from imagine_bench.store.counters import EvaluationCounts
 
 Info = dict[str, Any]
+Env = gymnasium.Env[Any, Any]
 
 
 def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
@@ -22,7 +23,7 @@ def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
 
 
 def play(
-    env: gymnasium.Env[Any, Any],
+    env: Env,
     agent: Agent,
     *,
     seed: int,
@@ -65,6 +66,20 @@ def play(
         before, over = after, terminated or truncated
 
 
+def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
+    """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
+    start_s = time.process_time()
+    seed, success = episode_seed(purpose, 0, counts.episodes), False
+    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
+        counts.env_steps += 1
+        counts.return_sum += transition.reward
+        counts.faults += bool(info["fault"])
+        success = bool(info["is_success"])
+    counts.episodes += 1
+    counts.successes += success
+    counts.cpu_s += time.process_time() - start_s
+
+
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for.
 
@@ -73,7 +88,7 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
         seed: The run's seed.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
+    def __init__(self, env: Env, seed: int) -> None:
         super().__init__(env)
         self._seed, self._episode = seed, 0
 
@@ -82,41 +97,3 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
         start = episode_seed("training", self._seed, self._episode)
         self._episode += 1
         return self.env.reset(seed=start, options=options)
-
-
-@dataclass
-class EvaluationCounts:
-    """Counts over test episodes; a checkpoint may carry them half way.
-
-    Attributes:
-        episodes: Test episodes done.
-        successes: Those that ended in success.
-        env_steps: Macro-actions in them.
-        return_sum: Sum of their undiscounted returns.
-        faults: Macro-actions whose physics disagreed with the rules.
-        cpu_s: CPU seconds spent.
-        diagnostics: The agent's own means at the moment the test began.
-    """
-
-    episodes: int = 0
-    successes: int = 0
-    env_steps: int = 0
-    return_sum: float = 0.0
-    faults: int = 0
-    cpu_s: float = 0.0
-    diagnostics: dict[str, float] = field(default_factory=dict)
-
-    def add_episode(
-        self, env: gymnasium.Env[Any, Any], agent: Agent, *, privileged: bool, purpose: Purpose = "evaluation"
-    ) -> None:
-        """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-        start_s = cpu_time_s()
-        seed, success = episode_seed(purpose, 0, self.episodes), False
-        for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
-            self.env_steps += 1
-            self.return_sum += transition.reward
-            self.faults += bool(info["fault"])
-            success = bool(info["is_success"])
-        self.episodes += 1
-        self.successes += success
-        self.cpu_s += cpu_time_s() - start_s

@@ -10,7 +10,8 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from imagine_bench.bench.runs import Progress, RunSpec
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.runs import Progress, RunSpec
 
 Item = TypeVar("Item")
 
@@ -19,14 +20,16 @@ _LINE_EVERY_S = 15.0
 
 
 class ProgressBars(AbstractContextManager["ProgressBars"]):
-    """Shows :class:`~imagine_bench.bench.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
+    """Shows :class:`~imagine_bench.protocols.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
 
     Args:
-        specs: The runs to come, to their ends even where they rest on the way.
+        specs: The runs to come, to their ends even where they pause on the way.
         done: How much of each run earlier sessions did, by agent and seed, as far as is known before it goes on.
     """
 
-    def __init__(self, specs: Sequence[RunSpec], done: Mapping[tuple[str, int], int] | None = None) -> None:
+    def __init__(
+        self, specs: Sequence[RunSpec[ProtocolData]], done: Mapping[tuple[str, int], int] | None = None
+    ) -> None:
         self._works = {(spec.agent, spec.seed): spec.work for spec in specs}
         self._finished = set[tuple[str, int]]()
         self._done = dict(done or {})
@@ -47,20 +50,20 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
-        run, rests = (progress.agent, progress.seed), progress.phase == "done"
+        run, pauses = (progress.agent, progress.seed), progress.phase == "done"
         if progress.phase == "failed":
             self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
             return
         work = self._works[run]
-        if run not in self._seen:  # what an earlier session did took no time now and targets nothing
+        if run not in self._seen:  # what an earlier session did took no time now and foretells nothing
             self._seen.add(run)
             self._before[run] = progress.done
         self._done[run] = progress.done
-        if rests and progress.done >= work:
+        if pauses and progress.done >= work:
             self._finished.add(run)
         if self._total is not None:
-            self._show_on_bars(self._total, run, "" if rests else _sentence(progress, work))
-        elif rests or time.monotonic() - self._shown_s > _LINE_EVERY_S:
+            self._show_on_bars(self._total, run, "" if pauses else _sentence(progress, work))
+        elif pauses or time.monotonic() - self._shown_s > _LINE_EVERY_S:
             self._shown_s = time.monotonic()
             print(f"{self._description()},{self._times()}; {_sentence(progress, work)}", file=sys.stderr, flush=True)
 

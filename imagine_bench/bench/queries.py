@@ -1,6 +1,6 @@
-"""What others teach a learner: episodes that a demonstrator plays, and answers to its questions.
+"""What a learner is given beside its own episodes: demonstrated ones, and an oracle's labels for what it asks.
 
-Neither shows a macrostate: a demonstration is seen as frames, an answer is a reward and whether the episode would end.
+Neither shows a macrostate: a demonstration is seen as frames, a label is a reward and whether the episode would end.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import Info
-from imagine_bench.bench.protocol import Protocol
-from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import Answer, ExternalTrainer, QueryingAgent, TransferLearner
+from imagine_bench.capabilities import ExternalTrainer, Label, QueryingAgent, TransferLearner
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import RunSpec
 
 
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
@@ -32,15 +32,15 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     if protocol.after and not isinstance(agent, TransferLearner):
         raise InvalidValueError(
             f"Agent {name!r} has no model of the world to carry over from {', '.join(protocol.after)}; leave --after "
-            "out, or give agents that have one, such as imagine or imagination."
+            "out, or give agents that have one, such as factored or imagination."
         )
-    if protocol.questions and not isinstance(agent, QueryingAgent):
+    if protocol.queries and not isinstance(agent, QueryingAgent):
         raise InvalidValueError(
-            f"Agent {name!r} cannot ask a teacher; leave --questions out, or give an agent that can, such as imagine."
+            f"Agent {name!r} cannot query an oracle; leave --queries out, or give an agent that can, such as factored."
         )
 
 
-def demonstrator(spec: RunSpec) -> Agent:
+def demonstrator(spec: RunSpec[Protocol]) -> Agent:
     """The reference agent that plays the demonstrated episodes of a run; it has to be shown macrostates."""
     return registry.make_agent(registry.DEMONSTRATOR, dataclasses.replace(spec, agent=registry.DEMONSTRATOR).context())
 
@@ -55,7 +55,7 @@ def as_seen(transition: Transition) -> Transition:
 
 
 class LabelOracle:
-    """Answers what actions would bring, from the rules and the true macrostate, where the rules leave no doubt.
+    """Labels what actions would bring, from the rules and the true macrostate, where the rules leave no doubt.
 
     Args:
         rules: Of the task.
@@ -64,11 +64,11 @@ class LabelOracle:
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
 
-    def answer(self, macrostate: tuple[int, ...], actions: NDArray[np.int64]) -> Answer | None:
+    def label(self, macrostate: tuple[int, ...], actions: NDArray[np.int64]) -> Label | None:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
 
         The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
-        may happen is looked at; None where that differs in reward or end: a matter of chance has no answer.
+        may happen is looked at; None where that differs in reward or end: a matter of chance has no label.
 
         Raises:
             InvalidValueError: No action, or one that does not exist.
@@ -81,33 +81,33 @@ class LabelOracle:
         possible = {macrostate}
         for action in planned[:-1]:
             possible = {each.macrostate for state in possible for each in self._rules.outcomes(state, action)}
-        answers = {
-            Answer(outcome.reward, outcome.terminated)
+        labels = {
+            Label(outcome.reward, outcome.terminated)
             for state in possible
             for outcome in self._rules.outcomes(state, planned[-1])
         }
-        return answers.pop() if len(answers) == 1 else None
+        return labels.pop() if len(labels) == 1 else None
 
 
 class QueryBudget:
-    """The questions of one episode: a learner's, as many as are allowed, before each of its macro-actions.
+    """The queries of one episode: as many as are allowed, before each of the learner's macro-actions.
 
     Args:
-        learner: Who asks.
-        teacher: Who answers.
-        questions: How many are allowed.
+        learner: The agent that asks.
+        oracle: Labels what it asks about.
+        queries: How many are allowed.
     """
 
-    def __init__(self, learner: QueryingAgent, teacher: LabelOracle, questions: int) -> None:
-        self._learner, self._teacher, self._left = learner, teacher, questions
+    def __init__(self, learner: QueryingAgent, oracle: LabelOracle, queries: int) -> None:
+        self._learner, self._oracle, self._left = learner, oracle, queries
         self.asked = 0
 
     def __call__(self, observation: Observation, info: Info) -> None:
         """Let the learner ask at a real frame until it has nothing to ask or may not any more."""
         while self._left > 0:
-            actions = self._learner.question(observation)
+            actions = self._learner.query(observation)
             if actions is None:
                 return
             macrostate = tuple(int(value) for value in info["macrostate"])
-            self._learner.learn_label(observation, actions, self._teacher.answer(macrostate, actions))
+            self._learner.learn_label(observation, actions, self._oracle.label(macrostate, actions))
             self._left, self.asked = self._left - 1, self.asked + 1

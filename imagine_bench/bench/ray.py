@@ -1,4 +1,4 @@
-"""The same runs on a Ray cluster: a task a cohort, in a fresh process with one thread, resumed wherever it was lost.
+"""The same runs on a Ray cluster: a task a run, in a fresh process with one thread, resumed wherever it was lost.
 
 The folder of the bench must be on a file system that all nodes share. A worker or a whole node that dies costs what a
 ``kill -9`` costs locally, the time since the run's last checkpoint: Ray starts its task again elsewhere, which finds
@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from imagine_bench.bench.launchers import ONE_THREAD, Failure, Job, carry_out, cohorts, require_runnable, run_job
-from imagine_bench.bench.runs import Observer, Progress
+from imagine_bench.bench.launchers import ONE_THREAD, Failure, Job, carry_out, require_workers, run_job
 from imagine_bench.errors import BusyError, SetupError
+from imagine_bench.protocols.runs import OnProgress, Progress
 
 _LOST = 20
-"""Times that a task may lose its worker or its node before its runs count as failed."""
+"""Times that a task may lose its worker or its node before its run counts as failed."""
 _POLL_S = 0.5
 _ANSWERS_WITHIN_S = 10.0
 _FREED_WITHIN_S = 60.0
@@ -31,22 +31,21 @@ class RayCluster:
 
     Args:
         workers: Tasks at a time on a cluster started here; an existing one runs as many as it has CPUs.
-        abreast: Most runs of one agent side by side in a task; None for one.
 
     Raises:
-        InvalidValueError: Fewer than one worker, or fewer than one run abreast.
+        InvalidValueError: Fewer than one worker.
         SetupError: Ray is not installed.
     """
 
-    def __init__(self, workers: int, abreast: int | None = None) -> None:
-        require_runnable(workers, abreast)
+    def __init__(self, workers: int) -> None:
+        require_workers(workers)
         try:
             import ray  # noqa: F401, PLC0415 - an optional dependency
         except ImportError as error:
             raise SetupError("The launcher 'ray' needs Ray: pip install 'imagine-bench[ray]'.") from error
-        self._workers, self._abreast = workers, abreast or 1
+        self._workers = workers
 
-    def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job; see :class:`imagine_bench.bench.launchers.Launcher`.
 
         Raises:
@@ -56,7 +55,7 @@ class RayCluster:
 
         self._connect(ray)
         try:
-            return _launch(ray, cohorts(jobs, self._workers, self._abreast), on_progress)
+            return _launch(ray, jobs, on_progress)
         finally:
             ray.shutdown()
 
@@ -80,8 +79,8 @@ def _require_listening(address: str | None) -> None:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWERS_WITHIN_S).close()
 
 
-def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) -> tuple[Failure, ...]:
-    gpus = int(any(job.spec.protocol.device == "cuda" for group in groups for job in group))
+def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+    gpus = int(any(job.spec.protocol.device == "cuda" for job in jobs))
     if ray.cluster_resources().get("GPU", 0) < gpus:
         raise SetupError("No node of the Ray cluster has a GPU for device 'cuda'; add one, or use device 'cpu'.")
     here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
@@ -91,23 +90,21 @@ def _launch(ray: Any, groups: Sequence[tuple[Job, ...]], on_progress: Observer) 
     work = ray.remote(
         num_cpus=1,
         num_gpus=gpus,
-        max_calls=1,  # a fresh process for each cohort: no threads, GL contexts or open logs of another
+        max_calls=1,  # a fresh process for each run: no threads, GL contexts or open logs of another
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
     )(_work)
-    running = {work.remote([_absolute(job) for job in group], board): group for group in groups}
+    running = {work.remote(_absolute(job), board): job for job in jobs}
     failures = []
     while running:
         ended, _ = ray.wait(list(running), timeout=_POLL_S)
         for progress in ray.get(board.take.remote()):
             on_progress(progress)
         for task in ended:
-            group = running.pop(task)
-            reasons = _reasons(ray, task, len(group))
-            failed = [Failure(job=job, reason=reason) for job, reason in zip(group, reasons, strict=True) if reason]
-            for failure in failed:
+            failure = Failure(job=running.pop(task), reason=_reason(ray, task))
+            if failure.reason:
+                failures.append(failure)
                 on_progress(failure.progress)
-            failures += failed
     for progress in ray.get(board.take.remote()):
         on_progress(progress)
     return tuple(failures)
@@ -120,15 +117,15 @@ def _absolute(job: Job) -> Job:
     return replace(job, spec=spec, folder=job.folder.resolve())
 
 
-def _reasons(ray: Any, task: Any, count: int) -> list[str]:
-    """Why each of an ended task's runs failed, or empty strings."""
+def _reason(ray: Any, task: Any) -> str:
+    """Why an ended task's run failed, or an empty string."""
     try:
-        reasons: list[str] = ray.get(task)
-    except ray.exceptions.RayTaskError as error:  # raised before the runs could speak for themselves
-        return [f"it could not begin ({error.cause!r})"] * count
+        reason: str = ray.get(task)
+    except ray.exceptions.RayTaskError as error:  # raised before the run could speak for itself
+        return f"it could not begin ({error.cause!r})"
     except ray.exceptions.RayError as error:
-        return [f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"] * count
-    return reasons
+        return f"it lost its worker or node {_LOST + 1} times ({str(error).splitlines()[0]})"
+    return reason
 
 
 class _Board:
@@ -145,14 +142,12 @@ class _Board:
         return news
 
 
-def _work(jobs: Sequence[Job], board: Any) -> list[str]:
-    """Runs side by side. Returns why each failed, or empty strings."""
-    reasons = [""] * len(jobs)
-    carry_out(jobs, board.put.remote, reasons.__setitem__, _run_when_free)
-    return reasons
+def _work(job: Job, board: Any) -> str:
+    """A run. Returns why it failed, or an empty string."""
+    return carry_out(job, board.put.remote, _run_when_free)
 
 
-def _run_when_free(job: Job, on_progress: Observer) -> None:
+def _run_when_free(job: Job, on_progress: OnProgress) -> None:
     """Run; wait a while for the folder, which the worker of a node that just died may not have let go of yet."""
     deadline_s = time.monotonic() + _FREED_WITHIN_S
     while True:

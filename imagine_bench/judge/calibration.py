@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import Floats, Mixtures
+from imagine_bench.interfaces import Floats
+from imagine_bench.regression.interfaces import Mixtures
 
 LEVELS = (0.5, 0.8, 0.95)
 """Central intervals whose coverage is reported."""
@@ -26,12 +27,7 @@ _AT_ONCE = 2**24
 def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
     """The probability integral transform: P(Y <= outcome), uniform in [0, 1] if the prediction is calibrated.
 
-    Args:
-        mixtures: Leading axes (...).
-        outcomes: Shape (..., D).
-
-    Returns:
-        Shape (..., D).
+    Mixtures of leading axes (...) and outcomes (..., D) give shape (..., D).
     """
     scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
     below: Floats = (mixtures.weights[..., None] * special.ndtr(scaled)).sum(axis=-2)
@@ -50,9 +46,7 @@ def coverage(transforms: Floats, level: float) -> float:
 
 
 def transform_distance(transforms: Floats) -> float:
-    """How far the transforms are from uniform: the largest gap between the two distribution functions, in [0, 1]
-    (Kolmogorov-Smirnov).
-    """
+    """Kolmogorov-Smirnov distance of the transforms from uniform, in [0, 1]."""
     return float(stats.kstest(transforms.ravel(), "uniform").statistic)
 
 
@@ -60,14 +54,7 @@ def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
     """Continuous ranked probability score, in the unit of y; lower is better, and the absolute error for a point mass.
 
     Closed form for Gaussian mixtures (Grimit et al. 2006, equation 5): ``sum_k w_k A(y - m_k, s_k^2)
-    - 1/2 sum_kl w_k w_l A(m_k - m_l, s_k^2 + s_l^2)`` with ``A(m, v) = E|N(m, v)|``.
-
-    Args:
-        mixtures: Leading axes (...).
-        outcomes: Shape (..., D).
-
-    Returns:
-        Shape (..., D).
+    - 1/2 sum_kl w_k w_l A(m_k - m_l, s_k^2 + s_l^2)`` with ``A(m, v) = E|N(m, v)|``. Shapes as above.
     """
     weights, means, variances = mixtures.weights, mixtures.means, mixtures.sigmas**2
     away = _mean_size(outcomes[..., None, :] - means, variances)  # [..., K, D]

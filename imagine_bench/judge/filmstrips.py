@@ -1,4 +1,4 @@
-"""Picture strips of imagined rollouts: what the real environment shows above, what the agent imagined below."""
+"""Filmstrips of imagined rollouts: beside reality, or several of one start below one another (thesis' figure 3.4)."""
 
 from __future__ import annotations
 
@@ -11,26 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from imagine_bench.interfaces import Macrostate, Rules, TaskSpec
 from imagine_bench.store.results import ComparedRollout
 
-_CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is hallucinated
-_GAP = 12
+_CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is made up
+_GAP, _SHEET_GAP, _MARGIN = 12, 14, 12
 _LABELS = 108  # width of the column that names the rows
 _HEADER, _FOOTER = 62, 92
 _ROW = _CELL + _GAP
+_BOTTOM = _HEADER + 2 * _ROW
+_SHEET_HEADER, _SHEET_ROW = 36, 36 + _CELL + 54 + _SHEET_GAP
+_LINE = 20  # characters
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: color-blind safe
 
 
-def rollout_strip(
+def filmstrip(
     compared: ComparedRollout, action_names: tuple[str, ...], *, columns: int | None = None
 ) -> NDArray[np.uint8]:
-    """Draw one imagined rollout beside reality, one column a macro-action.
+    """Draw one imagined rollout below reality, one column a macro-action.
 
     Each column names the macro-action and shows the real frame, the decoded imagined one, and the predicted reward,
     P(end) and epistemic uncertainty, with the true reward in brackets. A vertical line marks where the uncertainty
-    filter cut; what it threw away is paler. The frame around an imagined picture is blue where its macrostate is what
-    the rules say and orange where it is not; the words below say the same. Where nothing real is to
+    filter cuts; what it discards is paler. The border of an imagined frame is blue where its macrostate is what
+    the rules say and orange where it is not; the text below says the same. Where nothing real is to
     compare with (a plan that was not carried out that far), the upper row stays empty.
 
     Args:
@@ -39,107 +43,153 @@ def rollout_strip(
         columns: Macro-actions to make room for; None for exactly D. Deeper rollouts are shown up to there.
 
     Returns:
-        The picture. Shape (height, width, 3), uint8.
+        The image. Shape (height, width, 3), uint8.
     """
     depth = len(compared.rollout.actions)
     room = depth if columns is None else columns
-    width = _LABELS + (room + 1) * _ROW
-    canvas = Image.new("RGB", (width, _HEADER + 2 * _ROW + _FOOTER), PAPER)
+    canvas = Image.new("RGB", (_LABELS + (room + 1) * _ROW, _BOTTOM + _FOOTER), PAPER)
     draw = ImageDraw.Draw(canvas)
-    _row_labels(draw)
-    _picture(canvas, compared.start_frame, column=0, row=0)
-    _picture(canvas, rgb(compared.rollout.start_frame), column=0, row=1)
+    for y, text in ((_HEADER + 54, "real"), (_HEADER + _ROW + 54, "imagined")):
+        draw.text((8, y), text, font=font(15, bold=True), fill=INK)
+    draw.multiline_text((8, _BOTTOM + 19), "predicted\n(true)", font=font(12), fill=FAINT, spacing=4)
+    _paste(canvas, compared.start_frame, (_left(0), _HEADER))
+    _paste(canvas, rgb(compared.rollout.start_frame), (_left(0), _HEADER + _ROW))
     draw.text((_left(0), _HEADER - 20), "start", font=font(13, bold=True), fill=INK)
     for index in range(min(depth, room)):
         _column(canvas, draw, compared, index, action_names)
-    _cut_mark(draw, compared, room)
+    cut = first_cut(compared)
+    if cut is not None and cut < room:
+        _mark_cut(draw, _left(cut + 1) - _GAP // 2 - 1)
     return np.asarray(canvas)
 
 
-def png(picture: NDArray[np.uint8]) -> bytes:
-    """Encode a picture (height, width, 3), uint8, as PNG."""
+def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec) -> NDArray[np.uint8]:
+    """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
+
+    Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
+    orange where not.
+
+    Args:
+        sampled_rollouts: Several rollouts from one start, at least one.
+        spec: Names macro-actions and macrostates.
+
+    Returns:
+        The image. Shape (height, width, 3), uint8.
+    """
+    depth = max(len(each.rollout.actions) for each in sampled_rollouts)
+    width = 2 * _MARGIN + (depth + 1) * (_CELL + _SHEET_GAP)
+    canvas = Image.new("RGB", (width, 2 * _MARGIN + len(sampled_rollouts) * _SHEET_ROW), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    for row, compared in enumerate(sampled_rollouts):
+        top = _MARGIN + row * _SHEET_ROW + _SHEET_HEADER
+        if row == 0:
+            _paste(canvas, compared.start_frame, (_MARGIN, top))
+            draw.text((_MARGIN, top - 18), "the real start", font=font(12, bold=True), fill=INK)
+        else:
+            draw.text((_MARGIN, top + 40), "the same start,\nimagined again", font=font(12), fill=FAINT)
+        for step in range(len(compared.rollout.actions)):
+            _sampled_cell(canvas, draw, compared, step, top, spec)
+    return np.asarray(canvas)
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Encode an image (height, width, 3), uint8, as PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="PNG")
+    Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()
 
 
-def rgb(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A picture in [0, 1], gray (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
-    pixels = (np.clip(picture, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+def rgb(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """An image in [0, 1], gray (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
+    pixels = (np.clip(image, 0.0, 1.0) * 255.0).round().astype(np.uint8)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
 
 
 def first_cut(compared: ComparedRollout) -> int | None:
-    """Index of the first macro-action that the uncertainty filter throws away, or None where it keeps all."""
+    """Index of the first macro-action that the uncertainty filter discards, or None where it keeps all."""
     rejected = np.flatnonzero(~compared.rollout.accepted)
     return int(rejected[0]) if rejected.size else None
+
+
+def changes(before: Macrostate, now: Macrostate, spec: TaskSpec) -> str:
+    """What is different, in the task's own words."""
+    named = zip(spec.macrostate_names, spec.value_names(now), before, now, strict=True)
+    return ", ".join(f"{name} {value}" for name, value, was, after in named if was != after) or "nothing changes"
+
+
+def is_possible(rules: Rules, before: Macrostate, action: int, now: Macrostate) -> bool:
+    """Whether the rules allow ``now`` after ``action`` in ``before``."""
+    state, reached = tuple(before.tolist()), tuple(now.tolist())
+    known = state in rules.states and not rules.is_terminal(state)
+    return known and any(outcome.macrostate == reached for outcome in rules.outcomes(state, action))
+
+
+@functools.lru_cache
+def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which travels with matplotlib."""
+    name = f"mpl-data/fonts/ttf/DejaVuSans{'-Bold' if bold else ''}.ttf"
+    data = resources.files("matplotlib").joinpath(name).read_bytes()
+    return ImageFont.truetype(io.BytesIO(data), size)
 
 
 def _column(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, index: int, names: tuple[str, ...]
 ) -> None:
-    rollout, column = compared.rollout, index + 1
+    rollout, left = compared.rollout, _left(index + 1)
     kept, happened = bool(rollout.accepted[index]), index < len(compared.real_frames)
     over = 0 < index <= len(compared.real_frames) and bool(compared.real_terminated[index - 1])
     right = happened and np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
-    judged = happened and not over
-    ink = INK if kept else FAINT
+    ink, verdict, words = INK if kept else FAINT, RIGHT if right else WRONG, ""
     lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
-    draw.multiline_text((_left(column), 8), "\n".join(lines), font=font(12, bold=True), fill=ink, spacing=3)
+    draw.multiline_text((left, 8), "\n".join(lines), font=font(12, bold=True), fill=ink, spacing=3)
     if happened:
-        _picture(canvas, compared.real_frames[index], column=column, row=0, pale=over)
+        _paste(canvas, compared.real_frames[index], (left, _HEADER), pale=over)
     if over:
-        _overlay_text(draw, column, "episode over")
-    _picture(canvas, rgb(rollout.frames[index]), column=column, row=1, pale=not kept)
-    if judged:
-        _frame(draw, column, RIGHT if right else WRONG)
+        width = draw.textlength("episode over", font=font(13, bold=True))
+        corner = (left + (_CELL - width) / 2, _HEADER + _CELL / 2 - 8)
+        draw.text(corner, "episode over", font=font(13, bold=True), fill=INK)
+    _paste(canvas, rgb(rollout.frames[index]), (left, _HEADER + _ROW), pale=not kept)
+    if happened and not over:
+        words, top = "as the rules say" if right else "not what happens", _HEADER + _ROW
+        draw.rectangle([left - 3, top - 3, left + _CELL + 2, top + _CELL + 2], outline=verdict, width=3)
     truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
-    facts = [
-        ("as the rules say" if right else "not what happens") if judged else "",
+    draw.text((left, _BOTTOM), words, font=font(12, bold=True), fill=verdict)
+    predictions = (
         f"reward {_signed(rollout.rewards[index])}{truth}",
         f"P(end) {rollout.p_terminated[index]:.2f}",
         f"epistemic {rollout.epistemic[index]:.2g}",
-    ]
-    for line, text in enumerate(facts):
-        color = (RIGHT if right else WRONG) if line == 0 else ink
-        draw.text((_left(column), _HEADER + 2 * _ROW + line * 19), text, font=font(12, bold=line == 0), fill=color)
+    )
+    for line, text in enumerate(predictions, start=1):
+        draw.text((left, _BOTTOM + line * 19), text, font=font(12), fill=ink)
 
 
-def _cut_mark(draw: ImageDraw.ImageDraw, compared: ComparedRollout, room: int) -> None:
-    cut = first_cut(compared)
-    if cut is None or cut >= room:
-        return
-    x = _left(cut + 1) - _GAP // 2 - 1
-    draw.line([(x, 4), (x, _HEADER + 2 * _ROW + _FOOTER - 20)], fill=_CUT, width=3)
+def _mark_cut(draw: ImageDraw.ImageDraw, x: int) -> None:
+    draw.line([(x, 4), (x, _BOTTOM + _FOOTER - 20)], fill=_CUT, width=3)
     text = "filter cuts here"
     length = int(draw.textlength(text, font=font(11, bold=True)))
-    bottom = _HEADER + 2 * _ROW + _FOOTER - 16
-    draw.text((max(2, x - length // 2), bottom), text, font=font(11, bold=True), fill=_CUT)
+    draw.text((max(2, x - length // 2), _BOTTOM + _FOOTER - 16), text, font=font(11, bold=True), fill=_CUT)
 
 
-def _row_labels(draw: ImageDraw.ImageDraw) -> None:
-    bottom = _HEADER + 2 * _ROW
-    for y, text in ((_HEADER + 54, "real"), (_HEADER + _ROW + 54, "imagined")):
-        draw.text((8, y), text, font=font(15, bold=True), fill=INK)
-    draw.multiline_text((8, bottom + 19), "predicted\n(true)", font=font(12), fill=FAINT, spacing=4)
+def _sampled_cell(
+    canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, step: int, top: int, spec: TaskSpec
+) -> None:
+    rollout, left = compared.rollout, _MARGIN + (step + 1) * (_CELL + _SHEET_GAP)
+    action, now = int(rollout.actions[step]), rollout.macrostates[step]
+    before = compared.start_macrostate if step == 0 else rollout.macrostates[step - 1]
+    title = textwrap.wrap(spec.action_names[action], width=_LINE)[:2]
+    draw.multiline_text((left, top - _SHEET_HEADER), "\n".join(title), font=font(11, bold=True), fill=INK, spacing=2)
+    _paste(canvas, rgb(rollout.frames[step]), (left, top))
+    end = "; the end" if rollout.p_terminated[step] > 0.5 else ""
+    lines = textwrap.wrap(changes(before, now, spec) + end, width=_LINE)[:3]
+    color = RIGHT if is_possible(spec.rules, before, action, now) else WRONG
+    draw.multiline_text((left, top + _CELL + 3), "\n".join(lines), font=font(11), fill=color, spacing=2)
 
 
-def _overlay_text(draw: ImageDraw.ImageDraw, column: int, text: str) -> None:
-    length = draw.textlength(text, font=font(13, bold=True))
-    x, y = _left(column) + (_CELL - length) / 2, _HEADER + _CELL / 2 - 8
-    draw.text((x, y), text, font=font(13, bold=True), fill=INK)
-
-
-def _frame(draw: ImageDraw.ImageDraw, column: int, color: tuple[int, int, int]) -> None:
-    x, y = _left(column), _HEADER + _ROW
-    draw.rectangle([x - 3, y - 3, x + _CELL + 2, y + _CELL + 2], outline=color, width=3)
-
-
-def _picture(canvas: Image.Image, pixels: NDArray[np.uint8], *, column: int, row: int, pale: bool = False) -> None:
+def _paste(canvas: Image.Image, pixels: NDArray[np.uint8], corner: tuple[int, int], *, pale: bool = False) -> None:
     image = Image.fromarray(pixels).resize((_CELL, _CELL), Image.Resampling.NEAREST)
     if pale:
         image = Image.blend(image, Image.new("RGB", image.size, PAPER), 0.65)
-    canvas.paste(image, (_left(column), _HEADER + row * _ROW))
+    canvas.paste(image, corner)
 
 
 def _left(column: int) -> int:
@@ -148,11 +198,3 @@ def _left(column: int) -> int:
 
 def _signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "\u2212")
-
-
-@functools.lru_cache
-def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which travels with matplotlib."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    data = resources.files("matplotlib").joinpath("mpl-data", "fonts", "ttf", name).read_bytes()
-    return ImageFont.truetype(io.BytesIO(data), size)

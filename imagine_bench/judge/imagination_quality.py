@@ -1,136 +1,130 @@
-"""How right an agent's imagination is, measured against the rules; nothing here is ever shown to the agent."""
+"""How right an agent's imagination is, measured against the rules; nothing here is ever shown to the agent.
+
+Open loop: macro-actions that keep the episode alive are imagined from real starts and compared by depth. Examples:
+rollouts that the greedy controller chooses stand beside what the environment shows for the same macro-actions.
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout, Imaginer
-from imagine_bench.interfaces import Frame, Rules, TaskSpec
-from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, State, TaskSpec
+from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
 EXAMPLES = 5
 """Greedy imagined rollouts kept with each run, with their real counterparts."""
+SAMPLED_ROLLOUTS, SAMPLED_DEPTH = 4, 5
+"""Rollouts sampled from one start and kept with each run, and macro-actions of each."""
 
-COURSES, COURSE_DEPTH = 4, 5
-"""Imagined sampled_rollouts of one beginning kept with each run, and macro-actions of each."""
-
-State = tuple[int, ...]
 Alive = Callable[[frozenset[State], int], bool]
-Belief = dict[State, float]
-"""Probabilities of macrostates; of deterministic rules always a single one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question:
-    """A real start and actions the rules keep alive, with what the rules say about each step.
+class OpenLoopStart:
+    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them.
 
     Attributes:
-        frame: The real frame. Shape (64, 64, 3).
+        frame: The real frame.
         actions: Drawn uniformly among those that end no episode, now or by force later. Shape (D,).
-        beliefs: What the macrostate may be after each action. Length D.
+        beliefs: Probabilities of the macrostates after each action. Length D.
         rewards: Expected reward of each action. Shape (D,).
     """
 
-    frame: NDArray[np.uint8]
+    frame: Frame
     actions: NDArray[np.int64]
-    beliefs: tuple[Belief, ...]
-    rewards: NDArray[np.float64]
+    beliefs: tuple[dict[State, float], ...]
+    rewards: Floats
 
 
 def ask(
     spec: TaskSpec, *, starts: int, depth: int, appearance: str, purpose: Purpose = "evaluation"
-) -> tuple[Question, ...]:
-    """The questions of the open-loop comparison: the same for every agent and seed.
+) -> tuple[OpenLoopStart, ...]:
+    """The starts of the open-loop comparison: the same for every agent and seed.
 
     Args:
         spec: The task.
         starts: How many.
-        depth: Imagined steps D of each.
+        depth: Imagined steps D of each; fewer where the rules cannot be kept alive as long.
         appearance: Appearance level of the start frames (kinematic mode).
-        purpose: What the answers are for; tuning has questions of its own.
+        purpose: What the comparison is for; tuning has starts of its own.
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
     alive = _alive(spec)
     candidates: list[State] = []
-    while depth and not candidates:  # rules that cannot be kept alive as long are asked for less
+    while depth and not candidates:
         candidates = [state for state in spec.rules.start_states if alive(frozenset({state}), depth)]
         depth -= not candidates
     if not candidates or not starts:
         return ()
     states = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
     frames = spec.render_macrostates(np.array(states, dtype=np.int64), appearance, rng)
-    return tuple(_question(spec, alive, start, depth, rng) for start in zip(states, frames, strict=True))
-
-
-def open_loop(agent: Imaginer, questions: tuple[Question, ...], seeds: SeedTree) -> OpenLoop:
-    """Imagine every question's actions in closed loop of the model and compare by depth.
-
-    An imagined macrostate is right if it is one the rules allow after these actions, which for deterministic rules is
-    exactly one; the reward is compared with its expectation. The rules keep every rollout alive: any predicted end is
-    wrong.
-
-    Args:
-        agent: It is not changed.
-        questions: At least one, all of the same depth D.
-        seeds: Names the generators that imagination draws from.
-    """
-    answers = [
-        agent.imagine(
-            question.frame,
-            actions=question.actions,
-            depth=len(question.actions),
-            rng=seeds.child(index).generator(),
-        )
-        for index, question in enumerate(questions)
-    ]
-    correct = np.array([_correct(q, a) for q, a in zip(questions, answers, strict=True)])  # [starts, D]
-    accepted = np.array([answer.accepted for answer in answers])
-    rewards = np.array([answer.rewards for answer in answers], dtype=np.float64)
-    truths = np.array([question.rewards for question in questions])
-    kept = accepted.sum(axis=0)  # [D]
-    return OpenLoop(
-        count=np.full(correct.shape[1], len(questions), dtype=np.int64),
-        correct=correct.mean(axis=0),
-        correct_accepted=np.where(kept > 0, (correct & accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
-        accepted=accepted.mean(axis=0),
-        reward_mae=np.abs(rewards - truths).mean(axis=0),
-        termination_error=_mean([answer.p_terminated > 0.5 for answer in answers]),
-        epistemic=_mean([answer.epistemic for answer in answers]),
-        aleatoric=_mean([answer.aleatoric for answer in answers]),
-        modal=_mean([answer.modal for answer in answers]),
-        **_detection(correct, answers),
+    return tuple(
+        _open_loop_start(spec, alive, state, frame, depth, rng) for state, frame in zip(states, frames, strict=True)
     )
 
 
-def _detection(correct: NDArray[np.bool_], answers: list[ImaginedRollout]) -> dict[str, NDArray[np.float64]]:
-    """How well each uncertainty tells wrong transitions from right ones, by depth, where they began right.
+def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTree) -> OpenLoop:
+    """Imagine the macro-actions of every start in closed loop of the model and compare by depth.
+
+    An imagined macrostate is correct if the rules allow it after these actions; the reward is compared with its
+    expectation. The rules keep every rollout alive: any predicted termination is wrong.
 
     Args:
-        correct: Shape (starts, D).
-        answers: Length starts.
+        agent: It is not changed.
+        starts: At least one, all of the same depth D.
+        seeds: Names the generators that imagination draws from.
     """
+    rollouts = [
+        agent.imagine(start.frame, actions=start.actions, depth=len(start.actions), rng=seeds.child(index).generator())
+        for index, start in enumerate(starts)
+    ]
+
+    def stacked(name: str) -> Floats:  # [starts, D]
+        return np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
+
+    correct = np.array([
+        [tuple(row) in belief for row, belief in zip(rollout.macrostates.tolist(), start.beliefs, strict=True)]
+        for start, rollout in zip(starts, rollouts, strict=True)
+    ])  # fmt: skip  # [starts, D]
+    accepted, kept = stacked("accepted"), stacked("accepted").sum(axis=0)
+    rewards = np.array([start.rewards for start in starts])
+    causes = {cause: stacked(cause) for cause in ("epistemic", "aleatoric", "modal")}
+    return OpenLoop(
+        count=np.full(correct.shape[1], len(starts), dtype=np.int64),
+        correct=correct.mean(axis=0),
+        correct_accepted=np.where(kept > 0, (correct * accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
+        accepted=accepted.mean(axis=0),
+        reward_mae=np.abs(stacked("rewards") - rewards).mean(axis=0),
+        termination_error=(stacked("p_terminated") > 0.5).mean(axis=0),
+        **{cause: values.mean(axis=0) for cause, values in causes.items()},
+        **_detection(correct, causes),
+    )
+
+
+def _detection(correct: NDArray[np.bool_], causes: dict[str, Floats]) -> dict[str, Floats]:
+    """How well each uncertainty (starts, D) tells wrong transitions from correct ones that began correct, by depth."""
     from imagine_bench.judge.calibration import auroc  # noqa: PLC0415 - scipy loads slowly
 
     began = np.concatenate([np.ones((len(correct), 1), dtype=np.bool_), correct[:, :-1]], axis=1)
     found = {"judged": began.sum(axis=0).astype(np.float64)}
-    for kind in ("epistemic", "aleatoric", "modal"):
-        scores = np.array([getattr(answer, kind) for answer in answers], dtype=np.float64)
-        columns = zip(scores.T, correct.T, began.T, strict=True)
-        found[f"auroc_{kind}"] = np.array([auroc(score[b], ~right[b]) for score, right, b in columns])
+    for cause, values in causes.items():
+        columns = zip(values.T, correct.T, began.T, strict=True)
+        found[f"auroc_{cause}"] = np.array([auroc(value[b], ~right[b]) for value, right, b in columns])
     return found
 
 
 def examples(
     agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
 ) -> tuple[ComparedRollout, ...]:
-    """A handful of rollouts the greedy controller chooses, each beside its real counterpart.
+    """A handful of rollouts that the greedy controller chooses, each from a start of its own, beside reality.
 
     Args:
         agent: It is not changed.
@@ -139,80 +133,121 @@ def examples(
         seeds: Names the generators that imagination draws from.
         purpose: What the starts are drawn for.
     """
+    starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
-    known = len(spec.rules.start_states)
-    picks = rng.choice(known, size=EXAMPLES, replace=known < EXAMPLES)
-    states = np.array([spec.rules.start_states[index] for index in picks], dtype=np.int64)
+    picks = rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)
+    states = np.array([starts[index] for index in picks], dtype=np.int64)
     frames = spec.render_macrostates(states, appearance, rng)
-    return tuple(
-        compare_rollout(
-            spec,
-            frame=frame,
-            macrostate=state,
-            rollout=agent.imagine(frame, actions=None, depth=spec.horizon, rng=seeds.child(index).generator()),
-            appearance=appearance,
-            rng=rng,
-        )
-        for index, (frame, state) in enumerate(zip(frames, states, strict=True))
-    )
-
-
-def is_random(rules: Rules) -> bool:
-    """Whether some macro-action may lead to one thing or another."""
-    return any(len(rules.outcomes(state, action)) > 1 for state in rules.states for action in range(rules.n_actions))
+    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=spec.horizon)
 
 
 def imagine_sampled_rollouts(
     agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
 ) -> tuple[ComparedRollout, ...]:
-    """Imagine the same beginning several times, the agent's greedy controller choosing; none if nothing is random.
-
-    Args:
-        agent: It is not changed.
-        spec: The task; the beginning is the same for every agent and seed.
-        appearance: Appearance level of the real frame (kinematic mode).
-        seeds: Names the generators that imagination draws from.
-        purpose: What the beginning is drawn for.
-    """
+    """Like :func:`examples`, with the same start several times; none where the rules leave nothing to chance."""
     if not is_random(spec.rules):
         return ()
     rng = SeedTree(0).child(purpose, "sampled_rollouts", spec.id).generator()
     start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
     frame = spec.render_macrostates(start[None], appearance, rng)[0]
-    return courses_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)
+    return sampled_rollouts_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)
 
 
-def courses_from(
+def sampled_rollouts_from(
+    agent: Imaginer, spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, appearance: str, seeds: SeedTree
+) -> tuple[ComparedRollout, ...]:
+    """Imagine one start several times: the real ``frame``, which shows ``macrostate``. See :func:`examples`."""
+    frames, states = [frame] * SAMPLED_ROLLOUTS, [macrostate] * SAMPLED_ROLLOUTS
+    rng = seeds.child("reality").generator()
+    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=SAMPLED_DEPTH)
+
+
+def _greedy_rollouts(
     agent: Imaginer,
+    spec: TaskSpec,
+    frames: Iterable[Frame],
+    states: Iterable[Macrostate],
+    appearance: str,
+    seeds: SeedTree,
+    rng: np.random.Generator,
+    *,
+    depth: int,
+) -> tuple[ComparedRollout, ...]:
+    found = []
+    for index, (frame, state) in enumerate(zip(frames, states, strict=True)):
+        rollout = agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator())
+        found.append(
+            compare_rollout(spec, frame=frame, macrostate=state, rollout=rollout, appearance=appearance, rng=rng)
+        )
+    return tuple(found)
+
+
+def compare_rollout(
     spec: TaskSpec,
     *,
     frame: Frame,
-    macrostate: NDArray[np.int64],
+    macrostate: Macrostate,
+    rollout: ImaginedRollout,
     appearance: str,
-    seeds: SeedTree,
-) -> tuple[ComparedRollout, ...]:
-    """Imagine one beginning several times, the agent's greedy controller choosing.
+    rng: np.random.Generator,
+) -> ComparedRollout:
+    """Put the truth beside an imagined rollout: the rules give states and rewards, the kinematic mode gives frames.
+
+    Where the rules leave several outcomes to chance, the one that was imagined is taken if it is among them.
+    Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
 
     Args:
-        agent: It is not changed.
         spec: The task.
-        frame: The real frame it begins with. Shape (64, 64, 3).
+        frame: The real frame the rollout starts from.
         macrostate: What that frame shows. Shape (M,).
-        appearance: Appearance level of the real counterparts.
-        seeds: Names the generators that imagination and reality draw from.
+        rollout: What the agent imagined from it, of depth D.
+        appearance: Appearance level of the real frames.
+        rng: Draws among stochastic outcomes, and the appearance.
     """
-    rng = seeds.child("reality").generator()
-    return tuple(
-        compare_rollout(
-            spec,
-            frame=frame,
-            macrostate=macrostate,
-            rollout=agent.imagine(frame, actions=None, depth=COURSE_DEPTH, rng=seeds.child(index).generator()),
-            appearance=appearance,
-            rng=rng,
-        )
-        for index in range(COURSES)
+    state = tuple(int(value) for value in macrostate)
+    over = spec.rules.is_terminal(state)
+    real: list[tuple[State, float, bool]] = []
+    for action, imagined in zip(rollout.actions, rollout.macrostates, strict=True):
+        reward = 0.0
+        if not over:
+            outcome = _choose(spec.rules.outcomes(state, int(action)), tuple(imagined.tolist()), rng)
+            state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
+        real.append((state, reward, over))
+    states = np.array([state for state, _, _ in real], dtype=np.int64)
+    frames = spec.render_macrostates(states, appearance, rng) if real else ()
+    return beside_reality(rollout, frame, macrostate, frames, real)
+
+
+def beside_reality(
+    rollout: ImaginedRollout,
+    frame: Frame,
+    macrostate: Sequence[int] | Macrostate,
+    frames: Sequence[Frame] | Frame,
+    real: Sequence[tuple[State, float, bool]],
+) -> ComparedRollout:
+    """An imagined rollout from a ``frame`` that shows ``macrostate``, and what really came of it.
+
+    ``frames`` and ``real`` (macrostate, reward, whether the episode has ended) have an entry for each macro-action
+    that was carried out.
+    """
+    done = len(real)
+    return ComparedRollout(
+        start_frame=frame.copy(),
+        start_macrostate=np.array(macrostate, dtype=np.int64),
+        rollout=rollout,
+        real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
+        real_macrostates=np.array([state for state, _, _ in real], dtype=np.int64).reshape(done, len(macrostate)),
+        real_rewards=np.array([reward for _, reward, _ in real], dtype=np.float64),
+        real_terminated=np.array([over for _, _, over in real], dtype=np.bool_),
     )
+
+
+def _choose(outcomes: tuple[Outcome, ...], imagined: State, rng: np.random.Generator) -> Outcome:
+    """The imagined outcome if it is possible, else one of the possible ones, with its probability."""
+    for outcome in outcomes:
+        if outcome.macrostate == imagined:
+            return outcome
+    return outcomes[int(rng.choice(len(outcomes), p=[outcome.probability for outcome in outcomes]))]
 
 
 def _alive(spec: TaskSpec) -> Alive:
@@ -236,41 +271,19 @@ def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps:
     return safe
 
 
-def _question(
-    spec: TaskSpec, alive: Alive, start: tuple[State, NDArray[np.uint8]], depth: int, rng: np.random.Generator
-) -> Question:
-    state, frame = start
-    belief: Belief = {state: 1.0}
+def _open_loop_start(
+    spec: TaskSpec, alive: Alive, start: State, frame: Frame, depth: int, rng: np.random.Generator
+) -> OpenLoopStart:
+    belief: Belief = {(start, False): 1.0}
     actions, beliefs, rewards = [], [], []
     for step in range(depth):
-        action = int(rng.choice(_safe_actions(spec, alive, belief, depth - step)))
-        belief, reward = _advance(spec.rules, belief, action)
-        actions.append(action)
-        beliefs.append(belief)
+        actions.append(int(rng.choice(_safe_actions(spec, alive, by_macrostate(belief), depth - step))))
+        belief, reward = advance(spec.rules, belief, actions[-1])
+        beliefs.append(by_macrostate(belief))
         rewards.append(reward)
-    return Question(
+    return OpenLoopStart(
         frame=frame,
         actions=np.array(actions, dtype=np.int64),
         beliefs=tuple(beliefs),
         rewards=np.array(rewards, dtype=np.float64),
     )
-
-
-def _advance(rules: Rules, belief: Belief, action: int) -> tuple[Belief, float]:
-    """The belief after ``action`` and the reward expected of it."""
-    after: Belief = {}
-    reward = 0.0
-    for state, weight in belief.items():
-        for outcome in rules.outcomes(state, action):
-            after[outcome.macrostate] = after.get(outcome.macrostate, 0.0) + weight * outcome.probability
-            reward += weight * outcome.probability * outcome.reward
-    return after, reward
-
-
-def _correct(question: Question, answer: ImaginedRollout) -> NDArray[np.bool_]:
-    read = [tuple(int(value) for value in row) for row in answer.macrostates]
-    return np.array([state in belief for state, belief in zip(read, question.beliefs, strict=True)])
-
-
-def _mean(rows: list[NDArray[np.float32]] | list[NDArray[np.bool_]]) -> NDArray[np.float64]:
-    return np.asarray(rows, dtype=np.float64).mean(axis=0)

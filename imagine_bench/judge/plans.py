@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, Rules
+from imagine_bench.interfaces import Frame, State
+from imagine_bench.judge.imagination_quality import beside_reality
+from imagine_bench.rules import fewest_actions
 from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
-State = tuple[int, ...]
 OnStep = Callable[[int], None]
 """Told after each macro-action how many of the plan are done."""
 
@@ -130,55 +131,26 @@ def carry_out(
     refused = _refusal(rollout, max_epistemic)
     if on_plan is not None:
         on_plan(frame, rollout)
-    frames, states, rewards, ends, faults, solved = [], [], [], [], 0, False
+    frames, real, faults, solved = [], [], 0, False
     for step, action in enumerate([] if refused else rollout.actions, start=1):
         seen, reward, terminated, truncated, info = env.step(int(action))
         frames.append(seen)
-        states.append(_state(info))
-        rewards.append(float(reward))
-        ends.append(bool(terminated))
+        real.append((_state(info), float(reward), bool(terminated)))
         faults += bool(info["fault"])
         solved = bool(info["is_success"])
         if on_step is not None:
             on_step(step)
         if terminated or truncated:
             break
-    done = len(frames)
-    compared = ComparedRollout(
-        start_frame=frame.copy(),
-        start_macrostate=np.array(start, dtype=np.int64),
-        rollout=rollout,
-        real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
-        real_macrostates=np.array(states, dtype=np.int64).reshape(done, len(start)),
-        real_rewards=np.array(rewards, dtype=np.float64),
-        real_terminated=np.array(ends, dtype=np.bool_),
-    )
     return Plan(
         number=number,
         start=start,
-        compared=compared,
+        compared=beside_reality(rollout, frame, start, frames, real),
         refused=refused,
         solved=solved,
         shortest=fewest_actions(trained.task.rules, start),
         faults=faults,
     )
-
-
-def fewest_actions(rules: Rules, start: State) -> int:
-    """The fewest macro-actions after which the rules can give a success; exact where the rules are deterministic.
-
-    Raises:
-        InvalidValueError: No success can be reached from ``start``.
-    """
-    reached, seen, steps = {start}, {start}, 0
-    while reached:
-        steps += 1
-        outcomes = [o for state in reached for action in range(rules.n_actions) for o in rules.outcomes(state, action)]
-        if any(outcome.success for outcome in outcomes):
-            return steps
-        reached = {outcome.macrostate for outcome in outcomes if not outcome.terminated} - seen
-        seen |= reached
-    raise InvalidValueError(f"The rules allow no success from {start}.")
 
 
 def require_threshold(max_epistemic: float | None) -> None:
@@ -189,16 +161,16 @@ def require_threshold(max_epistemic: float | None) -> None:
 
 def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     """Why a plan must not be carried out, or an empty string."""
-    doubt = rollout.epistemic
+    epistemic = rollout.epistemic
     if max_epistemic is not None:
-        if float(doubt.max()) <= max_epistemic:
+        if float(epistemic.max()) <= max_epistemic:
             return ""
-        step = int((doubt > max_epistemic).argmax())
-        return f"epistemic uncertainty {doubt[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
+        step = int((epistemic > max_epistemic).argmax())
+        return f"epistemic uncertainty {epistemic[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
     if not rollout.accepted.all():
         step = int((~rollout.accepted).argmax())
-        uncertainty = f"epistemic uncertainty of the state {doubt[step]:.2g}"
-        return f"the agent's filter discards macro-action {step + 1} ({uncertainty})"
+        why = f"epistemic uncertainty of the state {epistemic[step]:.2g}"
+        return f"the agent's filter discards macro-action {step + 1} ({why})"
     return ""
 
 

@@ -24,12 +24,11 @@ from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
-from imagine_bench.judge.comparison import compare_rollout
-from imagine_bench.judge.filmstrips import png, rgb, rollout_strip
-from imagine_bench.judge.imagination_quality import courses_from, is_random
-from imagine_bench.judge.sampled_filmstrips import courses_sheet
+from imagine_bench.judge.filmstrips import filmstrip, png, rgb, sampled_filmstrips
+from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
@@ -248,7 +247,7 @@ class _Story:
         compared = compare_rollout(
             self._spec, frame=frame, macrostate=macrostate, rollout=rollout, appearance=self._appearance, rng=rng
         )
-        strip = png(rollout_strip(compared, self._spec.action_names, columns=IMAGINED_DEPTH))
+        strip = png(filmstrip(compared, self._spec.action_names, columns=IMAGINED_DEPTH))
         self._recording.log("/imagined/strip", rr.EncodedImage(contents=strip, media_type="image/png"), strict=True)
         self._uncertainty_bars(compared)
         if is_random(self._spec.rules):
@@ -257,11 +256,11 @@ class _Story:
             self._by_depth(compared, f"/imagined/episode_{episode}")
 
     def _several(self, agent: Imaginer, frame: Frame, macrostate: NDArray[np.int64], seeds: SeedTree) -> None:
-        """Several imagined sampled_rollouts from here, where what happens next is partly chance."""
-        sampled_rollouts = courses_from(
+        """Several rollouts sampled from here, where what happens next is partly chance."""
+        sampled_rollouts = sampled_rollouts_from(
             agent, self._spec, frame=frame, macrostate=macrostate, appearance=self._appearance, seeds=seeds
         )
-        sheet = png(courses_sheet(sampled_rollouts, self._spec))
+        sheet = png(sampled_filmstrips(sampled_rollouts, self._spec))
         self._recording.log(
             "/imagined/sampled_rollouts", rr.EncodedImage(contents=sheet, media_type="image/png"), strict=True
         )

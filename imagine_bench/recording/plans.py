@@ -16,7 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench.interfaces import SceneReader
-from imagine_bench.judge.filmstrips import png, rgb, rollout_strip
+from imagine_bench.judge.filmstrips import filmstrip, png, rgb
 from imagine_bench.judge.plans import Plan, carry_out, make_env
 from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ, recording_file
@@ -115,7 +115,7 @@ class _PlanStory:
         recording.log("/real/frame", rr.Image(real), strict=True)
         recording.log("/imagined/frame", rr.Image(rgb(imagined)), strict=True)
         task = self._trained.task  # room for the longest plan: the viewer takes no pictures of different sizes
-        strip = rollout_strip(_so_far(compared, done), task.action_names, columns=task.horizon)
+        strip = filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
         image = rr.EncodedImage(contents=png(strip), media_type="image/png")
         recording.log("/imagined/strip", image, strict=True)
         text = rr.TextDocument(self._words(plan, done), media_type=rr.MediaType.MARKDOWN)

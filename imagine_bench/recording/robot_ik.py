@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.recording.episodes import recording_file
 from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
-from imagine_bench.regression import RegressionSpec
+from imagine_bench.regression.interfaces import RegressionSpec
 
 CHOICES = 6
 """Decisions of the first network that are shown: the first ones, not the best."""

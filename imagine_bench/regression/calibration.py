@@ -1,4 +1,4 @@
-"""Calibration of a regressor's networks on unseen points: is it as sure as it may be, and unsure where it is wrong?"""
+"""Calibration of a regressor's networks on unseen points, and whether uncertainty finds wrong predictions."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from imagine_bench.judge.calibration import (
     probability_transform,
     transform_distance,
 )
-from imagine_bench.regression import SCORES, Floats, Mixtures, RegressionSpec, Regressor
-from imagine_bench.regression.results import Arrays, Row
+from imagine_bench.regression.interfaces import SCORES, Floats, Mixtures, RegressionSpec, Regressor
+from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.codec import Arrays
 
 CRPS_POINTS = 50
 """Points of each network at which both distributions are scored: all weight samples together cost (T K)^2 a point."""
@@ -33,8 +34,8 @@ def calibrate(
 ) -> tuple[list[Row], Arrays]:
     """Measure every network on points of its own.
 
-    Two predictive distributions are judged: ``predictive``, from which the regressor draws its predictions (for dropout
-    the thesis' averaged parameters), and ``pooled``, all weight samples' mixtures side by side.
+    Two predictive distributions are judged: ``predictive``, from which the regressor samples its predictions (for
+    dropout the thesis' averaged parameters), and ``pooled``, all weight samples' mixtures side by side.
 
     Args:
         task: Gives the points and says how wrong a prediction is.
@@ -42,7 +43,7 @@ def calibrate(
         variant: What they were trained on.
         networks: One node of the seed tree each.
         points: Unseen points a network, N.
-        rng: Draws the predictions.
+        rng: Samples the predictions.
 
     Returns:
         One row a network, and arrays: ``transform`` and ``pooled_transform`` (E, N, D), ``error`` (E, N), and one a
@@ -50,14 +51,14 @@ def calibrate(
     """
     tests = [task.testing(variant, node.child("test", variant).generator(), points) for node in networks]
     inputs, targets = np.stack([t.inputs for t in tests]), np.stack([t.targets for t in tests])
-    said = regressor.predict(inputs, rng)
-    error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, said.prediction, strict=True)])
-    scores = {name: score(said) for name, score in SCORES.items()}
-    transform = probability_transform(said.predictive, targets)
+    prediction = regressor.predict(inputs, rng)
+    error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, prediction.prediction, strict=True)])
+    scores = {name: score(prediction) for name, score in SCORES.items()}
+    transform = probability_transform(prediction.predictive, targets)
     pooled_transform, pooled_crps = _pooled(regressor, inputs, targets)
     rows: list[Row] = []
     for e in range(len(networks)):
-        own = Mixtures(**{n: getattr(said.predictive, n)[e] for n in ("weights", "means", "sigmas")})
+        own = Mixtures(**{n: getattr(prediction.predictive, n)[e] for n in ("weights", "means", "sigmas")})
         wrong = error[e] > task.wrong_above
         row: Row = {"error_mean": error[e].mean(), "error_median": np.median(error[e]), "wrong": wrong.mean()}
         own_crps = crps(own, targets[e])  # [N, D]

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import ProtocolData, digest, require_seeds
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
+from imagine_bench.protocols.data import ProtocolData, digest, require_seeds
 
 _SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -24,7 +24,8 @@ class RegressionProtocol(ProtocolData):
 
     Attributes:
         task: Registered regression task.
-        preset: Name of this protocol and of the regressors' settings preset.
+        preset: Name of this protocol.
+        hyperparameters: Set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``.
         variants: Variants of the task, in the order of the report; the task's own where none are given.
         agents: Registered regressors, in the order of the report.
         seeds: One run a seed and regressor; each in [0, 2**24).
@@ -32,12 +33,13 @@ class RegressionProtocol(ProtocolData):
         test_points: Unseen points of each network, for errors and calibration.
         recorded: Whether runs leave a recording.
         overrides: Settings that replace the preset's, as sorted (name, value) pairs.
-        settings_digest: As of :class:`imagine_bench.bench.protocol.Protocol`.
+        settings_digest: As of :class:`imagine_bench.protocols.data.ProtocolData`.
         device: ``"cpu"`` or ``"cuda"``.
     """
 
     task: str
     preset: str
+    hyperparameters: str = "fast"
     variants: tuple[str, ...] = ()
     agents: tuple[str, ...] = ("mc_dropout", "ensemble")
     seeds: tuple[int, ...] = (0,)
@@ -74,10 +76,10 @@ class RegressionProtocol(ProtocolData):
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "smoke": {"networks": 2, "test_points": 50},
+    "smoke": {"hyperparameters": "minimal", "networks": 2, "test_points": 50},
     "quick": {},
-    "thesis": {"networks": 10, "test_points": 500},
-    "full": {"networks": 20, "test_points": 1000},
+    "thesis": {"hyperparameters": "published", "networks": 10, "test_points": 500},
+    "full": {"hyperparameters": "published", "networks": 20, "test_points": 1000},
 }
 """What each preset changes: ``thesis`` is chapter 4 as printed, ten networks on ten datasets."""
 
@@ -99,7 +101,7 @@ def plan(
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    settings = registry.load(_SETTINGS)(wanted.preset, dict(wanted.overrides))
+    settings = registry.load(_SETTINGS)(wanted.hyperparameters, dict(wanted.overrides))
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)
     return replace(wanted, settings_digest=digest([asdict(one) for one in settings])), {}

@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.judge.calibration import LEVELS
-from imagine_bench.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
-from imagine_bench.regression.results import RegressionResult, rows_csv
+from imagine_bench.regression.interfaces import SCORES
+from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.page import aligned, facts, flat
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
 from imagine_bench.report.template import render
+from imagine_bench.store.codec import table_text
 from imagine_bench.store.files import csv_text, make_folder, write_bytes
 
 _SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -46,7 +47,7 @@ def write_report(result: RegressionResult) -> Path:
     tables = [table for section in sections for table in section.tables]
     files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]).encode() for table in tables}
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
-    files["results.csv"] = rows_csv(rows).encode()
+    files["results.csv"] = table_text(rows).encode()
     files["report.md"] = render("regression.md.j2", context).encode()
     files["index.html"] = render("regression.html.j2", context).encode()
     for name, content in files.items():

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.regression import SCORES
+from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.sections import Picture, Section, Table, mean_std, picture
 from imagine_bench.report.text import few_words

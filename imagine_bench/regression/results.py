@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +13,14 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
-from imagine_bench.store.files import csv_text, write_bytes
+from imagine_bench.store.codec import Arrays, grouped, read_arrays, table_rows, table_text, write_arrays
+from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import require_one_setting
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
 
 Row = dict[str, float | str]
 """One network of one variant: ``variant``, ``network``, and every measure by name."""
-Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,13 +107,7 @@ class RegressionResult:
 
 def write_rows(folder: Path, rows: Sequence[Row]) -> None:
     """Write one row a variant and network, atomically."""
-    write_bytes(folder / METRICS, rows_csv(rows).encode())
-
-
-def rows_csv(rows: Sequence[Row]) -> str:
-    """Rows as CSV; what one was not measured by, as an older version made it, is an empty cell."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
+    write_bytes(folder / METRICS, table_text(rows).encode())
 
 
 def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
@@ -124,7 +116,7 @@ def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays])
     flat = {  # sorted, for a checkpoint gives arrays back in any order
         f"{variant}/{name}": array for variant, arrays in evaluations.items() for name, array in sorted(arrays.items())
     }
-    run_folder.write_arrays(folder / EVALUATION, flat)
+    write_arrays(folder / EVALUATION, flat)
     run_folder.mark_done(folder, ["config.json", METRICS, EVALUATION])
 
 
@@ -136,15 +128,12 @@ def load_run(folder: Path) -> RegressionRun:
     """
     config = run_folder.require_done(folder)
     recording = run_folder.recording_path(folder)
-    rows = csv.DictReader(io.StringIO((folder / METRICS).read_text()))
     return RegressionRun(
         agent=config["agent"],
         seed=config["seed"],
         settings=config["settings"],
-        rows=tuple(
-            {name: value if name == "variant" else float(value) for name, value in row.items() if value} for row in rows
-        ),
-        evaluations=run_folder.grouped(run_folder.read_arrays(folder / EVALUATION)),
+        rows=tuple(table_rows((folder / METRICS).read_text(), texts=("variant",))),
+        evaluations=grouped(read_arrays(folder / EVALUATION)),
         folder=folder,
         recording=recording if recording.is_file() else None,
     )

@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.cohort import cpu_time_s
-from imagine_bench.bench.runs import Observer, Phase, Progress, RunSpec
 from imagine_bench.errors import DivergedError
-from imagine_bench.regression import Dataset, Floats, Prediction, Regressor, RegressorContext
+from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.results import Arrays, RegressionRun, Row, finish, load_run, write_rows
+from imagine_bench.regression.interfaces import Dataset, Floats, Prediction, Regressor, RegressorContext
+from imagine_bench.regression.protocol import RegressionProtocol
+from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
 from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
+from imagine_bench.store.codec import Arrays, grouped
 from imagine_bench.store.files import lock, make_folder
 
 _SLICES = 100
@@ -29,7 +30,7 @@ _MEASURING = 10
 """What measuring counts beside them."""
 
 
-def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RegressionRun:
+def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
     """Do a run, or what is left of it, and read its result; a finished run is only read.
 
     Args:
@@ -51,7 +52,7 @@ def run(spec: RunSpec, folder: Path, on_progress: Observer) -> RegressionRun:
 
 
 class _Run:
-    def __init__(self, spec: RunSpec, folder: Path, on_progress: Observer) -> None:
+    def __init__(self, spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> None:
         self.spec, self.folder, self.on_progress = spec, folder, on_progress
         self.protocol, self.task = spec.protocol, registry.regression(spec.protocol.task)
         self.seeds = SeedTree(spec.seed)
@@ -62,7 +63,7 @@ class _Run:
         self.snapshot = load_newest(folder / "checkpoints")
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
-            found = run_folder.grouped(self.snapshot.arrays)  # files give arrays back in any order
+            found = grouped(self.snapshot.arrays)  # files give arrays back in any order
             self.evaluations = {variant: found[variant] for variant in self.protocol.variants if variant in found}
         self.saved_s = time.monotonic()
 
@@ -92,7 +93,7 @@ class _Run:
         return RegressorContext(
             datasets=datasets,
             seeds=tuple(node.child("regressor", variant) for node in self.networks),
-            preset=self.protocol.preset,
+            hyperparameters=self.protocol.hyperparameters,
             overrides=dict(self.protocol.overrides),
             device=self.protocol.device,
         )
@@ -111,9 +112,9 @@ class _Run:
         step = max(1, regressor.epochs // _SLICES)
         try:
             while regressor.epoch < regressor.epochs:
-                start_s = cpu_time_s()
+                start_s = time.process_time()
                 regressor.train(min(step, regressor.epochs - regressor.epoch))
-                self.train_cpu_s += cpu_time_s() - start_s
+                self.train_cpu_s += time.process_time() - start_s
                 done = _SLICES * regressor.epoch // regressor.epochs
                 self._tell("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
                 if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
@@ -125,7 +126,7 @@ class _Run:
 
     def _measure(self, regressor: Regressor, variant: str) -> None:
         self._tell("testing", f"{variant}, measuring", _SLICES)
-        start_s = cpu_time_s()
+        start_s = time.process_time()
         rows, arrays = calibrate(
             self.task, regressor, variant, self.networks, points=self.protocol.test_points,
             rng=self.seeds.child("calibration", variant).generator(),
@@ -135,7 +136,7 @@ class _Run:
             return regressor.predict(inputs, self.seeds.child("predict", variant, name).generator())
 
         evaluation = self.task.evaluate(variant, predict, self.networks)
-        measure_cpu_s = cpu_time_s() - start_s
+        measure_cpu_s = time.process_time() - start_s
         shared: Row = {**regressor.diagnostics()}  # of all networks together; the CPU seconds are a network's share
         shared["train_cpu_s"] = self.train_cpu_s / self.protocol.networks
         shared["measure_cpu_s"] = measure_cpu_s / self.protocol.networks

@@ -211,7 +211,8 @@ def summary_csv(data: ReportData) -> str:
 def futures_csv(data: ReportData) -> str:
     """One row an agent, seed, budget, depth, macrostate and macro-action of the futures that were sampled."""
     spec, errors = data.spec, ("reward_error", "termination_error")
-    measures = ("samples", "total_variation", "floor", "missing", "hallucinated", *errors, "survival_probability")
+    outcomes = ("total_variation", "sampling_noise_floor", "missed", "hallucinated")
+    measures = ("samples", *outcomes, *errors, "survival_probability")
     rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
     for agent in data.futures:
         for run in data.result.of(agent):
@@ -224,7 +225,8 @@ def futures_csv(data: ReportData) -> str:
 
 def _futures_rows(futures: Futures, spec: TaskSpec, measures: tuple[str, ...]) -> Iterator[list[object]]:
     for depth, pair in np.ndindex(*futures.total_variation.shape):
-        numbers = [np.broadcast_to(getattr(futures, name), futures.floor.shape)[depth, pair] for name in measures]
+        shape = futures.total_variation.shape
+        numbers = [np.broadcast_to(getattr(futures, name), shape)[depth, pair] for name in measures]
         yield [
             depth + 1,
             *spec.value_names(futures.macrostates[pair]),
@@ -312,7 +314,8 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 
     weight = np.stack([each.survival_probability for each in found])  # [runs, D, P]
     distance = np.stack([each.total_variation for each in found])
-    uncertain = np.stack([each.floor for each in found]) > 0.0  # no sample of a certain outcome can deviate from it
+    # No sample of a certain outcome can deviate from it.
+    uncertain = np.stack([each.sampling_noise_floor for each in found]) > 0.0
     by_budget: dict[int, list[tuple[float, float]]] = {}
     for run in runs:
         for checkpoint in run.checkpoints:
@@ -325,8 +328,8 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
         total_variation=mean("total_variation"),
         by_chance=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
         survival_probability=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
-        floor=mean("floor"),
-        missing=total("missing"),
+        floor=mean("sampling_noise_floor"),
+        missing=total("missed"),
         hallucinated=total("hallucinated"),
         reward_error=mean("reward_error"),
         termination_error=mean("termination_error"),

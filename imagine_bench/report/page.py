@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.judge.filmstrips import first_cut, png, rollout_strip
-from imagine_bench.judge.sampled_filmstrips import courses_sheet
+from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.report import plots
 from imagine_bench.report import text as words
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
@@ -196,7 +195,7 @@ def _strip(data: ReportData, agent: str, seed: int, index: int, compared: Compar
     )
     return Picture(
         name=f"rollout_{agent}_{index + 1}",
-        png=png(rollout_strip(compared, data.spec.action_names)),
+        png=png(filmstrip(compared, data.spec.action_names)),
         alt=f"Real frames above, imagined frames below. {caption}",
         caption=caption,
     )
@@ -212,7 +211,7 @@ def _courses(data: ReportData) -> list[Picture]:
             caption = (
                 f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
             )
-            sheet = png(courses_sheet(run.sampled_rollouts, data.spec))
+            sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
             alt = f"Only the first picture is real. {caption}"
             sheets.append(Picture(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
     return sheets

@@ -1,10 +1,10 @@
-"""What became of an agent's plans: a table for the terminal and for a page, one row a plan, and the pictures."""
+"""Plans imagined from one frame and carried out without a second look: a table, one row a plan, and filmstrips."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,35 +13,107 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.filmstrips import png, rollout_strip
-from imagine_bench.judge.plans import Plan
+from imagine_bench.bench.progress import counted
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import EXECUTIONS, TaskSpec
+from imagine_bench.judge.filmstrips import filmstrip, png
+from imagine_bench.judge.plans import Plan, make_plans, require_threshold
+from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.text import percent
-from imagine_bench.store.files import csv_text, make_folder, with_null, write_bytes, write_json, writing
+from imagine_bench.store.bench_folder import load_bench, read_protocol
+from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
+from imagine_bench.store.trained import Trained, best_run, load_trained, require_control, require_runs
 
 _COLUMNS = (
     *("plan", "start", "shortest", "planned", "done", "solved", "optimal", "refused", "as_imagined", "faults"),
     *("max_epistemic", "actions"),
 )
 RECORDING = "recording.rrd"
+_FILMSTRIPS = 6
+"""Plans in plans.png, of as many lengths as there are."""
 _SHOWN_FAILURES = 12
+
+Record = Callable[..., Path]
+"""Records plans: :func:`imagine_bench.recording.plans.record_plans`."""
+
+
+def plan_report(
+    run: Path | None,
+    *,
+    root: Path,
+    task: str | None,
+    count: int,
+    execution: str,
+    max_epistemic: float | None,
+    encoder: str | None,
+    recorded: int = 0,
+    record: Record | None = None,
+) -> str:
+    """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
+
+    Args:
+        run: A run's folder, or a bench's, whose best imagining run is taken; None for the newest bench.
+        root: Folder of all benches.
+        task: Whose newest bench; None for that of any task.
+        count: Plans.
+        execution: ``"physics"`` or ``"kinematic"``.
+        max_epistemic: See :func:`imagine_bench.judge.plans.make_plans`.
+        encoder: See :func:`imagine_bench.store.trained.load_trained`.
+        recorded: Plans that are recorded.
+        record: Records them.
+
+    Returns:
+        What to print.
+
+    Raises:
+        ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
+        BusyError: Another process makes the same plans.
+    """
+    require_known("execution", execution, EXECUTIONS)
+    if recorded < 0 or count < 1:
+        raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
+    require_threshold(max_epistemic)
+    run = chosen(run, root, task)
+    if (run / "protocol.json").exists():  # a bench's folder
+        require_control(read_protocol(run).task, str(run))
+        require_runs(run)
+        run = best_run(load_bench(run)).folder
+    trained = load_trained(run, encoder=encoder)
+    name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
+    folder = make_folder(run / "plans" / name)
+    how: dict[str, Any] = {"execution": execution, "max_epistemic": max_epistemic}
+    with lock(folder / ".lock", f"The folder {folder}"):
+        plans = list(counted(make_plans(trained, count=count, **how), "plans", total=count))
+        lines = _write(trained, plans, folder, how)
+        if record is not None and recorded:
+            path = record(trained, count=min(recorded, count), **how, path=folder / RECORDING)
+            lines.append(f"Recording:  {path} (imagine-bench view opens it)")
+    return "\n".join(lines)
+
+
+def _write(trained: Trained, plans: Sequence[Plan], folder: Path, how: dict[str, Any]) -> list[str]:
+    """Keep the plans of a trained agent, and say what became of them."""
+    spec, task = trained.spec, trained.task
+    run = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
+    origin = {**provenance(spec.protocol.hash), **run, "appearance": spec.protocol.appearance, **how}
+    summary = write_plans(folder, plans, task, origin, filmstrips=_FILMSTRIPS)
+    return [
+        f"{task.title}: {spec.agent}, seed {spec.seed}, after {trained.episodes:,} real episodes, "
+        f"{spec.protocol.appearance}, {how['execution']}",
+        "",
+        plan_table(summary, task),
+        "",
+        *(f"plan {plan.number} from {plan.start}: {plan.outcome}" for plan in plans if not plan.solved),
+        f"Filmstrips: {folder / 'plans.png'}",
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSummary:
-    """Counts over plans.
+    """Counts over plans, and macro-actions of the solved ones (0 and NaN where none was).
 
-    Attributes:
-        attempted: Plans asked for.
-        refused: Those not carried out for doubt.
-        solved: Those that solved the task.
-        optimal: Those of them that took the fewest macro-actions possible.
-        shortest: Macro-actions of the shortest solved plan; 0 where none was solved.
-        longest: Macro-actions of the longest solved plan.
-        mean_length: Mean macro-actions of the solved plans; NaN where none was.
-        steps: Macro-actions carried out.
-        steps_as_imagined: Those that led where they were imagined to.
-        faults: Those whose physics disagreed with the rules.
+    ``steps`` are macro-actions carried out, ``steps_as_imagined`` those that led where they were imagined to, and
+    ``faults`` those whose physics disagreed with the rules.
     """
 
     attempted: int
@@ -77,28 +149,25 @@ def plan_table(summary: PlanSummary, task: TaskSpec) -> str:
     """The counts as Markdown, the thesis' beside them where it has any."""
     thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
     low, high = statistics.wilson(summary.solved, summary.attempted)
+    share = f"{summary.solved} = {percent(summary.solved / summary.attempted)} % [{percent(low)}, {percent(high)}]"
+    lengths = f"{summary.shortest} to {summary.longest}, mean {summary.mean_length:.2f}" if summary.solved else "–"
     rows = [
         ("plans", f"{summary.attempted}", thesis.get("attempted")),
-        (
-            "solved",
-            f"{summary.solved} = {percent(summary.solved / summary.attempted)} % [{percent(low)}, {percent(high)}]",
-            thesis.get("solved"),
-        ),
+        ("solved", share, thesis.get("solved")),
         ("of these optimal", f"{summary.optimal}", thesis.get("optimal_among_solved")),
-        ("refused for doubt", f"{summary.refused}", None),
-        ("macro-actions of a solved plan", _lengths(summary), _thesis_lengths(thesis)),
+        ("refused as too uncertain", f"{summary.refused}", None),
+        ("macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else None),
         ("macro-actions that led where imagined", f"{summary.steps_as_imagined} of {summary.steps}", None),
         ("faults of the physics", f"{summary.faults}", None),
     ]
-    lines = ["| open-loop plans, carried out blindly | here | thesis |", "|---|---|---|"]
-    lines += [f"| {name} | {here} | {'–' if there is None else there} |" for name, here, there in rows]
-    return "\n".join(lines)
+    shown = [(name, here, "–" if there is None else there) for name, here, there in rows]
+    return "\n".join(markdown(["open-loop plans, carried out blindly", "here", "thesis"], shown))
 
 
 def write_plans(
-    folder: Path, plans: Sequence[Plan], task: TaskSpec, facts: dict[str, Any], *, strips: int
+    folder: Path, plans: Sequence[Plan], task: TaskSpec, provenance: dict[str, Any], *, filmstrips: int
 ) -> PlanSummary:
-    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and strips of the first plans that failed.
+    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
 
     What an earlier call left there, its recording included, goes.
 
@@ -106,8 +175,8 @@ def write_plans(
         folder: Where to; it is made.
         plans: What became of them.
         task: Their task.
-        facts: How they were made, for ``summary.json``.
-        strips: Plans in ``plans.png``, of as many lengths as there are.
+        provenance: How they were made, for ``summary.json``.
+        filmstrips: Plans in ``plans.png``, of as many lengths as there are.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -118,21 +187,13 @@ def write_plans(
             earlier.unlink(missing_ok=True)
     summary = summarise(plans)
     write_bytes(folder / "plans.csv", _csv(plans).encode())
-    write_json(folder / "summary.json", {**facts, **with_null(dataclasses.asdict(summary))})
+    write_json(folder / "summary.json", {**provenance, **with_null(dataclasses.asdict(summary))})
     failures = [plan for plan in plans if not plan.solved]
     write_bytes(folder / "plans.md", (_page(summary, failures, task)).encode())
-    write_bytes(folder / "plans.png", png(_stack(_varied(plans, strips), task)))
+    write_bytes(folder / "plans.png", png(_stack(_varied(plans, filmstrips), task)))
     for plan in failures[:_SHOWN_FAILURES]:
         write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))
     return summary
-
-
-def _lengths(summary: PlanSummary) -> str:
-    return f"{summary.shortest} to {summary.longest}, mean {summary.mean_length:.2f}" if summary.solved else "–"
-
-
-def _thesis_lengths(thesis: dict[str, Any]) -> str | None:
-    return f"{thesis['shortest']} to {thesis['longest']}" if thesis else None
 
 
 def _page(summary: PlanSummary, failures: Sequence[Plan], task: TaskSpec) -> str:
@@ -166,6 +227,6 @@ def _varied(plans: Sequence[Plan], count: int) -> list[Plan]:
 
 
 def _stack(plans: Sequence[Plan], task: TaskSpec) -> NDArray[np.uint8]:
-    """The strips of plans below one another. Shape (height, width, 3)."""
+    """The filmstrips of plans below one another. Shape (height, width, 3)."""
     columns = max(plan.length for plan in plans)
-    return np.concatenate([rollout_strip(plan.compared, task.action_names, columns=columns) for plan in plans])
+    return np.concatenate([filmstrip(plan.compared, task.action_names, columns=columns) for plan in plans])

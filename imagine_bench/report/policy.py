@@ -1,20 +1,19 @@
-"""Where the greedy policies of a bench's agents lead, as a table for the terminal, a page, and one row a start."""
+"""Where the greedy policies of a bench's agents lead, by the rules and from every start."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.policy import FRAMES, Ends, optimal_length
-from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
-from imagine_bench.seeding import SeedTree
-from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
+from imagine_bench.interfaces import Floats, State, TaskSpec
+from imagine_bench.judge.policy import FRAMES, Terminations, action_shares, eval_states, optimal_length, terminations
+from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
+from imagine_bench.report.text import agent_words, percent
+from imagine_bench.seeding import Purpose
+from imagine_bench.store.trained import Trained
 
 _SHARES = {
     "success": "solved",
@@ -28,124 +27,98 @@ _SURE = 0.999
 _LISTED = 12
 """Starts that the page lists; starts.csv has all."""
 
-_Groups = dict[tuple[str, int], list[Ends]]
-"""The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these."""
+
+def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+    """Follow the policy of every learner of a bench: :func:`.analysis.analyse`."""
+    return analyse(PolicyAnalysis, folder, root=root, task=task, encoder=encoder)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Followed:
-    """One run, and where its policy led after ``episodes`` real training episodes."""
+class PolicyAnalysis(Analysis[Terminations]):
+    """Where each policy leads from every start."""
 
-    agent: str
-    seed: int
-    episodes: int
-    ends: Ends
+    name = "policy"
+    heading = "where the greedy policies lead"
+    rows_file = "starts.csv"
 
+    def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
+        super().__init__(spec, appearance=appearance, purpose=purpose)
+        self._states = eval_states(spec, appearance=appearance, purpose=purpose)
+        self._optimal = optimal_length(spec)
 
-def policy_table(followed: Sequence[Followed], task: TaskSpec) -> str:
-    """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
-    groups, optimal = _groups(followed), optimal_length(task)
-    fewest = min((len(ends) for ends in groups.values() if len(ends) > 1), default=1)
-    lines = [
-        f"All {len(task.rules.start_states)} starts, followed by the rules; every visit of a macrostate shows one of "
-        f"{FRAMES} frames of it. Mean over seeds [95 % interval over seeds]. "
-        f"{' '.join(few_words(fewest))}".rstrip(),
-        "",
-        f"| agent | real episodes | seeds | {' | '.join(f'{words}, %' for words in _SHARES.values())} "
-        f"| macro-actions (optimal: {optimal.mean():.2f}) |",
-        f"|---|---|---|{'---|' * len(_SHARES)}---|",
-    ]
-    for (agent, episodes), ends in groups.items():
-        cells = [_cell([getattr(one, share) for one in ends], f"{agent} {share}") for share in _SHARES]
-        cells.append(_cell([one.length for one in ends], f"{agent} length", "{:.2f}".format))
-        lines.append(f"| {agent_words(agent).title} | {episodes:,} | {len(ends)} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *_by_distance(groups, optimal), "", *_missed(groups, optimal, task)])
+    def measure(self, trained: Trained) -> Terminations:
+        """Where its policy leads."""
+        shares = action_shares(trained.agent, self._states, self.spec.n_actions)
+        return terminations(self.spec, self._states, shares)
 
+    def table(self, runs: Sequence[Measured[Terminations]]) -> str:
+        """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
+        groups = Groups(runs, self.name)
+        head = ["agent", "real episodes", "seeds", *(f"{words}, %" for words in _SHARES.values())]
+        rows = []
+        for (agent, episodes), seeds in groups.items():
+            means = {name: [float(getattr(each, name).mean()) for each in seeds] for name in (*_SHARES, "length")}
+            cells = [groups.cell(means[share], f"{agent} {share}") for share in _SHARES]
+            length = groups.cell(means["length"], f"{agent} length", "{:.2f}".format)
+            rows.append([agent_words(agent).title, f"{episodes:,}", len(seeds), *cells, length])
+        lines = [
+            f"All {len(self._optimal)} starts, followed by the rules; every visit of a macrostate shows one of "
+            f"{FRAMES} frames of it; {groups.caution}",
+            "",
+            *markdown([*head, f"macro-actions (optimal: {self._optimal.mean():.2f})"], rows),
+            "",
+            *self._by_distance(groups),
+            "",
+            *self._missed(groups),
+        ]
+        return "\n".join(lines)
 
-def write_policy(folder: Path, followed: Sequence[Followed], task: TaskSpec, facts: dict[str, Any]) -> None:
-    """Write ``starts.csv``, ``summary.json`` and ``policy.md``.
+    def rows(self, runs: Sequence[Measured[Terminations]]) -> Iterable[Sequence[object]]:
+        """One row a run and start."""
+        names = (*_SHARES, "length")
+        yield ["agent", "seed", "episodes", *self.spec.macrostate_names, *names, "optimal_length"]
+        for run in runs:
+            for index, state in enumerate(self.spec.rules.start_states):
+                numbers = [*(getattr(run.value, name)[index] for name in names), self._optimal[index]]
+                yield [*run.head.values(), *self.spec.value_names(state), *(f"{number:.6g}" for number in numbers)]
 
-    Raises:
-        SetupError: The folder cannot be written.
-    """
-    make_folder(folder)
-    runs = [
-        {
-            "agent": one.agent,
-            "seed": one.seed,
-            "episodes": one.episodes,
-            **{name: float(getattr(one.ends, name).mean()) for name in (*_SHARES, "length")},
-        }
-        for one in followed
-    ]
-    write_bytes(folder / "starts.csv", _csv(followed, task).encode())
-    write_json(folder / "summary.json", {**facts, "runs": runs})
-    page = f"# {task.title}: where the greedy policies lead\n\n{policy_table(followed, task)}\n\n{origin(facts)}\n"
-    write_bytes(folder / "policy.md", page.encode())
+    def summary(self, value: Terminations) -> dict[str, Any]:
+        """Means over the starts."""
+        return {name: float(getattr(value, name).mean()) for name in (*_SHARES, "length")}
 
+    def _by_distance(self, groups: Groups[Terminations]) -> list[str]:
+        """What is solved of the starts from which an optimal agent needs equally long, in whole macro-actions."""
+        needs, solved, rows = self._optimal.round().astype(int), _solved(groups), []
+        for need in np.unique(needs):
+            shares = solved[:, needs == need].mean(axis=1)
+            rows.append([need, int((needs == need).sum()), *map(percent, shares)])
+        return markdown(["optimal macro-actions", "starts", *_heads(groups)], rows)
 
-def _groups(followed: Sequence[Followed]) -> _Groups:
-    groups: _Groups = {}
-    for one in followed:
-        groups.setdefault((one.agent, one.episodes), []).append(one.ends)
-    return groups
+    def _missed(self, groups: Groups[Terminations]) -> list[str]:
+        """The starts that are solved least, with what an optimal agent needs there."""
+        solved, states = _solved(groups), self.spec.rules.start_states
+        worst = np.min([one.success for seeds in groups.values() for one in seeds], axis=0)  # [starts]
+        order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]
+        if not order:
+            return ["Every run solves every start."]
+        rows = [
+            [self._words(states[index]), f"{self._optimal[index]:.2f}", *map(percent, solved[:, index])]
+            for index in order[:_LISTED]
+        ]
+        return [
+            f"Starts that some run does not always solve: {len(order)} of {len(self._optimal)}. Solved least:",
+            "",
+            *markdown(["start", "optimal macro-actions", *_heads(groups)], rows),
+        ]
 
-
-def _by_distance(groups: _Groups, optimal: NDArray[np.float64]) -> list[str]:
-    """What is solved of the starts from which an optimal agent needs equally long, in whole macro-actions."""
-    needs = optimal.round().astype(int)
-    solved = _solved(groups)
-    lines = [f"| optimal macro-actions | starts | {_heads(groups)} |", f"|---|---|{'---|' * len(groups)}"]
-    for need in np.unique(needs):
-        cells = " | ".join(percent(float(share)) for share in solved[:, needs == need].mean(axis=1))
-        lines.append(f"| {need} | {int((needs == need).sum())} | {cells} |")
-    return lines
-
-
-def _missed(groups: _Groups, optimal: NDArray[np.float64], task: TaskSpec) -> list[str]:
-    """The starts that are solved least, with what an optimal agent needs there."""
-    solved = _solved(groups)
-    worst = np.min([one.success for ends in groups.values() for one in ends], axis=0)  # [starts]
-    order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]
-    if not order:
-        return ["Every run solves every start."]
-    lines = [
-        f"Starts that some run does not always solve: {len(order)} of {len(optimal)}. Solved least:",
-        "",
-        f"| start | optimal macro-actions | {_heads(groups)} |",
-        f"|---|---|{'---|' * len(groups)}",
-    ]
-    for index in order[:_LISTED]:
-        cells = " | ".join(percent(float(share)) for share in solved[:, index])
-        lines.append(f"| {_words(task.rules.start_states[index], task)} | {optimal[index]:.2f} | {cells} |")
-    return lines
+    def _words(self, state: State) -> str:
+        named = zip(self.spec.macrostate_names, self.spec.value_names(state), strict=True)
+        return ", ".join(f"{name} {value}" for name, value in named)
 
 
-def _solved(groups: _Groups) -> NDArray[np.float64]:
+def _solved(groups: Groups[Terminations]) -> Floats:
     """Mean over the seeds of each group, of each start. Shape (groups, starts)."""
-    return np.array([np.mean([one.success for one in ends], axis=0) for ends in groups.values()])
+    return np.array([np.mean([one.success for one in seeds], axis=0) for seeds in groups.values()])
 
 
-def _heads(groups: _Groups) -> str:
-    return " | ".join(f"{agent_words(agent).title}, {episodes:,} episodes: solved, %" for agent, episodes in groups)
-
-
-def _words(macrostate: tuple[int, ...], task: TaskSpec) -> str:
-    named = zip(task.macrostate_names, task.value_names(macrostate), strict=True)
-    return ", ".join(f"{name} {value}" for name, value in named)
-
-
-def _cell(parts: Sequence[NDArray[np.float64]], name: str, words: Callable[[float], str] = percent) -> str:
-    values = [float(part.mean()) for part in parts]
-    return mean_text(values, SeedTree(0).child("report", "policy", name).generator(), words)
-
-
-def _csv(followed: Sequence[Followed], task: TaskSpec) -> str:
-    optimal = optimal_length(task)
-    rows = [["agent", "seed", "episodes", *task.macrostate_names, *_SHARES, "length", "optimal_length"]]
-    for one in followed:
-        for index, state in enumerate(task.rules.start_states):
-            numbers = [*(getattr(one.ends, name)[index] for name in (*_SHARES, "length")), optimal[index]]
-            shares = [f"{number:.6g}" for number in numbers]
-            rows.append([one.agent, str(one.seed), str(one.episodes), *task.value_names(state), *shares])
-    return csv_text(rows)
+def _heads(groups: Groups[Terminations]) -> list[str]:
+    return [f"{title}: solved, %" for title in groups.titles]

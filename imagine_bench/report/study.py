@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench import statistics
-from imagine_bench.bench.study import Line, Study
 from imagine_bench.report.plots import STYLE
 from imagine_bench.report.text import estimate_text, few_words, percent
 from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
+from imagine_bench.studies.study import Line, Study
 
 _HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's palette
 

@@ -16,11 +16,11 @@ import numpy as np
 
 from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.bench_folder import KEPT, read_protocol
 from imagine_bench.store.files import csv_text, json_text, read_json
-from imagine_bench.store.partial import largest_part
+from imagine_bench.store.merge import largest_part
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
-from imagine_bench.task_types import TASK_TYPES
 
 _RESULTS = "results.csv"
 _COUNTS = ("episodes", "env_steps", "test_episodes", "successes")
@@ -71,7 +71,7 @@ def load_archive(folder: Path) -> BenchResult:
         InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
-    if whole.task not in TASK_TYPES["control"].tasks:
+    if not isinstance(whole, Protocol):
         raise InvalidValueError(
             f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
             f"that act have a report. The command in its {KEPT} makes the bench anew, with one."

@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.registry import load
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.task_types import Result, task_type
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder, read_json, reading, write_json
-from imagine_bench.task_types import task_type
 
 KEPT = "bench.json"
 """Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
-_PROTOCOL, _ENVIRONMENT, _SITTINGS = "protocol.json", "environment.json", "sessions.json"
+_PROTOCOL, _ENVIRONMENT, _SESSIONS = "protocol.json", "environment.json", "sessions.json"
 _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
 
@@ -31,13 +32,13 @@ class BenchStore:
 
     Args:
         folder: The folder itself: that of :func:`bench_folder`, or wherever somebody has moved it to.
-        protocol: What is compared, of any kind.
+        protocol: What is compared.
     """
 
-    def __init__(self, folder: Path, protocol: Any) -> None:
+    def __init__(self, folder: Path, protocol: ProtocolData) -> None:
         self.protocol, self.folder = protocol, folder
         self._began_s = time.monotonic()
-        self._sittings: list[dict[str, Any]] = []
+        self._sessions: list[dict[str, Any]] = []
 
     def open(self) -> None:
         """Make the folder, or see that the one there is of this protocol.
@@ -83,16 +84,16 @@ class BenchStore:
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
         if begun:
-            self._sittings = _read_sittings(self.folder)
+            self._sessions = _read_sessions(self.folder)
         self._began_s = time.monotonic()
         changed, now = self.changed(environment), _facts(environment)
-        self._sittings.append({
+        self._sessions.append({
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "wall_s": 0.0,
             "command": environment["command"],
             "changed": {name: now.get(name) for name in changed},
         })  # fmt: skip
-        self.note_time()
+        self.save_time()
         if not begun:
             write_json(path, environment)  # last, so that a bench with an environment has sessions too
         return changed
@@ -104,19 +105,19 @@ class BenchStore:
         then, now = _facts(first), _facts(environment)
         return [name for name in _IDENTITY if then.get(name) != now.get(name)]
 
-    def note_time(self) -> None:
+    def save_time(self) -> None:
         """Note how long this session has lasted, so that a kill loses little of the count."""
-        self._sittings[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
-        write_json(self.folder / _SITTINGS, self._sittings)
+        self._sessions[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
+        write_json(self.folder / _SESSIONS, self._sessions)
 
 
-def bench_folder(root: Path, protocol: Any) -> Path:
+def bench_folder(root: Path, protocol: ProtocolData) -> Path:
     """Where the bench of a protocol belongs below ``root``, the folder of all benches, such as ``runs``."""
     return Path(root / protocol.task / f"{protocol.preset}-{protocol.hash}")
 
 
-def load_bench(folder: Path) -> Any:
-    """Read a finished bench, as the result class of its task's kind.
+def load_bench(folder: Path) -> Result:
+    """Read a finished bench, as the result class of its task's type.
 
     Raises:
         ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
@@ -124,9 +125,8 @@ def load_bench(folder: Path) -> Any:
     protocol = read_protocol(folder)
     folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
     kind = task_type(protocol.task)
-    load_run = load(kind.load_run)
-    runs = tuple(load_run(run) for run in folders if run_folder.is_done(run))
-    return load(kind.result)(protocol=protocol, runs=runs, **bench_facts(folder))
+    runs = tuple(kind.load_run(run) for run in folders if run_folder.is_done(run))
+    return kind.result(protocol=protocol, runs=runs, **bench_facts(folder))
 
 
 def bench_facts(folder: Path) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def bench_facts(folder: Path) -> dict[str, Any]:
             facts, sessions = kept["environment"], kept["sessions"]
             sessions = [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
     else:
-        facts, sessions = read_json(folder / _ENVIRONMENT, "a bench's environment"), _read_sittings(folder)
+        facts, sessions = read_json(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
     environment = {**facts, "sessions": sessions}
     return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
 
@@ -158,7 +158,7 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
     Raises:
         ArtefactError: There is none.
     """
-    found = [path for path in root.glob(f"*/*/{_SITTINGS}") if not tasks or path.parts[-3] in tasks]
+    found = [path for path in root.glob(f"*/*/{_SESSIONS}") if not tasks or path.parts[-3] in tasks]
     if not found:
         some = next(iter(tasks), "arrow_puzzle")
         where = root / some if len(tasks) == 1 else root
@@ -190,8 +190,8 @@ def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
     return {**environment, "cpu": environment.get("machine", {}).get("cpu")}
 
 
-def _read_sittings(folder: Path) -> list[dict[str, Any]]:
-    path, what = folder / _SITTINGS, "a bench's sessions"
+def _read_sessions(folder: Path) -> list[dict[str, Any]]:
+    path, what = folder / _SESSIONS, "a bench's sessions"
     sessions: list[dict[str, Any]] = read_json(path, what, holds=list)
     with reading(path, what):
         return [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
@@ -201,7 +201,7 @@ def _run_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / agent / f"seed_{seed}"
 
 
-def read_protocol(folder: Path) -> Any:
+def read_protocol(folder: Path) -> ProtocolData:
     """The protocol of a bench folder.
 
     Raises:
@@ -212,4 +212,16 @@ def read_protocol(folder: Path) -> Any:
     data = read_json(path, what)
     with reading(path, what):
         data = data["protocol"] if kept else data
-        return load(task_type(data["task"]).protocol).from_dict(data)
+        return task_type(data["task"]).protocol.from_dict(data)
+
+
+def read_control(folder: Path) -> Protocol:
+    """The protocol of a bench folder of agents that act.
+
+    Raises:
+        ArtefactError: It is of a regression task, missing or damaged; the message names it.
+    """
+    protocol = read_protocol(folder)
+    if not isinstance(protocol, Protocol):
+        raise ArtefactError(f"{folder} is of a regression task, in which no agent acts; give one of agents.")
+    return protocol

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import csv
 import errno
-import fcntl
 import hashlib
 import io
 import json
 import math
 import os
 import socket
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from imagine_bench.errors import ArtefactError, BusyError, ImagineBenchError, SetupError
 
@@ -69,7 +69,9 @@ def require_writable(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in ``folder`` survive a power cut."""
+    """Make the names in ``folder`` survive a power cut, where the system can be asked to."""
+    if os.name == "nt":  # a folder cannot be opened there
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -195,7 +197,7 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock file ``path``; the system lets go of it when this process ends, however it ends.
 
     Args:
-        path: The lock file, which stays behind, empty of meaning once nobody holds it.
+        path: The lock file, which stays behind, as does the name of its last holder beside it.
         busy: Where another process works, for the error.
         patience_s: How long to wait for the holder, in seconds.
 
@@ -203,28 +205,16 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
         BusyError: Another live process holds it; the message says which.
         SetupError: The folder cannot be written or locked.
     """
+    held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")
     with writing(path):
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            held.acquire()
+        except Timeout:
+            who = holder.read_text() if holder.is_file() else "another process"
+            raise BusyError(f"{busy} is in use by {who}; wait for it, stop it, or choose another folder.") from None
     try:
-        _acquire(handle, path, busy, time.monotonic() + patience_s)
-        with suppress(OSError):  # a courtesy for whoever finds it held, which a full disk cannot take
-            os.ftruncate(handle, 0)
-            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        with suppress(OSError):  # a courtesy to the next who finds it held, which a full disk cannot take
+            holder.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         yield
     finally:
-        os.close(handle)
-
-
-def _acquire(handle: int, path: Path, busy: str, deadline_s: float) -> None:
-    while True:
-        try:
-            with writing(path):
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except SetupError as error:
-            if not isinstance(error.__cause__, BlockingIOError):
-                raise
-        if time.monotonic() >= deadline_s:
-            holder = os.pread(handle, 200, 0).decode(errors="replace") or "another process"
-            raise BusyError(f"{busy} is in use by {holder}; wait for it, stop it, or choose another folder.")
-        time.sleep(0.05)
+        held.release()

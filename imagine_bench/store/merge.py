@@ -1,71 +1,196 @@
-"""Several benches as one, each measured by its own command: other agents on the same test, or other seeds of the same.
+"""Several runs as one table: of an unfinished bench the largest complete one, and several benches as one.
 
-The latter is how a bench is shared out among machines that have no disk in common.
+Benches that are merged were each measured by its own command: other agents on the same test, or other seeds of the
+same. The latter is how a bench is shared out among machines that have no disk in common.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from imagine_bench.bench.protocol import Protocol, digest
-from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.store.archive import is_archive, load_archive
-from imagine_bench.store.bench_folder import read_protocol
-from imagine_bench.store.partial import cut, load_so_far
-from imagine_bench.store.results import BenchResult
+import numpy as np
 
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import digest
+from imagine_bench.store import run_folder
+from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
+from imagine_bench.store.checkpoints import has_checkpoint
+from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
+
+_MEANS = ("time/", "loss/", "imagination/")
+"""Diagnostics that are means since the test before."""
 _OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
-def load_merged(folders: Sequence[Path], root: Path) -> BenchResult:
-    """Read several benches, finished or not or in the form they are kept in, that differ only in agents or in seeds.
+def load_so_far(folder: Path) -> BenchResult:
+    """Read a bench of agents, finished or not.
+
+    Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
+    and no agent has more seeds or episodes than another.
+
+    Raises:
+        ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
+    """
+    whole = read_control(folder)
+    store = BenchStore(folder, whole)
+    reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
+    part = largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
+    if part.missing:
+        return part
+    last = tuple(f"{agent} seed {seed}: its recording" for agent, seed in store.missing())  # tested, but not at its end
+    return dataclasses.replace(part, whole=whole if last else None, missing=last)
+
+
+def largest_part(
+    whole: Protocol,
+    reached: Mapping[tuple[str, int], int],
+    load: Callable[[str, int], RunResult],
+    folder: Path,
+    made_with: str = "",
+) -> BenchResult:
+    """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
+
+    Args:
+        whole: Its protocol.
+        reached: The last budget with results of every agent and seed; 0 where there are none.
+        load: Reads the run of an agent and seed.
+        folder: Where the bench's files lie.
+        made_with: See :class:`BenchResult`.
+
+    Raises:
+        ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
+    """
+    part = _largest_table(whole, reached)
+    missing = tuple(
+        f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
+        for (agent, seed), at in reached.items()
+        if at < whole.budgets[-1]
+    )
+    return BenchResult(
+        protocol=part,
+        runs=tuple(cut(load(agent, seed), part) for agent in part.agents for seed in part.seeds),
+        **bench_facts(folder),
+        whole=whole if missing else None,
+        missing=missing,
+        made_with=made_with,
+    )
+
+
+def _reached(store: BenchStore, agent: str, seed: int) -> int:
+    """The last budget of which a run has results; they lie in its newest checkpoint until it is done."""
+    folder = store.run_folder(agent, seed)
+    return run_folder.reached(folder) if run_folder.is_done(folder) or has_checkpoint(folder / "checkpoints") else 0
+
+
+def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:
+    """The protocol that is complete: among all cuts through the budgets, the one that leaves most results."""
+
+    def seeds_at(budget: int) -> tuple[int, ...]:
+        return tuple(seed for seed in whole.seeds if all(reached[agent, seed] >= budget for agent in whole.agents))
+
+    budgets = whole.budgets
+    count = max(range(1, len(budgets) + 1), key=lambda count: (count * len(seeds_at(budgets[count - 1])), count))
+    seeds = seeds_at(budgets[count - 1])
+    if not seeds:
+        raise ArtefactError(
+            f"No seed of this bench has brought every agent to {budgets[0]} real episodes yet, so there is nothing to "
+            "compare. Run the same bench command again to go on."
+        )
+    return dataclasses.replace(whole, seeds=seeds, budgets=budgets[:count])
+
+
+def _load(folder: Path) -> RunResult:
+    return run_folder.load_run(folder) if run_folder.is_done(folder) else run_folder.load_unfinished(folder)
+
+
+def cut(result: RunResult, part: Protocol) -> RunResult:
+    """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
+    kept = _as_if_untested(result.checkpoints, part.budgets)
+    episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
+    return dataclasses.replace(
+        result,
+        checkpoints=kept,
+        training_success=result.training_success[:episodes],
+        training_length=result.training_length[:episodes],
+        imagined=result.imagined if whole else (),
+        sampled_rollouts=result.sampled_rollouts if whole else (),
+    )
+
+
+def _as_if_untested(rows: Sequence[Checkpoint], budgets: Collection[int]) -> tuple[Checkpoint, ...]:
+    """The rows at some budgets; what agents said of the time since a test that is left out counts for the next."""
+    kept, since, before = list[Checkpoint](), list[Checkpoint](), 0
+    for row in rows:
+        since.append(row)
+        if row.episodes in budgets:
+            kept.append(row if len(since) == 1 else _over(since, before))
+            since, before = [], row.env_steps
+    return tuple(kept)
+
+
+def _over(rows: Sequence[Checkpoint], before: int) -> Checkpoint:
+    """The last of some rows with the mean times a real step of all of them, who began after ``before`` steps.
+
+    Means over losses and over imagined transitions are left out: how many there were of these is not kept.
+    """
+    last, steps = rows[-1], np.diff([before, *(row.env_steps for row in rows)])
+    said = {name: value for name, value in last.diagnostics.items() if not name.startswith(_MEANS)}
+    for name in {name for row in rows for name in row.diagnostics if name.startswith("time/")}:
+        values = np.array([row.diagnostics.get(name, np.nan) for row in rows])
+        if np.isfinite(values).any() and steps.sum() > 0:
+            said[name] = float(np.nansum(values * steps) / steps.sum())
+    return dataclasses.replace(last, diagnostics=said)
+
+
+def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
+    """Several benches, or parts of them, that differ only in agents or in seeds, as one.
 
     Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that
     any has. Budgets are those of all.
 
     Args:
-        folders: Theirs.
+        results: Theirs.
         root: Folder of all benches; the result's own is a new one in it, named by what was compared.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no seed or budget is in all.
-        ArtefactError: One is no bench of control, has nothing to show, or is damaged.
+        ArtefactError: Two runs of an agent had other settings.
     """
-    for folder in folders:
-        if not isinstance(read_protocol(folder), Protocol):
-            raise ArtefactError(f"{folder} is no bench of agents; only those can be shown together.")
-    results = [load_archive(folder) if is_archive(folder) else load_so_far(folder) for folder in folders]
-    protocol = _joined([result.protocol for result in results], folders)
+    protocol = _merged(results)
+    commands = "; ".join(str(result.environment.get("command", "")) for result in results)
+    benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
     return BenchResult(
         protocol=protocol,
         runs=tuple(cut(run, protocol) for result in results for run in result.runs if run.seed in protocol.seeds),
-        environment=_environment(results),
-        folder=root / protocol.task / f"together-{protocol.hash}",
+        environment={"command": commands, **benches},
+        folder=root / protocol.task / f"merged-{protocol.hash}",
         wall_s=sum(result.wall_s for result in results),
         missing=tuple(sentence for result in results for sentence in result.missing),
     )
 
 
-def _joined(protocols: Sequence[Protocol], folders: Sequence[Path]) -> Protocol:
+def _merged(results: Sequence[BenchResult]) -> Protocol:
+    """The protocol of all of them together."""
+    protocols = [result.protocol for result in results]
     first, same = protocols[0], len({frozenset(protocol.agents) for protocol in protocols}) == 1
-    agents = first.agents if same else _all([protocol.agents for protocol in protocols], "an agent")
-    digests = [protocol.settings_digest for protocol in protocols]  # empty, so unknown, in the oldest ones
-    seeds = [protocol.seeds for protocol in protocols]
-    for protocol, folder in zip(protocols, folders, strict=True):
+    for result in results:
         for field in dataclasses.fields(Protocol):
-            ours, theirs = getattr(first, field.name), getattr(protocol, field.name)
+            ours, theirs = getattr(first, field.name), getattr(result.protocol, field.name)
             if field.name not in _OWN and ours != theirs:
                 raise InvalidValueError(
-                    f"{folder} has {field.name} {theirs!r} where {folders[0]} has {ours!r}; benches that are shown "
-                    "together differ in their agents or in their seeds only."
+                    f"{result.folder} has {field.name} {theirs!r} where {results[0].folder} has {ours!r}; benches that "
+                    "are merged differ in their agents or in their seeds only."
                 )
+    digests = [protocol.settings_digest for protocol in protocols]
+    seeds = [protocol.seeds for protocol in protocols]
     return dataclasses.replace(
         first,
-        agents=agents,
+        agents=first.agents if same else _all([protocol.agents for protocol in protocols], "an agent"),
         settings_digest=_one(digests, "are of different settings") or "" if same else digest(digests),
         seeds=tuple(sorted(_all(seeds, "a seed"))) if same else _common(seeds, "seeds"),
         budgets=_common([protocol.budgets for protocol in protocols], "budgets"),
@@ -99,11 +224,3 @@ def _common(values: Sequence[tuple[int, ...]], name: str) -> tuple[int, ...]:
     if not kept:
         raise InvalidValueError(f"The benches have no {name} in common: {values}.")
     return kept
-
-
-def _environment(results: Sequence[BenchResult]) -> dict[str, Any]:
-    benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
-    return {
-        "command": "; ".join(str(result.environment.get("command", "")) for result in results),
-        **benches,
-    }

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.files import first_difference
 
 
@@ -56,15 +56,15 @@ class OpenLoop:
 
 @dataclass(frozen=True, kw_only=True)
 class Futures:
-    """Sampled futures against the exact ones, from every macrostate of play and macro-action: P pairs, depths 1 to D.
+    """Sampled futures against the exact ones, from every macrostate and macro-action: P pairs, depths 1 to D.
 
     Attributes:
         macrostates: Where each begins. Shape (P, M).
         actions: Its first macro-action. Shape (P,).
         samples: Futures of each pair. Shape ().
         total_variation: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
-        floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
-        missing: Possible outcomes that are not imagined. Shape (D, P).
+        sampling_noise_floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
+        missed: Possible outcomes that are not imagined. Shape (D, P).
         hallucinated: Imagined outcomes that are impossible. Shape (D, P).
         reward_error: Absolute error of the expected reward of this macro-action. Shape (D, P).
         termination_error: Absolute error of the probability that the episode is over. Shape (D, P).
@@ -75,8 +75,8 @@ class Futures:
     actions: NDArray[np.int64]
     samples: NDArray[np.int64]
     total_variation: NDArray[np.float64]
-    floor: NDArray[np.float64]
-    missing: NDArray[np.float64]
+    sampling_noise_floor: NDArray[np.float64]
+    missed: NDArray[np.float64]
     hallucinated: NDArray[np.float64]
     reward_error: NDArray[np.float64]
     termination_error: NDArray[np.float64]
@@ -156,7 +156,7 @@ class RunResult:
         training_success: Whether each training episode succeeded. Shape (episodes,).
         training_length: Macro-actions of each training episode. Shape (episodes,).
         imagined: Example rollouts at the last budget, for agents that imagine.
-        sampled_rollouts: Several rollouts from one beginning at the last budget, where the rules leave something to chance.
+        sampled_rollouts: Several from one beginning at the last budget, where the rules leave something to chance.
         folder: Where the run's files lie.
         recording: Its Rerun recording, or None.
     """

@@ -1,37 +1,31 @@
 """The files of one run: written once, when it is finished, and read back with every number the report needs.
 
-``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``open_loop.npz``, ``futures.npz``, ``imagined.npz``
-and ``sampled_rollouts.npz`` (of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and
-last ``DONE``, with the digests of the results.
+``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``measured.npz`` (what observers measured at the
+budgets), ``imagined.npz`` (rollouts of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``,
+``checkpoints/``, and last ``DONE``, with the digests of the results.
 """
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import io
 import json
 import shutil
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError
-from imagine_bench.store.files import csv_text, first_difference, read_json, reading, sha256, write_bytes, write_json
-from imagine_bench.store.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
+from imagine_bench.store.counters import Counters
+from imagine_bench.store.files import first_difference, read_json, reading, sha256, write_bytes, write_json
+from imagine_bench.store.results import Checkpoint, ComparedRollout, RunResult
 
 FORMAT = "imagine_bench run 1"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
-_OPEN_LOOP, _IMAGINED, _TRAINING = "open_loop.npz", "imagined.npz", "training.npz"
-_FUTURES, _COURSES = "futures.npz", "sampled_rollouts.npz"
+_MEASURED, _IMAGINED, _TRAINING = "measured.npz", "imagined.npz", "training.npz"
 _DIAGNOSTIC = "diagnostics/"
-_INTEGERS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
-_NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
+_APART = ("diagnostics", "open_loop", "futures")
+"""Fields of a row that have columns or a file of their own."""
 
 
 def recording_path(folder: Path) -> Path:
@@ -48,7 +42,7 @@ def reached(folder: Path) -> int:
     """The last budget at which the run in ``folder`` was tested, 0 before the first."""
     path = folder / _METRICS
     with reading(path, "the metrics of a run"):
-        rows = list(csv.DictReader(io.StringIO(path.read_text()))) if path.is_file() else []
+        rows = table_rows(path.read_text()) if path.is_file() else []
         return int(rows[-1]["episodes"]) if rows else 0
 
 
@@ -81,14 +75,11 @@ def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
     Raises:
         SetupError: It cannot be written.
     """
-    names = sorted({name for checkpoint in checkpoints for name in checkpoint.diagnostics})
-    fields = (*_INTEGERS, *_NUMBERS)
-    rows = [
-        [*(getattr(row, field) for field in fields), *(row.diagnostics.get(name, "") for name in names)]
-        for row in checkpoints
-    ]
-    head = [*fields, *(_DIAGNOSTIC + name for name in names)]
-    write_bytes(folder / _METRICS, csv_text([head, *rows]).encode())
+    rows = []
+    for values in pack(list(checkpoints))[0]:
+        diagnostics = {_DIAGNOSTIC + name: value for name, value in sorted(values["diagnostics"].items())}
+        rows.append({**{name: value for name, value in values.items() if name not in _APART}, **diagnostics})
+    write_bytes(folder / _METRICS, table_text(rows).encode())
 
 
 def forget(folder: Path) -> None:
@@ -99,33 +90,28 @@ def forget(folder: Path) -> None:
 
 def finish(
     folder: Path,
+    counters: Counters,
     *,
-    checkpoints: Sequence[Checkpoint],
-    training: Mapping[str, NDArray[Any]],
-    imagined: Sequence[ComparedRollout],
-    sampled_rollouts: Sequence[ComparedRollout],
+    imagined: Sequence[ComparedRollout] = (),
+    sampled_rollouts: Sequence[ComparedRollout] = (),
 ) -> None:
     """Write the results of a run and mark it as done.
 
     Args:
         folder: The run's folder, with its ``config.json``.
-        checkpoints: One a budget.
-        training: ``success`` and ``length`` of each training episode.
+        counters: With a row a budget.
         imagined: Example rollouts.
         sampled_rollouts: Several rollouts from one beginning.
 
     Raises:
         SetupError: Something cannot be written; the run is then not marked.
     """
-    write_metrics(folder, checkpoints)
-    write_arrays(folder / _TRAINING, training)
-    loops = {str(row.episodes): row.open_loop for row in checkpoints if row.open_loop is not None}
-    write_arrays(folder / _OPEN_LOOP, {f"{n}/{k}": v for n, loop in loops.items() for k, v in _arrays(loop).items()})
-    write_arrays(folder / _FUTURES, futures_arrays(checkpoints))
-    _write_rollouts(folder / _IMAGINED, imagined)
-    _write_rollouts(folder / _COURSES, sampled_rollouts)
-    names = [_CONFIG, _METRICS, _TRAINING, _OPEN_LOOP, _FUTURES, _IMAGINED, _COURSES]
-    mark_done(folder, names)
+    write_metrics(folder, counters.rows)
+    write_arrays(folder / _MEASURED, pack(counters.rows)[1])
+    write_arrays(folder / _TRAINING, counters.training())
+    rollouts = {"imagined": imagined, "sampled_rollouts": sampled_rollouts}
+    write_arrays(folder / _IMAGINED, {n: a for name, each in rollouts.items() for n, a in pack(each, name)[1].items()})
+    mark_done(folder, [_CONFIG, _METRICS, _MEASURED, _TRAINING, _IMAGINED])
 
 
 def mark_done(folder: Path, names: Sequence[str]) -> None:
@@ -163,132 +149,52 @@ def load_run(folder: Path) -> RunResult:
         ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
     """
     config = require_done(folder)
-    training = read_arrays(folder / _TRAINING)
+    training, rollouts = read_arrays(folder / _TRAINING), read_arrays(folder / _IMAGINED)
     recording = recording_path(folder)
     return RunResult(
         agent=config["agent"],
         seed=config["seed"],
-        checkpoints=with_futures(_read_metrics(folder), read_arrays(folder / _FUTURES)),
+        checkpoints=_read_checkpoints(folder),
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
-        imagined=_read_rollouts(folder / _IMAGINED),
-        sampled_rollouts=_read_rollouts(folder / _COURSES),
+        imagined=unpack(tuple[ComparedRollout, ...], None, rollouts, "imagined"),
+        sampled_rollouts=unpack(tuple[ComparedRollout, ...], None, rollouts, "sampled_rollouts"),
         folder=folder,
         recording=recording if recording.is_file() else None,
     )
 
 
-def checkpoint_to_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A row as JSON-serialisable values, for snapshots, but for its futures: see :func:`futures_arrays`."""
-    values = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
-    loop = checkpoint.open_loop
-    values["diagnostics"] = dict(checkpoint.diagnostics)
-    values["open_loop"] = None if loop is None else {name: array.tolist() for name, array in _arrays(loop).items()}
-    values["futures"] = None
-    return values
+def load_unfinished(folder: Path) -> RunResult:
+    """Read a run as far as its newest checkpoint has come.
 
-
-def checkpoint_from_json(values: Mapping[str, Any]) -> Checkpoint:
-    """The inverse of :func:`checkpoint_to_json`."""
-    loop = values["open_loop"]
-    return Checkpoint(**{**values, "open_loop": None if loop is None else _open_loop(loop)})
-
-
-def futures_arrays(checkpoints: Sequence[Checkpoint]) -> dict[str, NDArray[Any]]:
-    """The futures of all rows, by budget and name."""
-    found = {str(row.episodes): row.futures for row in checkpoints if row.futures is not None}
-    return {f"{budget}/{name}": array for budget, each in found.items() for name, array in _arrays(each).items()}
-
-
-def with_futures(checkpoints: Sequence[Checkpoint], arrays: Mapping[str, NDArray[Any]]) -> tuple[Checkpoint, ...]:
-    """The rows with their futures, as :func:`futures_arrays` gave them."""
-    found = {budget: Futures(**parts) for budget, parts in grouped(arrays).items()}
-    return tuple(dataclasses.replace(row, futures=found.get(str(row.episodes))) for row in checkpoints)
-
-
-def _open_loop(arrays: Mapping[str, Any]) -> OpenLoop:
-    integers = {"count": np.asarray(arrays["count"], dtype=np.int64)}
-    unmeasured = np.full(len(integers["count"]), np.nan)  # by the version that made an older run
-    names = [field.name for field in dataclasses.fields(OpenLoop) if field.name not in integers]
-    numbers: dict[str, Any] = {name: np.asarray(arrays.get(name, unmeasured), dtype=np.float64) for name in names}
-    return OpenLoop(**{**numbers, **integers})
-
-
-def _read_metrics(folder: Path) -> tuple[Checkpoint, ...]:
-    loops = grouped(read_arrays(folder / _OPEN_LOOP))
-    rows = csv.DictReader(io.StringIO((folder / _METRICS).read_text()))
-    return tuple(
-        Checkpoint(
-            **_counted(row),
-            diagnostics={
-                name.removeprefix(_DIAGNOSTIC): float(value)
-                for name, value in row.items()
-                if name.startswith(_DIAGNOSTIC) and value != ""
-            },
-            open_loop=_open_loop(loops[row["episodes"]]) if row["episodes"] in loops else None,
+    Raises:
+        ArtefactError: There is no checkpoint, or a file is damaged; the message names it.
+    """
+    snapshot = load_newest(folder / "checkpoints")
+    if snapshot is None:  # it had one a moment ago
+        raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
+    config = read_json(folder / _CONFIG, "a run's configuration")
+    with reading(folder / "checkpoints", "a run's checkpoint"):
+        counters = Counters.of(snapshot)
+    training = counters.training()
+    with reading(folder / _CONFIG, "a run's configuration"):
+        return RunResult(
+            agent=config["agent"],
+            seed=config["seed"],
+            checkpoints=tuple(counters.rows),
+            settings=config["settings"],
+            training_success=training["success"],
+            training_length=training["length"],
+            imagined=(),
+            folder=folder,
+            recording=None,
         )
-        for row in rows
-    )
 
 
-def _counted(row: Mapping[str, str]) -> dict[str, Any]:
-    return {**{name: int(row[name]) for name in _INTEGERS}, **{name: float(row[name]) for name in _NUMBERS}}
-
-
-def _write_rollouts(path: Path, rollouts: Sequence[ComparedRollout]) -> None:
-    write_arrays(path, {f"{n}/{k}": v for n, one in enumerate(rollouts) for k, v in _arrays(one).items()})
-
-
-def _read_rollouts(path: Path) -> tuple[ComparedRollout, ...]:
-    examples = []
-    for _, arrays in sorted(grouped(read_arrays(path)).items()):
-        rollout = {name.partition("/")[2]: array for name, array in arrays.items() if name.startswith("rollout/")}
-        rest = {name: array for name, array in arrays.items() if "/" not in name}
-        examples.append(ComparedRollout(rollout=ImaginedRollout(**rollout), **rest))
-    return tuple(examples)
-
-
-def _arrays(record: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays of a dataclass by slashed name."""
-    arrays: dict[str, NDArray[Any]] = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if dataclasses.is_dataclass(value):
-            arrays.update(_arrays(value, f"{prefix}{field.name}/"))
-        else:
-            arrays[prefix + field.name] = np.asarray(value)
-    return arrays
-
-
-def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, NDArray[Any]]]:
-    """Arrays by the first part of their slashed names."""
-    groups: dict[str, dict[str, NDArray[Any]]] = {}
-    for name, array in arrays.items():
-        group, _, rest = name.partition("/")
-        groups.setdefault(group, {})[rest] = array
-    return groups
-
-
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays, atomically.
-
-    Raises:
-        SetupError: They cannot be written.
-    """
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
-
-
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The inverse of :func:`write_arrays`.
-
-    Raises:
-        ArtefactError: The file is missing or damaged.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise ArtefactError(f"{path} is not an array file of a run: {error}. It was left untouched.") from error
+def _read_checkpoints(folder: Path) -> tuple[Checkpoint, ...]:
+    values = []
+    for row in table_rows((folder / _METRICS).read_text()):
+        diagnostics = {k.removeprefix(_DIAGNOSTIC): value for k, value in row.items() if k.startswith(_DIAGNOSTIC)}
+        values.append({**row, "diagnostics": diagnostics})
+    return unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))

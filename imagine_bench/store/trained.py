@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import Protocol
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.task_types import Result
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import is_archive
-from imagine_bench.store.bench_folder import BenchStore, read_protocol
+from imagine_bench.store.bench_folder import BenchStore, read_control
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import read_json, reading
 from imagine_bench.store.results import BenchResult, RunResult
@@ -35,7 +36,7 @@ class Trained:
     """
 
     agent: Agent
-    spec: RunSpec
+    spec: RunSpec[Protocol]
     task: TaskSpec
     episodes: int
     folder: Path
@@ -100,13 +101,13 @@ def require_runs(bench: Path) -> None:
         )
 
 
-def imagining(result: BenchResult) -> tuple[RunResult, ...]:
+def imagining(result: Result) -> tuple[RunResult, ...]:
     """The runs of a bench whose agents imagine.
 
     Raises:
         ArtefactError: There are none.
     """
-    runs = tuple(run for run in result.runs if run.imagined)
+    runs = tuple(run for run in result.runs if run.imagined) if isinstance(result, BenchResult) else ()
     if not runs:
         raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
     return runs
@@ -118,7 +119,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
     Raises:
         ArtefactError: There are none.
     """
-    protocol = read_protocol(bench)
+    protocol = read_control(bench)
     store = BenchStore(bench, protocol)
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
     able = [agent for agent, entry in entries.items() if entry.learns and not entry.external_training_loop]
@@ -138,7 +139,7 @@ def _has_learned(run: Path) -> bool:
     return snapshot is not None and snapshot.episode > 0
 
 
-def best_run(result: BenchResult) -> RunResult:
+def best_run(result: Result) -> RunResult:
     """The imagining run of a bench that solves most of its last test; of equals, most of the one before, and so on.
 
     Raises:

@@ -28,7 +28,7 @@ class Fidelity:
         actions: Macro-actions done.
         as_ruled: How many ended as the rules say, without a fault.
         faults: Reasons of the others.
-        bystander_mm: The furthest that an object moved which the action should leave where it stood.
+        other_objects_mm: The furthest that an object moved which the action should leave where it stood.
         error_mm: Of each object acted on, its distance from where a perfect execution leaves it.
         error_deg: Its yaw from there, to the nearest quarter turn, since objects have no marked side.
         cpu_s: CPU seconds of each macro-action, frame included.
@@ -37,7 +37,7 @@ class Fidelity:
     actions: int = 0
     as_ruled: int = 0
     faults: list[str] = field(default_factory=list)
-    bystander_mm: float = 0.0
+    other_objects_mm: float = 0.0
     error_mm: list[float] = field(default_factory=list)
     error_deg: list[float] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
@@ -116,7 +116,7 @@ def _compare(
         found.error_deg.append(abs(float(np.degrees(off_rad - _QUARTER_RAD / 2))))
     for index in np.flatnonzero(stood & ~acted_on):
         moved_mm = 1e3 * float(np.abs(after[index, :3] - before[index, :3]).max())
-        found.bystander_mm = max(found.bystander_mm, moved_mm)
+        found.other_objects_mm = max(found.other_objects_mm, moved_mm)
 
 
 def _yaw_rad(pose: NDArray[np.float64]) -> float:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
 from ..scenes import constants as c
-from ..scenes.composing import mjcf
 from ..scenes.meshes import prism
 
 _ARROW_THICKNESS_M = 0.0008
@@ -20,20 +20,21 @@ def arrow_outline() -> np.ndarray:
     return np.array([(_TIP_M, 0.0), *upper, *[(x, -y) for x, y in reversed(upper)]])
 
 
-def add_cubes(root: mjcf.RootElement) -> None:
+def add_cubes(spec: mujoco.MjSpec) -> None:
     """Add bodies ``cube_0`` .. ``cube_2`` on their slots, with free joints ``cube_i_joint``."""
     arrow = prism(arrow_outline(), 0.0, _ARROW_THICKNESS_M)
-    root.asset.add("mesh", name="arrow", vertex=arrow.vertices.ravel(), face=arrow.faces.ravel())
-    root.asset.add("material", name="cube", rgba=(0.93, 0.90, 0.82, 1.0), specular=0.1, shininess=0.1)
-    root.asset.add("material", name="arrow", rgba=(0.09, 0.10, 0.13, 1.0), specular=0.0)
+    spec.add_mesh(name="arrow", uservert=arrow.vertices.ravel(), userface=arrow.faces.ravel())
+    spec.add_material(name="cube", rgba=(0.93, 0.90, 0.82, 1.0), specular=0.1, shininess=0.1)
+    spec.add_material(name="arrow", rgba=(0.09, 0.10, 0.13, 1.0), specular=0.0)
     for cube, (x_m, y_m) in enumerate(c.SLOTS_XY_M):
-        body = root.worldbody.add("body", name=f"cube_{cube}", pos=(x_m, y_m, c.TABLE_HEIGHT_M + _HALF_M))
-        body.add("freejoint", name=f"cube_{cube}_joint")
-        body.add(
-            "geom", name=f"cube_{cube}_box", type="box", size=(_HALF_M,) * 3, mass=c.CUBE_MASS_KG, material="cube",
-            group=c.SCENE_GROUP, condim=3, friction=(0.8, 0.005, 0.0001), solref=(2 * c.TIMESTEP_S, 1.0),
+        body = spec.worldbody.add_body(name=f"cube_{cube}", pos=(x_m, y_m, c.TABLE_HEIGHT_M + _HALF_M))
+        body.add_freejoint(name=f"cube_{cube}_joint")
+        body.add_geom(
+            name=f"cube_{cube}_box", type=mujoco.mjtGeom.mjGEOM_BOX, size=(_HALF_M,) * 3, mass=c.CUBE_MASS_KG,
+            material="cube", group=c.SCENE_GROUP, condim=3, friction=(0.8, 0.005, 0.0001),
+            solref=(2 * c.TIMESTEP_S, 1.0),
         )  # fmt: skip
-        body.add(
-            "geom", name=f"cube_{cube}_arrow", type="mesh", mesh="arrow", material="arrow", pos=(0.0, 0.0, _HALF_M),
-            mass=0.0, contype=0, conaffinity=0, group=c.SCENE_GROUP,
+        body.add_geom(
+            name=f"cube_{cube}_arrow", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="arrow", material="arrow",
+            pos=(0.0, 0.0, _HALF_M), mass=0.0, contype=0, conaffinity=0, group=c.SCENE_GROUP,
         )  # fmt: skip

@@ -1,13 +1,12 @@
-"""The rules of the arrow puzzle (thesis, chapter 5) and of its family: no physics, no pixels, exact.
+"""The rules of the arrow puzzle (thesis, chapter 5) and of its family: no physics, no images, exact.
 
 A macrostate is ``(d0, d1, d2, pointed)``: the arrow directions of the cubes, left to right in the agent's frame, and
 the cube the human points at. Directions: 0 toward the human (up in the frame), 1 right, 2 toward the agent, 3 left.
-What a turn does and what is illegal is the same for the whole family; a goal is a predicate on legal macrostates.
+What a turn does and what is illegal is the same for the whole family; its members differ in the goal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -24,46 +23,60 @@ GOAL_REWARD = 50.0
 ILLEGAL_REWARD = -5.0
 STEP_REWARD = -1.0
 
-Goal = Callable[[tuple[int, ...]], bool]
-"""Whether a macrostate that is legal is a goal."""
+
+@dataclass(frozen=True)
+class Turn:
+    """A macro-action: a quarter turn of one cube, as seen in the frame."""
+
+    cube: int
+    clockwise: bool
 
 
-def toward_human(macrostate: tuple[int, ...]) -> bool:
-    """The arrow pointed at points toward the human (thesis 5.2.1)."""
-    return macrostate[macrostate[N_CUBES]] == TOWARD_HUMAN
+TURNS = tuple(Turn(cube, clockwise) for cube in range(N_CUBES) for clockwise in (True, False))
+"""What each action does."""
 
 
-def toward_human_alone(macrostate: tuple[int, ...]) -> bool:
-    """The same, and no arrow points toward the agent (the hard variant, thesis 5.2.3)."""
-    return toward_human(macrostate) and TOWARD_AGENT not in macrostate[:N_CUBES]
+@dataclass(frozen=True)
+class Goal:
+    """A condition on legal macrostates.
+
+    Attributes:
+        pointed: Direction of the arrow of the cube that the human points at.
+        absent: Direction that no arrow may have, or None.
+    """
+
+    pointed: int
+    absent: int | None = None
+
+    def holds(self, macrostate: tuple[int, ...]) -> bool:
+        """Whether a legal macrostate is a goal."""
+        directions = macrostate[:N_CUBES]
+        return directions[macrostate[N_CUBES]] == self.pointed and self.absent not in directions
 
 
-def toward_agent(macrostate: tuple[int, ...]) -> bool:
-    """The arrow pointed at points toward the agent."""
-    return macrostate[macrostate[N_CUBES]] == TOWARD_AGENT
-
-
-def left_and_clear_clockwise(macrostate: tuple[int, ...]) -> bool:
-    """The arrow pointed at points left, and none points a quarter turn clockwise of it."""
-    return macrostate[macrostate[N_CUBES]] == LEFT and TOWARD_HUMAN not in macrostate[:N_CUBES]
+GOALS = {
+    "toward_human": Goal(TOWARD_HUMAN),  # thesis 5.2.1
+    "toward_human_alone": Goal(TOWARD_HUMAN, absent=TOWARD_AGENT),  # the hard variant, thesis 5.2.3
+    "toward_agent": Goal(TOWARD_AGENT),
+    "left": Goal(LEFT, absent=TOWARD_HUMAN),
+}
+"""One a member of the family."""
 
 
 @dataclass(frozen=True)
 class ArrowPuzzleRules:
     """The macrostate machine of the arrow puzzle.
 
-    Action ``2i`` turns cube i a quarter turn clockwise as seen in the frame, ``2i + 1`` counter-clockwise.
-
     Args:
         goal: Which of the legal macrostates are goals.
     """
 
-    goal: Goal = toward_human
+    goal: Goal = GOALS["toward_human"]
 
     @property
     def n_actions(self) -> int:
         """Two turns a cube."""
-        return 2 * N_CUBES
+        return len(TURNS)
 
     @cached_property
     def states(self) -> tuple[tuple[int, ...], ...]:
@@ -81,7 +94,7 @@ class ArrowPuzzleRules:
 
     def is_goal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether the macrostate is legal and a goal."""
-        return self.is_legal(macrostate) and self.goal(macrostate)
+        return self.is_legal(macrostate) and self.goal.holds(macrostate)
 
     def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether the macrostate is a goal or illegal."""
@@ -95,9 +108,8 @@ class ArrowPuzzleRules:
         """
         if not 0 <= action < self.n_actions:
             raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
-        cube, counter_clockwise = divmod(action, 2)
-        turned = list(macrostate)
-        turned[cube] = (turned[cube] + (-1 if counter_clockwise else 1)) % N_DIRECTIONS
+        turn, turned = TURNS[action], list(macrostate)
+        turned[turn.cube] = (turned[turn.cube] + (1 if turn.clockwise else -1)) % N_DIRECTIONS
         return tuple(turned)
 
     def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:

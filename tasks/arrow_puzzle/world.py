@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..macro_env import Reading
-from ..motion import orientation as attitude
+from ..motion import orientation
 from ..motion.executor import MacroResult, at_rest
 from ..scenes import constants as c
-from ..scenes.appearance import Appearance, Looks
+from ..scenes.appearance import Appearance, AppearanceSampler
+from .rules import N_CUBES, TURNS
 from .scene import compile_arrow_scene
 
 if TYPE_CHECKING:
     from ..motion.turn import TurnExecutor
 
-_N_CUBES = len(c.SLOTS_XY_M)
 _QUARTER_RAD = math.pi / 2
 _MATERIALS = ("table_top", "cube", "arrow", "skin")
 
@@ -29,14 +29,14 @@ MAX_SKEW_RAD = math.radians(20.0)
 """A cube further from a right angle than this is a fault."""
 MAX_TILT_RAD = math.radians(10.0)
 MAX_OFF_SLOT_M = 0.015
-MAX_BYSTANDER_SHIFT_M = 0.005
+MAX_OTHER_SHIFT_M = 0.005
 
 
 class ArrowWorld:
     """One scene of the arrow puzzle.
 
     Args:
-        level: How much the looks vary.
+        level: How much the appearance varies.
 
     Attributes:
         model: Compiled scene, this world's own.
@@ -47,8 +47,8 @@ class ArrowWorld:
         self.model = compile_arrow_scene()
         self.data = mujoco.MjData(self.model)
         self._level = level
-        self._looks = Looks(self.model, level, camera=c.AGENT_CAMERA, materials=_MATERIALS)
-        starts = [int(self.model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(_N_CUBES)]
+        self._appearance = AppearanceSampler(self.model, level, camera=c.AGENT_CAMERA, materials=_MATERIALS)
+        starts = [int(self.model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(N_CUBES)]
         self._cube_qpos = (np.array(starts)[:, None] + np.arange(7)).ravel()
         self._hand = int(self.model.body("hand").mocapid[0])
         self._pointed = 0
@@ -63,24 +63,23 @@ class ArrowWorld:
         """Start anew from ``macrostate``, every cube a little off its slot as the appearance says."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.ctrl[:] = self._rest_qpos, self._rest_ctrl
-        self._pointed = macrostate[_N_CUBES]
+        self._pointed = macrostate[N_CUBES]
         offset_m, offset_rad = self._level.object_offset_m, self._level.object_yaw_rad
         poses: list[float] = []
         for (x_m, y_m), direction, (right, up, turn) in zip(
-            c.SLOTS_XY_M, macrostate, rng.uniform(-1.0, 1.0, (_N_CUBES, 3)).tolist(), strict=False
+            c.SLOTS_XY_M, macrostate, rng.uniform(-1.0, 1.0, (N_CUBES, 3)).tolist(), strict=False
         ):
-            half_yaw_rad = (-_QUARTER_RAD * direction + offset_rad * turn) / 2
             poses += (x_m + offset_m * right, y_m + offset_m * up, c.CUBE_REST_Z_M)
-            poses += (math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad))
+            poses += orientation.about_vertical(-_QUARTER_RAD * direction + offset_rad * turn)
         self.data.qpos[self._cube_qpos] = poses
         self._point()
         self._update()
 
     def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's light, colours, camera and hand as the appearance says."""
+        """Draw this frame's light, colors, camera and hand as the appearance says."""
         if not self._level.varies_every_frame:
             return
-        self._looks.vary(rng)
+        self._appearance.vary(rng)
         *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
         self._point([self._level.hand_offset_m * each for each in wobble], self._level.hand_yaw_rad * turn)
         self._update()
@@ -92,7 +91,7 @@ class ArrowWorld:
         self.data.mocap_pos[self._hand] = (
             slot_x_m + tip_x_m + dx_m, slot_y_m + tip_y_m + dy_m, c.CUBE_REST_Z_M + tip_z_m + dz_m,
         )  # fmt: skip
-        self.data.mocap_quat[self._hand] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+        self.data.mocap_quat[self._hand] = orientation.about_vertical(yaw_rad)
 
     def _update(self) -> None:
         """Bring geoms, cameras and lights up to date with positions."""
@@ -103,11 +102,9 @@ class ArrowWorld:
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
-        cube = action // 2
-        yaw_rad = -_QUARTER_RAD * intended[cube]
-        self.data.qpos[self._cube_qpos[7 * cube : 7 * cube + 7]] = (
-            *c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M, math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2),
-        )  # fmt: skip
+        cube = TURNS[action].cube
+        quat = orientation.about_vertical(-_QUARTER_RAD * intended[cube])
+        self.data.qpos[self._cube_qpos[7 * cube : 7 * cube + 7]] = (*c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M, *quat)
         self._update()
 
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
@@ -121,14 +118,13 @@ class ArrowWorld:
             from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
             self._executor = TurnExecutor(self.model)
-        cube, counter_clockwise = divmod(action, 2)
-        before = self._cube_poses()
+        turn, before = TURNS[action], self._cube_poses()
         result = self._executor.turn(
-            self.data, cube=cube, clockwise=not counter_clockwise, capture_motion_hz=capture_motion_hz
+            self.data, cube=turn.cube, clockwise=turn.clockwise, capture_motion_hz=capture_motion_hz
         )
         self._executor.executor.rest(self.data)
         self._update()
-        return replace(result, fault=result.fault or self._bystander_problem(cube, before))
+        return replace(result, fault=result.fault or self._pushed(turn.cube, before))
 
     # --- reading -------------------------------------------------------------------------------------------------
 
@@ -141,24 +137,24 @@ class ArrowWorld:
             directions.append(direction)
             problem = problem or _problem(cube, pose, skew_rad)
         fingertip_y_m = float(self.data.mocap_pos[self._hand, 1])
-        pointed = min(range(_N_CUBES), key=lambda slot: abs(c.SLOTS_XY_M[slot][1] - fingertip_y_m))
+        pointed = min(range(N_CUBES), key=lambda slot: abs(c.SLOTS_XY_M[slot][1] - fingertip_y_m))
         return Reading(macrostate=(*directions, pointed), problem=problem)
 
     def _cube_poses(self) -> NDArray[np.float64]:
         """Positions and quaternions of the cubes, copied. Shape (3, 7)."""
-        return np.asarray(self.data.qpos[self._cube_qpos]).reshape(_N_CUBES, 7)
+        return np.asarray(self.data.qpos[self._cube_qpos]).reshape(N_CUBES, 7)
 
-    def _bystander_problem(self, turned: int, before: NDArray[np.float64]) -> str | None:
+    def _pushed(self, turned: int, before: NDArray[np.float64]) -> str | None:
         shift_m = np.linalg.norm(self._cube_poses()[:, :3] - before[:, :3], axis=1)
-        for cube in range(_N_CUBES):
-            if cube != turned and shift_m[cube] > MAX_BYSTANDER_SHIFT_M:
+        for cube in range(N_CUBES):
+            if cube != turned and shift_m[cube] > MAX_OTHER_SHIFT_M:
                 return f"cube {cube} was pushed {1e3 * shift_m[cube]:.0f} mm while cube {turned} was turned"
         return None
 
 
 def _direction(pose: list[float]) -> tuple[int, float]:
     """The nearest direction of a cube's arrow, and how far the cube is turned from it, in rad."""
-    turned_rad = attitude.yaw_rad(*pose[3:])
+    turned_rad = orientation.yaw_rad(*pose[3:])
     quarters = round(turned_rad / _QUARTER_RAD)
     return -quarters % 4, abs(turned_rad - quarters * _QUARTER_RAD)
 
@@ -166,7 +162,7 @@ def _direction(pose: list[float]) -> tuple[int, float]:
 def _problem(cube: int, pose: list[float], skew_rad: float) -> str | None:
     """What is wrong with how a cube stands, or None."""
     x_m, y_m, _, _, qx, qy, _ = pose
-    tipped_rad = attitude.tilt_rad(qx, qy)
+    tipped_rad = orientation.tilt_rad(qx, qy)
     slot_x_m, slot_y_m = c.SLOTS_XY_M[cube]
     off_m = math.hypot(x_m - slot_x_m, y_m - slot_y_m)
     if tipped_rad > MAX_TILT_RAD:

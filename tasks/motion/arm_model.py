@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE, arm_root
+from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE, arm_spec
 
 Floats = NDArray[np.float64]
 
@@ -25,13 +25,11 @@ class ArmModel:
     """
 
     def __init__(self) -> None:
-        root = arm_root()
+        spec = arm_spec()
         for name in FINGER_JOINTS:
-            joint = root.find("joint", name)
-            for servo in [each for each in root.find_all("actuator") if each.joint == joint]:
-                servo.remove()
-            joint.remove()
-        self.model = mujoco.MjModel.from_xml_string(root.to_xml_string())
+            spec.delete(spec.actuator(name.replace("_slide", "_servo")))
+            spec.delete(spec.joint(name))
+        self.model = spec.compile()
         self._data = mujoco.MjData(self.model)
         self._tcp = self.model.site(TCP_SITE).id
         servos = [self.model.actuator(f"{name}_servo").id for name in ARM_JOINTS]

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from ..scenes.objects import THINGS, Thing, standing_m
-from . import orientation as attitude
+from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
-from .ik import ArmIK, UnreachableTargetError
-from .trajectory import Waypoint, plan
+from .ik import ArmIK, Reach, UnreachableTargetError
+from .orientation import ObjectPose
+from .trajectory import Waypoint
 
 _LIFT_M = 0.075
 """The gripper comes from and goes to so far above where it grips or lets go."""
@@ -29,26 +29,7 @@ _PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
 _LOST_M = 0.003
 """Fingers that close so much further than the object is wide have lost it."""
 _MAX_TILT_RAD = math.radians(12)
-_ARM_AT_REST_RAD = 0.02
 _HALF_TURN_RAD = math.pi
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Pose:
-    """An object as measured. Position (3,) in the world; yaw of its x axis and tilt of its z axis, rad."""
-
-    position_m: Floats
-    yaw_rad: float
-    tilt_rad: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Reach:
-    """Arm configurations at one place and above it."""
-
-    at_qpos_rad: Floats
-    above_qpos_rad: Floats
-    error_m: float
 
 
 class CarryExecutor:
@@ -65,24 +46,24 @@ class CarryExecutor:
         self.executor = MacroExecutor(model)
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
-        self._qpos = [int(model.joint(f"{thing.name}_joint").qposadr[0]) for thing in THINGS]
+        self._qpos = [int(model.joint(f"{spec.name}_joint").qposadr[0]) for spec in OBJECTS]
         self._rest_tcp_m, _ = self._arm.tcp_in_base(np.array(OBSERVATION_QPOS_RAD))
         self._tcp_site = model.site(TCP_SITE).id
-        self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(THINGS))]
+        self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(OBJECTS))]
 
     def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Lift object ``index`` from where it stands and bring it to the observation pose."""
-        thing, pose = THINGS[index], self._measure(data, index)
-        if thing.upright and pose.tilt_rad > _MAX_TILT_RAD:
-            return self._refuse(data, None, f"the {thing.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
-        yaw_rad = _nearest_to_zero(pose.yaw_rad) if thing.upright else 0.0
+        spec, pose = OBJECTS[index], self._measure(data, index)
+        if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
+            return self._refuse(data, None, f"the {spec.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
+        yaw_rad = _nearest_to_zero(pose.yaw_rad) if spec.upright else 0.0
         try:
             reach = self._solve(pose.position_m, yaw_rad, self._slots[index])
         except UnreachableTargetError as error:
-            return self._refuse(data, None, f"the {thing.name} is out of reach: {error}")
-        grip_m = thing.squeeze_m
+            return self._refuse(data, None, f"the {spec.name} is out of reach: {error}")
+        grip_m = spec.squeeze_m
         result, qpos = self._run(data, _waypoints(reach, REST_OPENING_M, grip_m), reach, None, capture_motion_hz)
-        return self._with_fault(result, qpos, self._missed(thing, qpos[-1]))
+        return self._unless_missed(spec, result, qpos)
 
     def place(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Put the held object ``index`` back on its nominal place, the right way round."""
@@ -92,14 +73,14 @@ class CarryExecutor:
         self, data: mujoco.MjData, *, index: int, palm_m: Floats, capture_motion_hz: float = 0.0
     ) -> MacroResult:
         """Lay the held object ``index`` into the palm whose middle is at ``palm_m``. Shape (3,)."""
-        target_m = palm_m + _up(THINGS[index].grip_height_m + _PALM_DROP_M)
+        target_m = palm_m + _up(OBJECTS[index].grip_height_m + _PALM_DROP_M)
         return self._put(data, index, target_m, None, capture_motion_hz)
 
     def visit(
         self, data: mujoco.MjData, *, place_m: Floats, held: int | None, capture_motion_hz: float = 0.0
     ) -> MacroResult:
         """Reach out to above ``place_m`` (3,) and come back, holding object ``held`` or nothing."""
-        grip_m = None if held is None else THINGS[held].squeeze_m
+        grip_m = None if held is None else OBJECTS[held].squeeze_m
         try:
             reach = self._solve(place_m, 0.0, self._slots[1])
         except UnreachableTargetError as error:
@@ -110,7 +91,7 @@ class CarryExecutor:
             *_home(opening_m),
         ]
         result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
-        return self._with_fault(result, qpos, None if held is None else self._missed(THINGS[held], qpos[-1]))
+        return result if held is None else self._unless_missed(OBJECTS[held], result, qpos)
 
     def rest(self, data: mujoco.MjData, held: int | None) -> None:
         """Bring ``data`` to the canonical start; object ``held`` goes with the gripper where the arm is corrected."""
@@ -118,7 +99,7 @@ class CarryExecutor:
             self.executor.rest(data)
             return
         before_m, before_quat = self._tcp(data)
-        self.executor.rest(data, squeeze_m=THINGS[held].squeeze_m)
+        self.executor.rest(data, squeeze_m=OBJECTS[held].squeeze_m)
         after_m, after_quat = self._tcp(data)
         row = self._qpos[held]
         turn, inverse = np.empty(4), np.empty(4)
@@ -135,83 +116,57 @@ class CarryExecutor:
         self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
     ) -> MacroResult:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
-        thing, pose = THINGS[index], self._measure(data, index)
+        spec, pose = OBJECTS[index], self._measure(data, index)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
-        turn_rad = 0.0 if yaw_rad is None or not thing.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
+        turn_rad = 0.0 if yaw_rad is None or not spec.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         held_m = pose.position_m - self._rest_tcp_m
         turned_m = np.array([cos * held_m[0] - sin * held_m[1], sin * held_m[0] + cos * held_m[1], held_m[2]])
         try:
             reach = self._solve(target_m - turned_m, turn_rad, self._slots[index])
         except UnreachableTargetError as error:
-            return self._refuse(data, index, f"the {thing.name} cannot be put there: {error}")
-        result, qpos = self._run(
-            data, _waypoints(reach, thing.squeeze_m, REST_OPENING_M), reach, index, capture_motion_hz
-        )
-        return self._with_fault(result, qpos, None)
+            return self._refuse(data, index, f"the {spec.name} cannot be put there: {error}")
+        waypoints = _waypoints(reach, spec.squeeze_m, REST_OPENING_M)
+        return self._run(data, waypoints, reach, index, capture_motion_hz)[0]
 
-    def _measure(self, data: mujoco.MjData, index: int) -> _Pose:
+    def _measure(self, data: mujoco.MjData, index: int) -> ObjectPose:
         """Read an object's pose from the simulation."""
-        start = self._qpos[index]
-        w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
-        return _Pose(
-            position_m=data.qpos[start : start + 3].copy(),
-            yaw_rad=attitude.yaw_rad(w, x, y, z),
-            tilt_rad=attitude.tilt_rad(x, y),
-        )
+        return ObjectPose.of(data.qpos[self._qpos[index] : self._qpos[index] + 7])
 
-    def _solve(self, place_m: Floats, yaw_rad: float, warm_start: _Reach | None) -> _Reach:
+    def _solve(self, place_m: Floats, yaw_rad: float, start: Reach | None) -> Reach:
         """Configurations with the tool centre point at ``place_m`` (3,), and above it."""
-        at, above = (
-            self._ik.solve(position_in_base_m=place_m + _up(lift_m), yaw_rad=yaw_rad, start_qpos_rad=start)
-            for lift_m, start in (
-                (0.0, warm_start.at_qpos_rad if warm_start else np.array(OBSERVATION_QPOS_RAD)),
-                (_LIFT_M, warm_start.above_qpos_rad if warm_start else np.array(OBSERVATION_QPOS_RAD)),
-            )
-        )
-        error_m = max(at.position_error_m, above.position_error_m)
-        return _Reach(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)
+        first = np.array(OBSERVATION_QPOS_RAD) if start is None else start
+        return self._ik.reach(place_m, yaw_rad=yaw_rad, lift_m=_LIFT_M, start=first)
 
     def _run(
         self,
         data: mujoco.MjData,
         waypoints: Sequence[Waypoint],
-        reach: _Reach,
+        reach: Reach,
         held: int | None,
         capture_motion_hz: float,
     ) -> tuple[MacroResult, Floats]:
         """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
-        grip_m = None if held is None else THINGS[held].squeeze_m
-        trajectory = plan(
+        result, qpos, _ = self.executor.perform(
+            data,
             self._arm,
-            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
-            start_opening_m=REST_OPENING_M if grip_m is None else grip_m,
-            waypoints=waypoints,
-            timestep_s=self.executor.model.opt.timestep,
+            waypoints,
+            ik_error_m=reach.error_m,
+            squeeze_m=None if held is None else OBJECTS[held].squeeze_m,
+            capture_motion_hz=capture_motion_hz,
         )
-        qpos = self.executor.run(data, trajectory, squeeze_m=grip_m)
-        time_s, samples = self.executor.capture(qpos, capture_motion_hz)
-        sim_time_s = (len(qpos) - 1) * self.executor.model.opt.timestep
-        result = MacroResult(sim_time_s=sim_time_s, ik_error_m=reach.error_m, fault=None, time_s=time_s, qpos=samples)
         return result, qpos
 
-    def _with_fault(self, result: MacroResult, qpos: Floats, lost: str | None) -> MacroResult:
-        """Add what went wrong as far as the robot itself can feel."""
-        off_rad = float(np.abs(self.executor.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
-        astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
-        return replace(result, fault=lost or astray)
-
-    def _missed(self, thing: Thing, qpos: Floats) -> str | None:
-        """Whether the fingers closed past what they should hold, in positions of the scene (nq,)."""
-        closed = self.executor.opening_m(qpos).max() < thing.grip_opening_m - _LOST_M
-        return f"the fingers closed and do not hold the {thing.name}" if closed else None
+    def _unless_missed(self, spec: ObjectSpec, result: MacroResult, qpos: Floats) -> MacroResult:
+        """The result of a run (N + 1, nq), with a fault if the fingers closed past what they should hold."""
+        if self.executor.opening_m(qpos[-1]).max() < spec.grip_opening_m - _LOST_M:
+            return replace(result, fault=f"the fingers closed and do not hold the {spec.name}")
+        return result
 
     def _refuse(self, data: mujoco.MjData, held: int | None, reason: str) -> MacroResult:
         """The arm stays where it is."""
         self.rest(data, held)
-        return MacroResult(
-            sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.executor.model.nq))
-        )
+        return self.executor.refused(reason)
 
     def _tcp(self, data: mujoco.MjData) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of the tool centre point in the world, updated."""
@@ -230,7 +185,7 @@ def _nearest_to_zero(yaw_rad: float) -> float:
     return yaw_rad - round(yaw_rad / _HALF_TURN_RAD) * _HALF_TURN_RAD
 
 
-def _waypoints(reach: _Reach, before_m: float, after_m: float) -> list[Waypoint]:
+def _waypoints(reach: Reach, before_m: float, after_m: float) -> list[Waypoint]:
     """Down with one finger command, to another one there, and back with that."""
     change_s = _CLOSE_S if after_m < before_m else _OPEN_S
     return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -14,11 +15,14 @@ from imagine_bench.errors import DivergedError
 
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from .arm_model import Floats
-from .trajectory import Trajectory
+from .arm_model import ArmModel, Floats
+from .trajectory import Trajectory, Waypoint, plan
 
 REST_OPENING_M = 0.0365
 """Each finger's distance from the grip's middle between macro-actions: a cube's half and 9 mm."""
+
+_ARM_AT_REST_RAD = 0.02
+"""An arm that ends further off its observation pose, in any joint, is a fault."""
 
 _RUNAWAY_RAD_S = 200.0
 """Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
@@ -98,6 +102,54 @@ class MacroExecutor:
             data.qpos[self._finger_qpos] = REST_OPENING_M
         data.ctrl[self._arm_ctrl] = OBSERVATION_QPOS_RAD
         data.ctrl[self._finger_ctrl] = REST_OPENING_M if squeeze_m is None else squeeze_m
+
+    def perform(
+        self,
+        data: mujoco.MjData,
+        arm: ArmModel,
+        waypoints: Sequence[Waypoint],
+        *,
+        ik_error_m: float,
+        squeeze_m: float | None = None,
+        capture_motion_hz: float = 0.0,
+    ) -> tuple[MacroResult, Floats, Trajectory]:
+        """Plan a motion through ``waypoints`` from the canonical start, and execute it.
+
+        Args:
+            data: Changed in place.
+            arm: Its limits shape the plan.
+            waypoints: At least one; the last one is the observation pose.
+            ik_error_m: Of the waypoints, for the result.
+            squeeze_m: As in :meth:`rest`, where something is held at the start.
+            capture_motion_hz: As in :meth:`capture`.
+
+        Returns:
+            The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
+
+        Raises:
+            DivergedError: As :meth:`run`.
+        """
+        timestep_s = self.model.opt.timestep
+        trajectory = plan(
+            arm,
+            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
+            start_opening_m=REST_OPENING_M if squeeze_m is None else squeeze_m,
+            waypoints=waypoints,
+            timestep_s=timestep_s,
+        )
+        qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
+        time_s, samples = self.capture(qpos, capture_motion_hz)
+        off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
+        astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
+        sim_time_s = (len(qpos) - 1) * timestep_s
+        result = MacroResult(sim_time_s=sim_time_s, ik_error_m=ik_error_m, fault=astray, time_s=time_s, qpos=samples)
+        return result, qpos, trajectory
+
+    def refused(self, reason: str) -> MacroResult:
+        """The result of a macro-action for which the arm does not move."""
+        return MacroResult(
+            sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.model.nq))
+        )
 
     def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory`` from the canonical start.

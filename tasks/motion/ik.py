@@ -45,6 +45,15 @@ class IKSolution:
     iterations: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """Arm configurations at a place and above it, (7,) each, and the larger distance from their targets."""
+
+    at_qpos_rad: Floats
+    above_qpos_rad: Floats
+    error_m: float
+
+
 def pointing_down(yaw_rad: float) -> mink.SO3:
     """The tool's rotation when it points down and its x axis has heading ``yaw_rad`` (0 along world +x)."""
     return mink.SO3.from_z_radians(yaw_rad) @ mink.SO3.from_x_radians(math.pi)
@@ -106,6 +115,28 @@ class ArmIK:
             f"{math.degrees(angle_error_rad):.1f} deg are missing, allowed are {1000 * POSITION_TOLERANCE_M:g} mm and "
             f"{math.degrees(ANGLE_TOLERANCE_RAD):.2f} deg; choose a target nearer to the middle of the table."
         )
+
+    def reach(self, place_m: Floats, *, yaw_rad: float, lift_m: float, start: Reach | Floats | None = None) -> Reach:
+        """Find the configurations at ``place_m`` (3,) and ``lift_m`` above it.
+
+        Args:
+            place_m: Where the tool centre point shall be.
+            yaw_rad: Heading of the tool's x axis about the vertical.
+            lift_m: How far above.
+            start: Where the searches start: a solution nearby, one configuration (7,) for both, or home if None.
+
+        Raises:
+            UnreachableTargetError: As :meth:`solve`.
+        """
+        starts = (start.at_qpos_rad, start.above_qpos_rad) if isinstance(start, Reach) else (start, start)
+        at, above = (
+            self.solve(
+                position_in_base_m=place_m + np.array([0.0, 0.0, height_m]), yaw_rad=yaw_rad, start_qpos_rad=qpos_rad
+            )
+            for height_m, qpos_rad in zip((0.0, lift_m), starts, strict=True)
+        )
+        error_m = max(at.position_error_m, above.position_error_m)
+        return Reach(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)
 
     def _errors(self) -> tuple[float, float]:
         """Distance (m) and angle (rad) still missing."""

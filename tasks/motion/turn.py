@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -11,11 +11,11 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 
 from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
-from . import orientation as attitude
 from .arm_model import ArmModel, Floats
 from .executor import REST_OPENING_M, MacroExecutor, MacroResult
-from .ik import ArmIK, UnreachableTargetError
-from .trajectory import Waypoint, plan
+from .ik import ArmIK, Reach, UnreachableTargetError
+from .orientation import ObjectPose
+from .trajectory import Waypoint
 
 _QUARTER_RAD = math.pi / 2
 _MIDDLE_YAW_RAD = math.pi / 4
@@ -35,36 +35,6 @@ _BLEND_S = 0.10
 
 _MAX_TILT_RAD = math.radians(10)
 _MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
-_ARM_AT_REST_RAD = 0.02
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stand:
-    """How a cube stands on the table, as measured.
-
-    Attributes:
-        xy_m: Its centre. Shape (2,).
-        yaw_rad: Heading of its x axis.
-        tilt_rad: Of its z axis from the vertical.
-    """
-
-    xy_m: Floats
-    yaw_rad: float
-    tilt_rad: float
-
-    @property
-    def skew_rad(self) -> float:
-        """Yaw beyond the nearest right angle, in [-pi/4, pi/4]."""
-        return self.yaw_rad - round(self.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Grip:
-    """Arm configurations over one place, both with the gripper's x axis at the middle yaw."""
-
-    at_qpos_rad: Floats
-    above_qpos_rad: Floats
-    error_m: float
 
 
 class TurnExecutor:
@@ -79,7 +49,7 @@ class TurnExecutor:
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
         self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(SLOTS_XY_M))]
-        self._slots = [self._solve(np.array(slot), None) for slot in SLOTS_XY_M]
+        self._slots = [self._reach(np.array(slot), None) for slot in SLOTS_XY_M]
 
     def turn(self, data: mujoco.MjData, *, cube: int, clockwise: bool, capture_motion_hz: float = 0.0) -> MacroResult:
         """Turn a cube by a quarter, to the nearest right angle and onto its nominal slot.
@@ -98,89 +68,54 @@ class TurnExecutor:
         """
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
-        stands = [self._measure(data, each) for each in range(len(self._slots))]
-        stand = stands[cube]
-        if stand.tilt_rad > _MAX_TILT_RAD:
-            return self._refuse(data, f"cube {cube} is tipped by {math.degrees(stand.tilt_rad):.0f} degrees")
+        poses = [ObjectPose.of(data.qpos[start : start + 7]) for start in self._cube_qpos]
+        pose, slot = poses[cube], self._slots[cube]
+        if pose.tilt_rad > _MAX_TILT_RAD:
+            return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         try:
-            grip = self._solve(stand.xy_m, self._slots[cube])
+            grip = self._reach(pose.position_m[:2], slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
         other_faces = not clockwise and (
-            abs(stand.skew_rad) > _MAX_SKEW_RAD
-            or any(_crowds(other, stand) for each, other in enumerate(stands) if each != cube)
+            abs(_skew_rad(pose)) > _MAX_SKEW_RAD
+            or any(_crowds(other, pose) for each, other in enumerate(poses) if each != cube)
         )
-        waypoints = _waypoints(grip, self._slots[cube], stand.skew_rad, clockwise, other_faces)
-        trajectory = plan(
+        result, qpos, trajectory = self.executor.perform(
+            data,
             self._arm,
-            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
-            start_opening_m=REST_OPENING_M,
-            waypoints=waypoints,
-            timestep_s=self.executor.model.opt.timestep,
+            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces),
+            ik_error_m=max(grip.error_m, slot.error_m),
+            capture_motion_hz=capture_motion_hz,
         )
-        qpos = self.executor.run(data, trajectory)
-        time_s, samples = self.executor.capture(qpos, capture_motion_hz)
-        return MacroResult(
-            sim_time_s=(len(qpos) - 1) * self.executor.model.opt.timestep,
-            ik_error_m=max(grip.error_m, self._slots[cube].error_m),
-            fault=self._fault(cube, qpos, trajectory.last_step["turn"] + 1),
-            time_s=time_s,
-            qpos=samples,
-        )
+        turned = qpos[trajectory.last_step["turn"] + 1]
+        if self.executor.opening_m(turned).min() < _MIN_GRIP_M:
+            return replace(result, fault=f"the fingers closed past cube {cube}")
+        return result
 
-    def _measure(self, data: mujoco.MjData, cube: int) -> _Stand:
-        """Read how a cube stands from the simulation."""
-        start = self._cube_qpos[cube]
-        w, x, y, z = (data.qpos[start + 3 : start + 7] / np.linalg.norm(data.qpos[start + 3 : start + 7])).tolist()
-        return _Stand(
-            xy_m=data.qpos[start : start + 2].copy(),
-            yaw_rad=attitude.yaw_rad(w, x, y, z),
-            tilt_rad=attitude.tilt_rad(x, y),
-        )
-
-    def _solve(self, place_xy_m: Floats, warm_start: _Grip | None) -> _Grip:
-        """Configurations that grip, and hover over, a cube standing at ``place_xy_m``. Shape (2,)."""
-        grip_z_m = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
-        solutions = [
-            self._ik.solve(
-                position_in_base_m=np.array([*place_xy_m, grip_z_m + lift_m]),
-                yaw_rad=_MIDDLE_YAW_RAD,
-                start_qpos_rad=start,
-            )
-            for lift_m, start in (
-                (0.0, warm_start.at_qpos_rad if warm_start else None),
-                (_LIFT_M, warm_start.above_qpos_rad if warm_start else None),
-            )
-        ]
-        at, above = solutions
-        error_m = max(at.position_error_m, above.position_error_m)
-        return _Grip(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)
+    def _reach(self, place_xy_m: Floats, start: Reach | None) -> Reach:
+        """Configurations that grip, and hover over, a cube standing at ``place_xy_m`` (2,), at the middle yaw."""
+        place_m = np.array([*place_xy_m, TABLE_HEIGHT_M + CUBE_EDGE_M / 2])
+        return self._ik.reach(place_m, yaw_rad=_MIDDLE_YAW_RAD, lift_m=_LIFT_M, start=start)
 
     def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
         """The arm stays where it is."""
         self.executor.rest(data)
-        return MacroResult(
-            sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.executor.model.nq))
-        )
-
-    def _fault(self, cube: int, qpos: Floats, turned_step: int) -> str | None:
-        """What went wrong as far as the robot itself can feel."""
-        if self.executor.opening_m(qpos[turned_step]).min() < _MIN_GRIP_M:
-            return f"the fingers closed past cube {cube}"
-        off_rad = float(np.abs(self.executor.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
-        if off_rad > _ARM_AT_REST_RAD:
-            return f"the arm ended {off_rad:.3f} rad off its observation pose"
-        return None
+        return self.executor.refused(reason)
 
 
-def _crowds(other: _Stand, gripped: _Stand) -> bool:
+def _skew_rad(pose: ObjectPose) -> float:
+    """Yaw beyond the nearest right angle, in [-pi/4, pi/4]."""
+    return pose.yaw_rad - round(pose.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
+
+
+def _crowds(other: ObjectPose, gripped: ObjectPose) -> bool:
     """Whether a finger between the two cubes would touch the other one."""
-    reach_m = CUBE_EDGE_M / 2 * (math.cos(other.skew_rad) + abs(math.sin(other.skew_rad)))
+    reach_m = CUBE_EDGE_M / 2 * (math.cos(_skew_rad(other)) + abs(math.sin(_skew_rad(other))))
     needed_m = REST_OPENING_M + _PAD_THICKNESS_M + _CLEARANCE_M + reach_m
-    return math.dist(other.xy_m, gripped.xy_m) < needed_m
+    return math.dist(other.position_m[:2], gripped.position_m[:2]) < needed_m
 
 
-def _waypoints(grip: _Grip, slot: _Grip, skew_rad: float, clockwise: bool, other_faces: bool) -> list[Waypoint]:
+def _waypoints(grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool) -> list[Waypoint]:
     """Down over the cube as it stands, turned to the nominal slot's right angle, and back.
 
     The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above. A clockwise turn

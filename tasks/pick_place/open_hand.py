@@ -6,8 +6,9 @@ are felt and not drawn.
 
 from __future__ import annotations
 
+import mujoco
+
 from ..scenes import constants as c
-from ..scenes.composing import mjcf
 from ..scenes.hand import Joint, add_limb
 from ..scenes.meshes import Mesh, ellipsoid, limb, merge
 
@@ -53,15 +54,15 @@ def open_sleeve_mesh() -> Mesh:
     return limb(_SLEEVE, sides=12)
 
 
-def add_open_hand(root: mjcf.RootElement, palm_m: tuple[float, float, float]) -> None:
+def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> None:
     """Add the mocap body ``palm`` with the middle of its palm at a place in the world."""
-    parts = {"palm": open_hand_mesh(), "palm_wrist": open_wrist_mesh(), "palm_sleeve": open_sleeve_mesh()}
-    body = add_limb(root, "palm", palm_m, parts)
+    meshes = {"palm": open_hand_mesh(), "palm_wrist": open_wrist_mesh(), "palm_sleeve": open_sleeve_mesh()}
+    body = add_limb(spec, "palm", palm_m, meshes)
     touch = {"mass": 0.0, "group": c.COLLISION_GROUP, "friction": (0.9, 0.01, 0.002)}
-    body.add("geom", name="palm_plate", type="box", size=_PLATE_HALF_M, pos=(0, 0, -_PLATE_HALF_M[2]), **touch)
+    body.add_geom(name="palm_plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE_HALF_M,
+                  pos=(0, 0, -_PLATE_HALF_M[2]), **touch)  # fmt: skip
     x, y, z = *_RIM_M, 0.5 * _RIM_RADIUS_M
     corners = ((-x, -y, z), (-x, y, z), (x, y, z), (x, -y, z))
     for number, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
-        body.add(
-            "geom", name=f"palm_rim_{number}", type="capsule", size=(_RIM_RADIUS_M,), fromto=(*start, *end), **touch
-        )
+        body.add_geom(name=f"palm_rim_{number}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(_RIM_RADIUS_M, 0, 0),
+                      fromto=(*start, *end), **touch)  # fmt: skip

@@ -9,8 +9,7 @@ import math
 import mujoco
 
 from ..scenes import constants as c
-from ..scenes.arm import arm_root
-from ..scenes.composing import mjcf
+from ..scenes.arm import arm_spec
 from ..scenes.hand import add_person_materials, add_pointing_hand
 from ..scenes.objects import add_objects, standing_m
 from ..scenes.tabletop import add_tabletop
@@ -41,34 +40,28 @@ def fingertip_m(index: int) -> tuple[float, float, float]:
     return (x_m + dx_m, y_m + dy_m, c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + dz_m)
 
 
-def stiffen_contacts(root: mjcf.RootElement) -> None:
-    """The contact parameters of every geom of this scene, the gripper's tips included."""
-    root.default.geom.solref = root.find("default", "tip").geom.solref = (2 * TIMESTEP_S, 1.0)
-    root.default.geom.solimp = _SOLIMP
-
-
-def pick_root() -> mjcf.RootElement:
-    """The whole scene; the arm is its root, so that every name stays without a prefix."""
-    root = arm_root()
-    root.model = "pick_place"
-    stiffen_contacts(root)
-    add_tabletop(root, TIMESTEP_S)
-    add_objects(root)
-    add_person_materials(root)
-    add_pointing_hand(root, IDLE_FINGERTIP_M)
-    add_open_hand(root, IDLE_PALM_M)
-    camera = root.find("camera", c.AGENT_CAMERA)
+def pick_spec() -> mujoco.MjSpec:
+    """The whole scene; it is added to the arm's own specification, so that every name stays without a prefix."""
+    spec = arm_spec()
+    spec.modelname = "pick_place"
+    add_tabletop(spec, TIMESTEP_S)
+    add_objects(spec)
+    add_person_materials(spec)
+    add_pointing_hand(spec, IDLE_FINGERTIP_M)
+    add_open_hand(spec, IDLE_PALM_M)
+    for geom in spec.geoms:
+        geom.solref, geom.solimp[:2] = (2 * TIMESTEP_S, 1.0), _SOLIMP
+    camera = spec.camera(c.AGENT_CAMERA)
     camera.fovy = _FOVY_DEG
-    camera.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
-    return root
+    camera.alt.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
+    return spec
 
 
 @functools.cache
 def _compiled() -> mujoco.MjModel:
-    root = pick_root()
-    return mujoco.MjModel.from_xml_string(root.to_xml_string(), assets=root.get_assets())
+    return pick_spec().compile()
 
 
 def compile_pick_scene() -> mujoco.MjModel:
-    """A model of the scene of one's own: appearance may write its colours, lights and cameras."""
+    """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
     return copy.copy(_compiled())

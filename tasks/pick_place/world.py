@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..macro_env import Reading
-from ..motion import orientation as attitude
+from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult, at_rest
 from ..scenes import constants as c
-from ..scenes.appearance import Appearance, Looks
+from ..scenes.appearance import Appearance, AppearanceSampler
 from ..scenes.arm import FINGER_JOINTS, TCP_SITE
-from ..scenes.objects import MATERIALS, THINGS, standing_m
+from ..scenes.objects import MATERIALS, OBJECTS, standing_m
 from .open_hand import PALM_REACH_M
 from .rules import HAND_OVER, HANDED_OVER, N_OBJECTS, OPEN_PALM, PICKED, PLACED, WITHDRAWN, held_object
 from .scene import IDLE_FINGERTIP_M, IDLE_PALM_M, PALM_M, compile_pick_scene, fingertip_m
@@ -35,7 +35,7 @@ MAX_OFF_GRIP_M = 0.015
 """An object further from the tool centre point is not held."""
 MAX_LIFT_OFF_M = 0.006
 """An object on the table or in the palm whose origin is higher or lower by so much lies on something else."""
-MAX_BYSTANDER_SHIFT_M = 0.005
+MAX_OTHER_SHIFT_M = 0.005
 _IN_THE_AIR_M = 0.15
 """What is held at the observation pose is at least so far above the table."""
 _HANDS_FORWARD_X_M = 0.90
@@ -50,7 +50,7 @@ class PickWorld:
     """One scene of pick-and-place.
 
     Args:
-        level: How much the looks vary.
+        level: How much the appearance varies.
 
     Attributes:
         model: Compiled scene, this world's own.
@@ -61,8 +61,10 @@ class PickWorld:
         self.model = compile_pick_scene()
         self.data = mujoco.MjData(self.model)
         self._level = level
-        self._looks = Looks(self.model, level, camera=c.AGENT_CAMERA, materials=("table_top", "skin", *MATERIALS))
-        starts = [int(self.model.joint(f"{thing.name}_joint").qposadr[0]) for thing in THINGS]
+        self._appearance = AppearanceSampler(
+            self.model, level, camera=c.AGENT_CAMERA, materials=("table_top", "skin", *MATERIALS)
+        )
+        starts = [int(self.model.joint(f"{spec.name}_joint").qposadr[0]) for spec in OBJECTS]
         self._object_qpos = np.array(starts)[:, None] + np.arange(7)  # [3, 7]
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
@@ -99,31 +101,31 @@ class PickWorld:
             where: A value of the macrostate.
             offset: Along x, along y and in yaw, as shares of what the appearance allows. Shape (3,).
         """
-        level, thing = self._level, THINGS[index]
+        level, spec = self._level, OBJECTS[index]
         across, along, turn = offset.tolist()
         if where == PLACED:
             base_m, share_x, share_y = standing_m(index), 1.0, 1.0
         elif where == PICKED:
             base_m, share_x, share_y = tuple(self._tcp_at_rest_m.tolist()), _GRIP_SHARE, 0.0
-            self._fingers(thing.grip_opening_m, thing.squeeze_m)
+            self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
-            base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + thing.grip_height_m), 1.0, 1.0
-        half_yaw_rad = level.object_yaw_rad * turn * share_x / 2
+            base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
         self.data.qpos[self._object_qpos[index]] = (
             base_m[0] + share_x * level.object_offset_m * across,
             base_m[1] + share_y * level.object_offset_m * along,
-            base_m[2], math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad),
-        )  # fmt: skip
+            base_m[2],
+            *orientation.about_vertical(level.object_yaw_rad * turn * share_x),
+        )
 
     def _fingers(self, opening_m: float, command_m: float) -> None:
         self.data.qpos[self._finger_qpos] = opening_m
         self.data.ctrl[self._finger_ctrl] = command_m
 
     def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's light, colours, camera and hands as the appearance says."""
+        """Draw this frame's light, colors, camera and hands as the appearance says."""
         if not self._level.varies_every_frame:
             return
-        self._looks.vary(rng)
+        self._appearance.vary(rng)
         *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
         objects, gesture = self._objects()[0], self._read_gesture()
         if HANDED_OVER not in objects:  # a hand that carries something keeps still
@@ -141,7 +143,7 @@ class PickWorld:
             poses[self._hand] = fingertip_m(gesture)
         for mocap, (x_m, y_m, z_m) in poses.items():
             self.data.mocap_pos[mocap] = (x_m + offset_m[0], y_m + offset_m[1], z_m + offset_m[2])
-            self.data.mocap_quat[mocap] = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+            self.data.mocap_quat[mocap] = orientation.about_vertical(yaw_rad)
 
     def _update(self) -> None:
         """Bring geoms, sites, cameras and lights up to date with positions."""
@@ -185,7 +187,7 @@ class PickWorld:
             self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
             self._update()
         moving = {index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])}
-        return replace(result, fault=result.fault or self._bystander_problem(moving, poses))
+        return replace(result, fault=result.fault or self._pushed(moving, poses))
 
     def _act(
         self, executor: CarryExecutor, action: int, objects: tuple[int, ...], capture_motion_hz: float
@@ -236,38 +238,38 @@ class PickWorld:
             return WITHDRAWN
         return min(range(N_OBJECTS), key=lambda index: abs(standing_m(index)[1] - fingertip_y_m))
 
-    def _bystander_problem(self, moving: set[int], before: Floats) -> str | None:
+    def _pushed(self, moving: set[int], before: Floats) -> str | None:
         shift_m = np.linalg.norm(self._poses()[:, :3] - before[:, :3], axis=1)
         for index in set(range(N_OBJECTS)) - moving:
-            if shift_m[index] > MAX_BYSTANDER_SHIFT_M:
-                return f"the {THINGS[index].name} was pushed {1e3 * shift_m[index]:.0f} mm by the way"
+            if shift_m[index] > MAX_OTHER_SHIFT_M:
+                return f"the {OBJECTS[index].name} was pushed {1e3 * shift_m[index]:.0f} mm by the way"
         return None
 
 
 def _place_of(index: int, pose: list[float], tcp_m: list[float], palm_m: list[float]) -> tuple[int, str | None]:
     """The value of the macrostate for an object's pose, and what is wrong with how it is there."""
-    thing, position_m = THINGS[index], pose[:3]
+    spec, position_m = OBJECTS[index], pose[:3]
     if position_m[2] > c.TABLE_HEIGHT_M + _IN_THE_AIR_M and math.dist(position_m, tcp_m) < MAX_OFF_GRIP_M:
         return PICKED, None
     in_palm = math.dist(position_m[:2], palm_m[:2]) < PALM_REACH_M
-    if in_palm and abs(position_m[2] - palm_m[2] - thing.grip_height_m) < MAX_LIFT_OFF_M:
-        return HANDED_OVER, _lean(thing.name, pose) if thing.upright else None
+    if in_palm and abs(position_m[2] - palm_m[2] - spec.grip_height_m) < MAX_LIFT_OFF_M:
+        return HANDED_OVER, _lean(spec.name, pose) if spec.upright else None
     slot_m = standing_m(index)
     off_m = math.dist(position_m[:2], slot_m[:2])
     if abs(position_m[2] - slot_m[2]) > MAX_LIFT_OFF_M:
-        return PLACED, f"the {thing.name} is neither on the table nor held nor in the palm"
+        return PLACED, f"the {spec.name} is neither on the table nor held nor in the palm"
     if off_m > MAX_OFF_SLOT_M:
-        return PLACED, f"the {thing.name} stands {1e3 * off_m:.0f} mm off its place"
-    if not thing.upright:
+        return PLACED, f"the {spec.name} stands {1e3 * off_m:.0f} mm off its place"
+    if not spec.upright:
         return PLACED, None
-    return PLACED, _lean(thing.name, pose) or _skew(thing.name, pose)
+    return PLACED, _lean(spec.name, pose) or _skew(spec.name, pose)
 
 
 def _lean(name: str, pose: list[float]) -> str | None:
-    tipped_rad = attitude.tilt_rad(*pose[4:6])
+    tipped_rad = orientation.tilt_rad(*pose[4:6])
     return f"the {name} is tipped by {math.degrees(tipped_rad):.0f} degrees" if tipped_rad > MAX_TILT_RAD else None
 
 
 def _skew(name: str, pose: list[float]) -> str | None:
-    turned_rad = abs(attitude.yaw_rad(*pose[3:]))
+    turned_rad = abs(orientation.yaw_rad(*pose[3:]))
     return f"the {name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Motion, Shape3D
-from imagine_bench.regression import Floats
+from imagine_bench.regression.interfaces import Floats
 
 from ..scene_reader import body_names, poses_of, shapes_of
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression import SCORES, Dataset, Floats, Predict, RegressionSpec
+from imagine_bench.regression.interfaces import SCORES, Dataset, Floats, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 if TYPE_CHECKING:

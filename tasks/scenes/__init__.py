@@ -1,1 +1,1 @@
-"""Scenes composed with dm_control.mjcf."""
+"""Scenes composed with MuJoCo's own ``MjSpec``."""

@@ -1,4 +1,4 @@
-"""How much a scene's looks vary: frozen levels, and writing one sample of them into a model without recompiling."""
+"""How much a scene's appearance varies: frozen levels, and writing one sample into a model without recompiling."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Appearance:
         hand_offset_m: Of the human's hand, along each axis, every frame until an object lies in its palm.
         hand_yaw_rad: Of the human's hand about the vertical through its fingertip, every frame.
         light_fraction: Of the brightness of all lights together, every frame.
-        colour_fraction: Of each colour channel of each material, every frame.
+        color_fraction: Of each color channel of each material, every frame.
         camera_offset_m: Of the agent's camera, along each axis, every frame.
         camera_angle_rad: Of the agent's camera, about each axis, every frame.
     """
@@ -36,7 +36,7 @@ class Appearance:
     hand_offset_m: float = 0.0
     hand_yaw_rad: float = 0.0
     light_fraction: float = 0.0
-    colour_fraction: float = 0.0
+    color_fraction: float = 0.0
     camera_offset_m: float = 0.0
     camera_angle_rad: float = 0.0
 
@@ -44,7 +44,7 @@ class Appearance:
     def varies_every_frame(self) -> bool:
         """Whether anything but the objects' start varies."""
         hand, camera = (self.hand_offset_m, self.hand_yaw_rad), (self.camera_offset_m, self.camera_angle_rad)
-        return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.colour_fraction))
+        return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.color_fraction))
 
 
 LEVELS: dict[str, Appearance] = {
@@ -66,7 +66,7 @@ LEVELS: dict[str, Appearance] = {
             hand_offset_m=0.006,
             hand_yaw_rad=math.radians(8.0),
             light_fraction=0.25,
-            colour_fraction=0.06,
+            color_fraction=0.06,
             camera_offset_m=0.003,
             camera_angle_rad=math.radians(0.5),
         ),
@@ -83,14 +83,14 @@ def appearance(name: str) -> Appearance:
     return LEVELS[require_known("appearance", name, LEVELS)]
 
 
-class Looks:
-    """Writes samples of light, colours and camera into one model.
+class AppearanceSampler:
+    """Writes samples of light, colors and camera into one model.
 
     Args:
         model: The scene; its arrays are changed by :meth:`vary`.
         level: How much varies.
         camera: Name of the camera that moves.
-        materials: Names of the materials whose colours vary.
+        materials: Names of the materials whose colors vary.
     """
 
     def __init__(self, model: mujoco.MjModel, level: Appearance, *, camera: str, materials: tuple[str, ...]) -> None:
@@ -112,8 +112,8 @@ class Looks:
             model.vis.headlight.ambient = self._ambient * brightness
             model.vis.headlight.diffuse = self._diffuse * brightness
             model.light_diffuse[:] = self._light_diffuse * brightness
-        if level.colour_fraction:
-            tint = 1.0 + level.colour_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
+        if level.color_fraction:
+            tint = 1.0 + level.color_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
             model.mat_rgba[self._materials, :_CHANNELS] = np.minimum(self._rgba[:, :_CHANNELS] * tint, 1.0)
         if level.camera_offset_m or level.camera_angle_rad:
             shift, turn = rng.uniform(-1.0, 1.0, (2, 3))

@@ -1,10 +1,10 @@
-"""The Sawyer arm and its gripper as an MJCF part, and the facts about it that MJCF cannot hold."""
+"""The Sawyer arm and its gripper, to be composed or compiled alone, and the facts about it that MJCF cannot hold."""
 
 from __future__ import annotations
 
 from importlib import resources
 
-from .composing import mjcf
+import mujoco
 
 ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
 """From the base to the wrist."""
@@ -19,6 +19,6 @@ JOINT_SPEED_LIMITS_RAD_S = (1.74, 1.328, 1.957, 1.957, 3.485, 3.485, 4.545)
 """Per arm joint, from the same URDF as ``assets/sawyer.xml``."""
 
 
-def arm_root() -> mjcf.RootElement:
-    """A new MJCF model of the arm, its base at the origin; attach it to a scene or compile it alone."""
-    return mjcf.from_xml_string(resources.files("imagine_bench.assets").joinpath("sawyer.xml").read_text())
+def arm_spec() -> mujoco.MjSpec:
+    """A new specification of the arm, its base at the origin; add a scene to it or compile it alone."""
+    return mujoco.MjSpec.from_string(resources.files("imagine_bench.assets").joinpath("sawyer.xml").read_text())

@@ -6,8 +6,9 @@ sleeve are one mesh each, since every drawn geom costs more than its vertices do
 
 from __future__ import annotations
 
+import mujoco
+
 from . import constants as c
-from .composing import mjcf
 from .meshes import Mesh, ellipsoid, limb, merge
 
 Joint = tuple[float, float, float, float]
@@ -46,40 +47,51 @@ def sleeve_mesh() -> Mesh:
     return limb(_SLEEVE, sides=12)
 
 
-def add_hand(root: mjcf.RootElement) -> None:
+def add_hand(spec: mujoco.MjSpec) -> None:
     """Add the mocap body ``hand``, pointing at the middle slot."""
     x_m, y_m = c.SLOTS_XY_M[1]
     tip = c.FINGERTIP_IN_SLOT_M
-    add_person_materials(root)
-    add_pointing_hand(root, (x_m + tip[0], y_m + tip[1], c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + tip[2]))
+    add_person_materials(spec)
+    add_pointing_hand(spec, (x_m + tip[0], y_m + tip[1], c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + tip[2]))
 
 
-def add_person_materials(root: mjcf.RootElement) -> None:
+def add_person_materials(spec: mujoco.MjSpec) -> None:
     """What every part of the person is made of."""
-    root.asset.add("material", name="skin", rgba=(0.91, 0.68, 0.55, 1.0), specular=0.15, shininess=0.2)
-    root.asset.add("material", name="cloth", rgba=(0.20, 0.35, 0.55, 1.0), specular=0.05)
+    spec.add_material(name="skin", rgba=(0.91, 0.68, 0.55, 1.0), specular=0.15, shininess=0.2)
+    spec.add_material(name="cloth", rgba=(0.20, 0.35, 0.55, 1.0), specular=0.05)
 
 
-def add_pointing_hand(root: mjcf.RootElement, fingertip_m: tuple[float, float, float]) -> None:
+def add_pointing_hand(spec: mujoco.MjSpec, fingertip_m: tuple[float, float, float]) -> None:
     """Add the mocap body ``hand`` with its index fingertip at a place in the world."""
-    add_limb(root, "hand", fingertip_m, {"hand": hand_mesh(), "wrist": wrist_mesh(), "sleeve": sleeve_mesh()})
+    add_limb(spec, "hand", fingertip_m, {"hand": hand_mesh(), "wrist": wrist_mesh(), "sleeve": sleeve_mesh()})
 
 
 def add_limb(
-    root: mjcf.RootElement, name: str, pos_m: tuple[float, float, float], parts: dict[str, Mesh]
-) -> mjcf.Element:
+    spec: mujoco.MjSpec, name: str, pos_m: tuple[float, float, float], meshes: dict[str, Mesh]
+) -> mujoco.MjsBody:
     """Add a mocap body drawn by three meshes, which touch nothing.
 
     Args:
-        root: The scene.
+        spec: The scene.
         name: Of the body.
         pos_m: Of its origin, in the world.
-        parts: The hand, the bare wrist and the sleeve, in this order; the agent's frame shows the hand alone.
+        meshes: The hand, the bare wrist and the sleeve, in this order; the agent's frame shows the hand alone.
     """
-    body = root.worldbody.add("body", name=name, mocap="true", pos=pos_m)
-    looks = (("skin", c.SCENE_GROUP), ("skin", c.SETTING_GROUP), ("cloth", c.SETTING_GROUP))
-    for (part, mesh), (material, group) in zip(parts.items(), looks, strict=True):
-        root.asset.add("mesh", name=part, vertex=mesh.vertices.ravel(), face=mesh.faces.ravel(), inertia="shell")
-        body.add("geom", name=f"{part}_skin", type="mesh", mesh=part, material=material, mass=0.0, contype=0,
-                 conaffinity=0, group=group)  # fmt: skip
+    body = spec.worldbody.add_body(name=name, mocap=True, pos=pos_m)
+    materials = (("skin", c.SCENE_GROUP), ("skin", c.SETTING_GROUP), ("cloth", c.SETTING_GROUP))
+    for (part, mesh), (material, group) in zip(meshes.items(), materials, strict=True):
+        add_drawn_mesh(spec, body, part, mesh, material=material, group=group, geom=f"{part}_skin")
     return body
+
+
+def add_drawn_mesh(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, *, material: str, group: int, geom: str
+) -> None:
+    """Add a geom that is drawn, weighs nothing and touches nothing.
+
+    MuJoCo moves a mesh into its own inertial frame and the geom back: positions stay as given.
+    """
+    spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(),
+                  inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)  # fmt: skip
+    body.add_geom(name=geom, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, mass=0.0, contype=0,
+                  conaffinity=0, group=group)  # fmt: skip

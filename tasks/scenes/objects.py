@@ -1,6 +1,6 @@
-"""Three things to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
+"""Three objects to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
 
-Every body's origin is the middle of its grip. What is drawn is one mesh a colour; what touches is a few primitives, and
+Every body's origin is the middle of its grip. What is drawn is one mesh a color; what touches is a few primitives, and
 feet or wheels are spheres, which stand quietly on a table and in a palm.
 """
 
@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import mujoco
+
 from . import constants as c
-from .composing import mjcf
+from .hand import add_drawn_mesh
 from .meshes import Mesh, arch, box, limb, merge, turned_profile
 
 SPACING_M = 0.10
@@ -27,7 +29,7 @@ _MASS_KG, _SQUEEZE_M = 0.10, 0.004
 
 
 @dataclass(frozen=True, kw_only=True)
-class Thing:
+class ObjectSpec:
     """One object as planning and reading see it.
 
     Attributes:
@@ -53,18 +55,29 @@ def _round_opening_m(radius_m: float) -> float:
     return math.sqrt((radius_m + TIP_RADIUS_M) ** 2 - TIP_OFFSET_M**2) - TIP_RADIUS_M
 
 
-BALL = Thing(name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False)
-CAR = Thing(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
-CUP = Thing(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
-THINGS = (BALL, CAR, CUP)
+BALL = ObjectSpec(
+    name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False
+)
+CAR = ObjectSpec(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
+CUP = ObjectSpec(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
+OBJECTS = (BALL, CAR, CUP)
 """Left to right in the agent's frame."""
 
-MATERIALS = ("ball", "car", "car_dark", "cup", "cup_inside")
+_RGBA = {
+    "ball": (0.10, 0.28, 0.95, 1.0),
+    "car": (0.93, 0.10, 0.09, 1.0),
+    "car_dark": (0.10, 0.10, 0.13, 1.0),
+    "cup": (0.10, 0.72, 0.22, 1.0),
+    "cup_inside": (0.02, 0.14, 0.06, 1.0),
+}
+MATERIALS = tuple(_RGBA)
+_TOUCH = {"group": c.COLLISION_GROUP, "friction": (0.8, 0.005, 0.0001), "condim": 3}
+"""Of geoms that are felt and not drawn."""
 
 
 def standing_m(index: int) -> tuple[float, float, float]:
     """Nominal position of object ``index`` on the table."""
-    return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + THINGS[index].grip_height_m)
+    return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + OBJECTS[index].grip_height_m)
 
 
 def _car_body() -> Mesh:
@@ -103,54 +116,46 @@ def _cup_inside() -> Mesh:
     return turned_profile([(0.74 * _CUP_RADIUS_M, high), (0.74 * _CUP_RADIUS_M, high + 0.0006)], sides=12)
 
 
-def add_objects(root: mjcf.RootElement) -> None:
+def add_objects(spec: mujoco.MjSpec) -> None:
     """Add bodies ``ball``, ``car`` and ``cup`` on their places, with free joints ``<name>_joint``."""
-    for name, rgba in (
-        ("ball", (0.10, 0.28, 0.95, 1.0)),
-        ("car", (0.93, 0.10, 0.09, 1.0)),
-        ("car_dark", (0.10, 0.10, 0.13, 1.0)),
-        ("cup", (0.10, 0.72, 0.22, 1.0)),
-        ("cup_inside", (0.02, 0.14, 0.06, 1.0)),
-    ):
-        root.asset.add("material", name=name, rgba=rgba, specular=0.2, shininess=0.3)
-    ball, car, cup = (_body(root, index) for index in range(len(THINGS)))
-    touch = {"group": c.COLLISION_GROUP, "friction": (0.8, 0.005, 0.0001), "condim": 3}
-
-    ball.add(
-        "geom", name="ball_skin", type="sphere", size=(_BALL_RADIUS_M,), mass=_MASS_KG, material="ball",
-        **{**touch, "group": c.SCENE_GROUP, "condim": 6, "friction": (0.8, 0.005, 0.002)},
+    for name, rgba in _RGBA.items():
+        spec.add_material(name=name, rgba=rgba, specular=0.2, shininess=0.3)
+    ball, car, cup = (_body(spec, index) for index in range(len(OBJECTS)))
+    kind = mujoco.mjtGeom
+    ball.add_geom(
+        name="ball_skin", type=kind.mjGEOM_SPHERE, size=(_BALL_RADIUS_M, 0, 0), mass=_MASS_KG, material="ball",
+        group=c.SCENE_GROUP, condim=6, friction=(0.8, 0.005, 0.002),
     )  # fmt: skip
 
     body_z = _CAR_CLEARANCE_M + _CAR_HALF_M[2] - _CAR_GRIP_Z_M
-    car.add("geom", name="car_box", type="box", size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG, **touch)
-    for number, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-        at = (sx * 0.021, sy * 0.014, _WHEEL_M - _CAR_GRIP_Z_M)
-        car.add("geom", name=f"car_wheel_{number}", type="sphere", size=(_WHEEL_M,), pos=at, mass=0.05 * _MASS_KG,
-                **touch)  # fmt: skip
-    _skin(root, car, "car_skin", _car_body(), "car")
-    _skin(root, car, "car_trim", _car_trim(), "car_dark")
+    car.add_geom(name="car_box", type=kind.mjGEOM_BOX, size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG,
+                 **_TOUCH)  # fmt: skip
+    _add_supports(car, "car_wheel", _WHEEL_M, (0.021, 0.014, _WHEEL_M - _CAR_GRIP_Z_M))
+    _skin(spec, car, "car_skin", _car_body(), "car")
+    _skin(spec, car, "car_trim", _car_trim(), "car_dark")
 
     half_m = (_CUP_HEIGHT_M - _CUP_FOOT_M) / 2
     middle_z = _CUP_FOOT_M + half_m - _CUP_GRIP_Z_M
-    cup.add("geom", name="cup_wall", type="cylinder", size=(_CUP_RADIUS_M, half_m), pos=(0, 0, middle_z),
-            mass=0.8 * _MASS_KG, **touch)  # fmt: skip
-    for number, (sx, sy) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-        at = (sx * 0.014, sy * 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M)
-        cup.add("geom", name=f"cup_foot_{number}", type="sphere", size=(_CUP_FOOT_M,), pos=at, mass=0.05 * _MASS_KG,
-                **touch)  # fmt: skip
-    _skin(root, cup, "cup_skin", _cup_body(), "cup")
-    _skin(root, cup, "cup_hole", _cup_inside(), "cup_inside")
+    cup.add_geom(name="cup_wall", type=kind.mjGEOM_CYLINDER, size=(_CUP_RADIUS_M, half_m, 0), pos=(0, 0, middle_z),
+                 mass=0.8 * _MASS_KG, **_TOUCH)  # fmt: skip
+    _add_supports(cup, "cup_foot", _CUP_FOOT_M, (0.014, 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M))
+    _skin(spec, cup, "cup_skin", _cup_body(), "cup")
+    _skin(spec, cup, "cup_hole", _cup_inside(), "cup_inside")
 
 
-def _body(root: mjcf.RootElement, index: int) -> mjcf.Element:
-    body = root.worldbody.add("body", name=THINGS[index].name, pos=standing_m(index))
-    body.add("freejoint", name=f"{THINGS[index].name}_joint")
+def _body(spec: mujoco.MjSpec, index: int) -> mujoco.MjsBody:
+    body = spec.worldbody.add_body(name=OBJECTS[index].name, pos=standing_m(index))
+    body.add_freejoint(name=f"{OBJECTS[index].name}_joint")
     return body
 
 
-def _skin(root: mjcf.RootElement, body: mjcf.Element, name: str, mesh: Mesh, material: str) -> None:
-    """What is drawn and weighs and touches nothing."""
-    root.asset.add("mesh", name=name, vertex=mesh.vertices.ravel(), face=mesh.faces.ravel(), inertia="shell")
-    # MuJoCo moves a mesh into its own inertial frame and the geom back: positions stay as given.
-    body.add("geom", name=name, type="mesh", mesh=name, material=material, mass=0.0, contype=0, conaffinity=0,
-             group=c.SCENE_GROUP)  # fmt: skip
+def _add_supports(body: mujoco.MjsBody, name: str, radius_m: float, corner_m: tuple[float, float, float]) -> None:
+    """Four spheres to stand on, at the corners of a rectangle about the body's z axis."""
+    x_m, y_m, z_m = corner_m
+    for number, (x_sign, y_sign) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+        body.add_geom(name=f"{name}_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius_m, 0, 0),
+                      pos=(x_sign * x_m, y_sign * y_m, z_m), mass=0.05 * _MASS_KG, **_TOUCH)  # fmt: skip
+
+
+def _skin(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str) -> None:
+    add_drawn_mesh(spec, body, name, mesh, material=material, group=c.SCENE_GROUP, geom=name)

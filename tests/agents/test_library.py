@@ -8,17 +8,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from test_runner import same_but_for_time, small
+from small_runs import same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
-from imagine_bench.bench import runner
+from imagine_bench.bench import phases
 from imagine_bench.bench.bench import plan
+from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.evaluation import TrainingStarts
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import ExternalTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.results import RunResult
@@ -34,13 +35,13 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
     few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": tuple(sorted(FEW.items()))}
     path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
-    result = runner.run(spec, folder, lambda progress: None)
+    result = run_observed(spec, folder, lambda progress: None)
     assert result is not None
     return result
 
 
 @pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS])
-def test_the_librarys_own_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
+def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
     result = do(tmp_path / "run", agent)
     first, last = result.checkpoints
     assert [row.env_steps for row in result.checkpoints] == [
@@ -75,10 +76,10 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner.run_folder, "finish", killed)
+        patch.setattr(run_folder, "finish", killed)
         do(tmp_path / "run")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner.EvaluationCounts, "add_episode", killed)
+        patch.setattr(phases, "play_test_episode", killed)
         do(tmp_path / "run")
     assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
     assert same_but_for_time(whole, do(tmp_path / "run"))
@@ -86,7 +87,7 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
     assert whole.training_length.tolist() != other.training_length.tolist()
 
 
-def test_the_registry_knows_which_agents_train_themselves() -> None:
+def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
     for name, entry in registry.AGENTS.items():
         if entry.settings == "imagine_bench.agents.library.settings":
             agent = registry.make_agent(name, spec(name).context())
@@ -140,9 +141,9 @@ def test_it_is_never_taken_up_again_half_way() -> None:
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from imagine_bench.agents.library import sb3 as peers
+    from imagine_bench.agents.library import sb3
 
-    present = peers.importlib.import_module
+    present = sb3.importlib.import_module
 
     def missing(name: str) -> Any:
         if name == "sb3_contrib":
@@ -150,10 +151,10 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         return present(name)
 
     context = spec("sb3_qrdqn").context()
-    monkeypatch.setattr(peers.importlib, "import_module", missing)
+    monkeypatch.setattr(sb3.importlib, "import_module", missing)
     sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
     with pytest.raises(SetupError, match=sentence):
-        peers.make_qrdqn(context)
+        sb3.make_qrdqn(context)
     with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
         plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
 

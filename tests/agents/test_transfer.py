@@ -8,18 +8,17 @@ import dataclasses
 import fake_codes
 import numpy as np
 import pytest
+from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
 from fake_latents import context
 from fake_latents import live as live_on_latents
-from imagine_bench.agents.factored.agent import ImagineAgent
+from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.queries import last_step, likeliest
+from imagine_bench.agents.factored.exploration import last_step, likeliest
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only as imagination_only
-from test_imagine import same
-from test_learner import same as same_learner
 
-from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
+from imagine_bench.capabilities import Label, QueryingAgent, TransferLearner
 from imagine_bench.interfaces import Observation
 
 GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
@@ -43,32 +42,32 @@ def other_task(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fake_codes, "starts", lambda: codes)
 
 
-def dynamics_of(learner: ImagineAgent) -> list[np.ndarray]:
-    return [part.evidence for part in learner.model.dynamics.parts]
+def dynamics_of(learner: FactoredAgent) -> list[np.ndarray]:
+    return [part.evidence for part in learner.model.dynamics.factors]
 
 
 def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
     learner, rng = agent(), np.random.default_rng(0)
     assert isinstance(learner, TransferLearner)
     live(learner, range(30), rng)
-    assert learner.diagnostics()["real_transitions"] == len(learner.memory)
+    assert learner.diagnostics()["real_transitions"] == len(learner.replay)
     live(learner, range(30, 31), rng)
     learner.reset_for_new_task()
-    known = Dynamics(learner.sizes, ACTIONS, learner.settings.dynamics)
-    for row in learner.memory.since(0):
+    known = Dynamics(learner.perception.sizes, ACTIONS, learner.settings.dynamics)
+    for row in learner.replay.rows():
         known.add(np.array(row.code), row.action, np.array(row.following))
-    for mine, all_of_it in zip(dynamics_of(learner), known.parts, strict=True):
+    for mine, all_of_it in zip(dynamics_of(learner), known.factors, strict=True):
         assert np.array_equal(mine, all_of_it.evidence)
     assert learner.model.outcomes.causes is None
     assert not learner.q_values(Observation(frame=frame((0, 1, 0)))).any(), "nothing is known of the new task"
     measured = learner.diagnostics()
-    assert set(measured) == {"real_transitions", "teacher/answers", "model/outcomes"}, "nothing yet of this task"
+    assert set(measured) == {"real_transitions", "oracle/labels", "model/outcomes"}, "nothing yet of this task"
     assert measured["real_transitions"] == 0
 
 
 @pytest.mark.parametrize("carried", [0.0, 0.5])
 def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
-    learner = agent(outcomes__carried=carried)
+    learner = agent(outcomes__transfer_weight=carried)
     live(learner, range(40), np.random.default_rng(0))
     learner.reset_for_new_task()
     lamp = Observation(frame=frame((0, 2, 1)))
@@ -85,7 +84,7 @@ def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
     assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by hint alone, too"
 
 
-def watch(learner: ImagineAgent, code: tuple[int, ...], action: int) -> None:
+def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
     learner.observe(fake_codes.transition(code, action), episode=0)
 
 
@@ -132,35 +131,35 @@ def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_
 # --- questions ---------------------------------------------------------------------------------------------------
 
 
-def ask(learner: ImagineAgent, questions: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+def ask(learner: FactoredAgent, questions: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
     """Let it ask and answer truly; the plans asked about."""
     asked = []
     for _ in range(questions):
-        actions = learner.question(Observation(frame=frame(code)))
+        actions = learner.query(Observation(frame=frame(code)))
         if actions is None:
             break
         asked.append(tuple(actions.tolist()))
         here = code
         for action in actions:
             here, reward, ended = _STEP(here, int(action))
-        learner.learn_label(Observation(frame=frame(code)), actions, Answer(reward, ended))
+        learner.learn_label(Observation(frame=frame(code)), actions, Label(reward, ended))
     return asked
 
 
 def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics() -> None:
     learner = agent()
     assert isinstance(learner, QueryingAgent)
-    assert learner.question(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
+    assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
-    learner._learn(len(learner.memory))  # what was no surprise too
-    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.memory.real()
+    learner.learn()  # what was no surprise too
+    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.replay.count_real()
     doubt = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     asked = ask(learner, 200)
     assert 0 < len(asked) < 200
     assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
     assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
-    assert (learner.memory.real(), learner.memory.told()) == (real, len(asked))
-    assert learner.diagnostics()["teacher/answers"] == len(asked)
+    assert (learner.replay.count_real(), learner.replay.count_labels()) == (real, len(asked))
+    assert learner.diagnostics()["oracle/labels"] == len(asked)
     after = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     assert after <= doubt
 
@@ -185,20 +184,20 @@ def test_what_has_no_answer_is_not_asked_again() -> None:
     live(learner, range(12), np.random.default_rng(0))
     seen, asked = Observation(frame=frame((0, 1, 1))), []
     for _ in range(5):
-        actions = learner.question(seen)
+        actions = learner.query(seen)
         assert actions is not None
         code, action, _ = last_step(learner.model, (0, 1, 1), actions)
         asked.append((code, action))
         learner.learn_label(seen, actions, None)
     assert len(set(asked)) == 5
-    assert learner.memory.told() == 0
-    assert learner.memory.in_vain == set(asked)
+    assert learner.replay.count_labels() == 0
+    assert learner.replay.without_label == set(asked)
 
 
 def test_questions_lead_where_the_dynamics_do() -> None:
     learner = agent()
     live(learner, range(40), np.random.default_rng(0))
-    learner._learn(len(learner.memory))
+    learner.learn()
     code, action, following = last_step(learner.model, (0, 1, 1), np.array([0, 2, 1]))
     assert code == (1, 2, 1)
     assert (action, following) == (1, (0, 2, 1))
@@ -215,10 +214,10 @@ def test_questions_lead_where_the_dynamics_do() -> None:
 def test_a_prior_for_staying_is_no_knowledge() -> None:
     """Of one part that holds all, it alone would call more than half sure."""
     learner = agent(dynamics__factored=False)
-    codes = np.array([learner._modelled(code) for code in starts()])
+    codes = np.array([learner.perception.code(frame(code)) for code in starts()])
     assert not likeliest(learner.model, codes)[1].any()
     live(learner, range(20), np.random.default_rng(0))
-    learner._learn(len(learner.memory))
+    learner.learn()
     assert (likeliest(learner.model, codes)[1] > 0.5).any()
 
 
@@ -249,9 +248,9 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch
     for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):
         assert any(bool((a != b).any()) for a, b in zip(before, part.parameters(), strict=True))
     assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
-    assert same_learner(learner.state(), resumed.state())
+    assert same(learner.state(), resumed.state())
     rngs = np.random.default_rng(1), np.random.default_rng(1)
     assert live_on_latents(learner, range(5), rngs[0]) == live_on_latents(resumed, range(5), rngs[1])
     trained = [weight.clone() for weight in learner.imagination.model.dynamics.parameters()]
     assert any(bool((a != b).any()) for a, b in zip(kept, trained, strict=True)), "it goes on learning"
-    assert same_learner(learner.state(), resumed.state())
+    assert same(learner.state(), resumed.state())

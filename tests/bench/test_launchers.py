@@ -12,11 +12,12 @@ from pathlib import Path
 import psutil
 import pytest
 from bench_fakes import FakeRunSpec
-from test_runner import small
+from small_runs import small
 
-from imagine_bench.bench.launchers import Job, LocalPool
-from imagine_bench.bench.runs import Progress
+from imagine_bench.bench.launchers import Job
+from imagine_bench.bench.local import LocalPool
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.protocols.runs import Progress
 from imagine_bench.store import run_folder
 
 _HERE = Path(__file__).parents[1] / "fakes"
@@ -40,19 +41,6 @@ def test_a_failed_run_is_named_and_stops_no_other(tmp_path: Path) -> None:
     assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
         (1, failure.reason)
     ]
-
-
-def test_a_failed_run_is_told_while_others_of_its_process_go_on(tmp_path: Path) -> None:
-    jobs = [job(tmp_path, "failing", 1), job(tmp_path, "failing", 0, budgets=(100_000,))]
-    told: list[Progress] = []
-
-    def stop_when_it_is_known(progress: Progress) -> None:
-        told.append(progress)
-        if {one.phase for one in told} >= {"failed", "training"} and progress.seed == 0 and progress.episode > 20:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        LocalPool(1, abreast=2).launch(jobs, stop_when_it_is_known)
 
 
 def test_a_process_that_is_killed_is_a_failure(tmp_path: Path) -> None:

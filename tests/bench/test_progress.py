@@ -8,10 +8,10 @@ import sys
 
 import pytest
 from bench_fakes import FakeRunSpec
-from test_runner import small
+from small_runs import small
 
 from imagine_bench.bench.progress import ProgressBars, counted
-from imagine_bench.bench.runs import Phase, Progress
+from imagine_bench.protocols.runs import Phase, Progress
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""

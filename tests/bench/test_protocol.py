@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imagine_bench.bench.bench import plan_control
-from imagine_bench.bench.protocol import PRESETS, Protocol, protocol
+from imagine_bench.bench.control import plan_control
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
@@ -42,12 +42,12 @@ def test_seeds_in_any_order_are_one_bench():
 def test_any_change_changes_the_hash():
     base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
     changes = {
-        "task": "arrow_puzzle_hard", "preset": "smoke", "settings": "chapter_3", "agents": ("dqn",),
-        "seeds": (5,), "budgets": (7,),
+        "task": "arrow_puzzle_hard", "preset": "smoke", "settings": "chapter_3", "hyperparameters": "thesis",
+        "agents": ("dqn",), "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
-        "after": ("arrow_puzzle",), "demonstrations": 1, "questions": 1,
+        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1,
         "settings_digest": "0123456789ab",
     }  # fmt: skip
     assert {*changes, "after_episodes"} >= {field.name for field in dataclasses.fields(Protocol)}
@@ -79,7 +79,7 @@ def test_a_preset_that_changes_is_another_bench(
 def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_word(monkeypatch):
     own = {"quick": {"seeds": (7, 8), "budgets": (5,)}}
     spec = dataclasses.replace(task("arrow_puzzle"), settings="chapter_3", presets=own)
-    monkeypatch.setattr("imagine_bench.bench.protocol.task", lambda name: spec)
+    monkeypatch.setattr("imagine_bench.protocols.control.task", lambda name: spec)
     wanted = protocol("arrow_puzzle", "quick", budgets=(6,))
     assert (wanted.settings, wanted.seeds, wanted.budgets) == ("chapter_3", (7, 8), (6,))
     assert protocol("arrow_puzzle", "smoke").seeds == PRESETS["smoke"]["seeds"]

@@ -7,72 +7,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_fakes import TableAgent
+from bench_fakes import Pupil
 from imagine_bench.tasks.arrow_puzzle.rules import ArrowPuzzleRules
-from numpy.typing import NDArray
-from test_resume_learners import measured
-from test_runner import final_arrays, small
+from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
-from imagine_bench.bench import runner
-from imagine_bench.bench.protocol import Protocol, protocol
+from imagine_bench.bench import phases, run_state
+from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.queries import LabelOracle
-from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import Answer, QueryingAgent, TransferLearner
+from imagine_bench.capabilities import Label, QueryingAgent, TransferLearner
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
-from imagine_bench.registry import AgentEntry
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.store import encoders
+from imagine_bench.store.codec import read_arrays
 from imagine_bench.store.results import RunResult
-from imagine_bench.store.run_folder import read_arrays
-
-
-class Pupil(TableAgent):
-    """Notes all that it is shown, asks about random plans whenever it may, and counts what it carries over."""
-
-    made: list[Pupil] = []  # noqa: RUF012 - how a test finds it
-
-    def __init__(self, context: AgentContext) -> None:
-        super().__init__(context)
-        self.asking = np.random.default_rng(0)
-        self.shown: list[tuple[int, Transition]] = []
-        self.seen: list[Observation] = []
-        self.answers: list[tuple[NDArray[np.int64], Answer | None]] = []
-        self.carried: list[int] = []
-        self.made.append(self)
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        self.seen.append(observation)
-        return super().act(observation, explore=explore)
-
-    def observe(self, transition: Transition, *, episode: int) -> None:
-        self.shown.append((episode, transition))
-        super().observe(transition, episode=episode)
-
-    def reset_for_new_task(self) -> None:
-        self.carried.append(len({episode for episode, _ in self.shown}))
-        self.shown.clear()
-
-    def question(self, observation: Observation) -> NDArray[np.int64] | None:
-        self.seen.append(observation)
-        return self.asking.integers(self.n_actions, size=3)
-
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], answer: Answer | None) -> None:
-        self.answers.append((actions, answer))
-
-    def state(self) -> AgentState:
-        state = super().state()
-        return AgentState(arrays=state.arrays, values={**state.values, "asking": self.asking.bit_generator.state})
-
-    def restore(self, state: AgentState) -> None:
-        super().restore(state)
-        self.asking.bit_generator.state = state.values["asking"]
 
 
 @pytest.fixture(autouse=True)
-def pupils(monkeypatch: pytest.MonkeyPatch) -> list[Pupil]:
-    monkeypatch.setitem(registry.AGENTS, "pupil", AgentEntry(make="test_teaching:Pupil", needs_encoder=False))
+def pupils() -> list[Pupil]:
     Pupil.made.clear()
     return Pupil.made
 
@@ -81,7 +35,7 @@ def do(folder: Path, agent: str = "pupil", task: str = "arrow_puzzle", **changes
     wanted = {**small().as_dict(), "agents": (agent,), "budgets": (6,), "evaluation_episodes": 1, **changes}
     wanted = {name: value for name, value in wanted.items() if name not in ("task", "preset")}
     spec = RunSpec(protocol=protocol(task, "smoke", **wanted), agent=agent, seed=0)
-    return runner.run(spec, folder, lambda progress: None)
+    return run_observed(spec, folder, lambda progress: None)
 
 
 # --- demonstrations ----------------------------------------------------------------------------------------------
@@ -105,7 +59,7 @@ def test_demonstrated_episodes_are_optimal_seen_as_frames_and_begin_where_others
 
 def test_demonstrations_are_shortest_plans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rules, lengths, states = registry.task("arrow_puzzle_clockwise").rules, [], []
-    real = runner.play
+    real = phases.play
 
     def watching(env: Any, agent: Any, **options: Any) -> Any:
         for transition, info in real(env, agent, **options):
@@ -113,7 +67,7 @@ def test_demonstrations_are_shortest_plans(tmp_path: Path, monkeypatch: pytest.M
                 states.append((tuple(transition.observation.macrostate.tolist()), transition.action))
             yield transition, info
 
-    monkeypatch.setattr(runner, "play", watching)
+    monkeypatch.setattr(phases, "play", watching)
     result = do(tmp_path / "run", task="arrow_puzzle_clockwise", demonstrations=6)
     assert all(rules.optimal_action(state) == action for state, action in states)
     lengths = result.training_length.tolist()
@@ -121,44 +75,44 @@ def test_demonstrations_are_shortest_plans(tmp_path: Path, monkeypatch: pytest.M
     assert max(lengths) <= 6 and result.training_success.all()
 
 
-# --- questions ---------------------------------------------------------------------------------------------------
+# --- queries -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", registry.TASKS)
 def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
     rules = registry.task(task).rules
-    teacher, answered, refused = LabelOracle(rules), 0, 0
+    oracle, answered, refused = LabelOracle(rules), 0, 0
     for state in rules.states:
         for first in range(rules.n_actions):
             single = {(each.reward, each.terminated) for each in rules.outcomes(state, first)}
-            answer = teacher.answer(state, np.array([first]))
+            answer = oracle.label(state, np.array([first]))
             assert (answer is None) == (len(single) > 1)
             for second in range(rules.n_actions):
                 possible = {
-                    Answer(after.reward, after.terminated)
+                    Label(after.reward, after.terminated)
                     for each in rules.outcomes(state, first)
                     for after in rules.outcomes(each.macrostate, second)
                 }
-                answer = teacher.answer(state, np.array([first, second]))
+                answer = oracle.label(state, np.array([first, second]))
                 assert answer == (next(iter(possible)) if len(possible) == 1 else None)
                 answered, refused = answered + (answer is not None), refused + (answer is None)
     by_chance = any(len(rules.outcomes(state, a)) > 1 for state in rules.states for a in range(rules.n_actions))
     assert answered > 0 and (refused > 0) == by_chance
 
 
-def test_a_question_is_about_its_last_action_and_goes_through_ends() -> None:
-    teacher = LabelOracle(ArrowPuzzleRules())
-    assert teacher.answer((3, 1, 2, 0), np.array([0])) == Answer(50.0, True)
-    assert teacher.answer((3, 1, 2, 0), np.array([0, 1])) == Answer(-1.0, False), "there and back through a goal"
+def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
+    oracle = LabelOracle(ArrowPuzzleRules())
+    assert oracle.label((3, 1, 2, 0), np.array([0])) == Label(50.0, True)
+    assert oracle.label((3, 1, 2, 0), np.array([0, 1])) == Label(-1.0, False), "there and back through a goal"
     for actions in ([], [6], [0, -1]):
         with pytest.raises(InvalidValueError, match="give at least one, each from 0 to 5"):
-            teacher.answer((3, 1, 2, 0), np.array(actions))
+            oracle.label((3, 1, 2, 0), np.array(actions))
 
 
-def test_no_more_questions_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
-    do(tmp_path / "run", questions=3, demonstrations=2)
+def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
+    do(tmp_path / "run", queries=3, demonstrations=2)
     (pupil,) = Pupil.made
-    asked = read_arrays(tmp_path / "run" / "training.npz")["questions"].tolist()
+    asked = read_arrays(tmp_path / "run" / "training.npz")["queries"].tolist()
     assert asked == [0, 0, 3, 3, 3, 3], "who watches does not ask"
     assert len(pupil.answers) == 12
     assert all(answer is not None for _, answer in pupil.answers), "this puzzle leaves nothing to chance"
@@ -166,11 +120,9 @@ def test_no_more_questions_than_allowed_and_no_macrostate(tmp_path: Path) -> Non
     assert all(observation.macrostate is None for observation in pupil.seen)
 
 
-def test_questions_change_no_start_and_no_test(tmp_path: Path) -> None:
-    with_questions, without = do(tmp_path / "with", questions=2), do(tmp_path / "without")
-    assert np.array_equal(with_questions.training_length, without.training_length), (
-        "this pupil learns nothing by asking"
-    )
+def test_queries_change_no_start_and_no_test(tmp_path: Path) -> None:
+    asking, without = do(tmp_path / "with", queries=2), do(tmp_path / "without")
+    assert np.array_equal(asking.training_length, without.training_length), "this pupil learns nothing by asking"
     assert final_arrays(tmp_path / "with")["table"].tobytes() == final_arrays(tmp_path / "without")["table"].tobytes()
 
 
@@ -178,13 +130,13 @@ def test_questions_change_no_start_and_no_test(tmp_path: Path) -> None:
 
 
 def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seeds, real = [], runner.play
+    seeds, real = [], phases.play
 
     def watching(env: Any, agent: Any, *, seed: int, **options: Any) -> Any:
         seeds.append((env.spec.id.partition("/")[2], seed))
         return real(env, agent, seed=seed, **options)
 
-    monkeypatch.setattr(runner, "play", watching)
+    monkeypatch.setattr(phases, "play", watching)
     earlier = ("arrow_puzzle_hard", "arrow_puzzle_toward")
     result = do(tmp_path / "run", after=earlier, after_episodes=3)
     (pupil,) = Pupil.made
@@ -215,12 +167,12 @@ def test_who_can_carry_over_or_ask_is_known() -> None:
             ["--after", "arrow_puzzle_hard"],
             "Agent 'dqn' has no model of the world to carry over from arrow_puzzle_hard;",
         ),
-        (["--questions", "2"], "Agent 'dqn' cannot ask a teacher; leave --questions out"),
+        (["--queries", "2"], "Agent 'dqn' cannot query an oracle; leave --queries out"),
         (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: what is known of one world is of no"),
         (["--after", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'?"),
         (["--after-episodes", "50"], "after_episodes is 50, but no task comes before; give it in after."),
         (["--demonstrations", "-1"], "demonstrations is -1; give at least 0."),
-        (["--questions", "-1"], "questions is -1; give at least 0"),
+        (["--queries", "-1"], "queries is -1; give at least 0"),
     ],
 )
 def test_wrong_words_get_one_line_and_exit_code_2(
@@ -233,14 +185,6 @@ def test_wrong_words_get_one_line_and_exit_code_2(
     assert not (tmp_path / "runs").exists()
 
 
-def test_younger_fields_are_in_a_protocol_only_where_they_say_something() -> None:
-    assert not {"after", "after_episodes", "demonstrations", "questions"} & set(small().as_dict())
-    taught = small(demonstrations=1)
-    assert "demonstrations" in taught.as_dict() and "after_episodes" not in taught.as_dict()
-    after = protocol("arrow_puzzle_hard", after=("arrow_puzzle",))
-    assert Protocol.from_dict(after.as_dict()) == after and after.as_dict()["after_episodes"] == 100
-
-
 # --- all of it, killed and resumed -------------------------------------------------------------------------------
 
 
@@ -251,7 +195,7 @@ class _KilledError(Exception):
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
-        ("factored", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "questions": 2}),
+        ("factored", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "queries": 2}),
         ("imagination", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2}),
     ],
 )
@@ -267,10 +211,10 @@ def test_a_killed_and_taught_learner_ends_in_the_same_bits(
 
     def go(folder: Path, every_s: float) -> RunResult:
         spec = RunSpec(protocol=wanted, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
-        return runner.run(spec, folder, lambda progress: None)
+        return run_observed(spec, folder, lambda progress: None)
 
     whole = go(tmp_path / "whole", 1e9)
-    real, saves = runner.save_snapshot, []
+    real, saves = run_state.save_snapshot, []
 
     def killing(folder: Path, snapshot: Any) -> Path:
         saves.append(real(folder, snapshot))
@@ -278,7 +222,7 @@ def test_a_killed_and_taught_learner_ends_in_the_same_bits(
             raise _KilledError
         return saves[-1]
 
-    monkeypatch.setattr(runner, "save_snapshot", killing)
+    monkeypatch.setattr(run_state, "save_snapshot", killing)
     for _ in range(4):
         with pytest.raises(_KilledError):
             go(tmp_path / "run", 0.0)

@@ -13,11 +13,12 @@ from typing import Any
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.bench.launchers import LAUNCHERS, Job, LocalPool, launcher
-from imagine_bench.bench.protocol import protocol
+from imagine_bench.bench.launchers import LAUNCHERS, Job, launcher
+from imagine_bench.bench.local import LocalPool
 from imagine_bench.bench.ray import RayCluster
-from imagine_bench.bench.runs import Progress, RunSpec
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.store import encoders
 from imagine_bench.store.run_folder import load_run
 

@@ -16,47 +16,20 @@ import bench_fakes
 import gymnasium
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from small_runs import context, do, final_arrays, same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
-from imagine_bench.bench import runner
-from imagine_bench.bench.evaluation import EvaluationCounts
-from imagine_bench.bench.protocol import Protocol, protocol
-from imagine_bench.bench.runs import Progress, RunSpec
+from imagine_bench.bench import run_state
+from imagine_bench.bench.control import run_observed
+from imagine_bench.bench.evaluation import play_test_episode
+from imagine_bench.cli import observers
 from imagine_bench.errors import ArtefactError, DivergedError
-from imagine_bench.interfaces import AgentContext, Transition
-from imagine_bench.seeding import TUNING_SEEDS, SeedTree, episode_seed
+from imagine_bench.interfaces import Transition
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.results import Checkpoint, RunResult
-
-_TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
-
-
-def small(**changes: Any) -> Protocol:
-    few: dict[str, Any] = {
-        "agents": ("table",),
-        "seeds": (0,),
-        "budgets": (4, 9),
-        "evaluation_episodes": 5,
-        "execution": "kinematic",
-        "open_loop_starts": 0,
-        "recorded_episodes": 0,
-    }
-    return protocol("arrow_puzzle", "smoke", **{**few, **changes})
-
-
-def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:
-    spec = RunSpec(protocol=small(**changes), agent=agent, seed=seed, checkpoint_every_s=every_s)
-    return runner.run(spec, folder, lambda progress: None)
-
-
-def same_but_for_time(a: RunResult, b: RunResult) -> bool:
-    def rows(result: RunResult) -> list[Checkpoint]:
-        return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
-
-    arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
-    return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
+from imagine_bench.store.counters import EvaluationCounts
 
 
 @pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
@@ -65,24 +38,18 @@ def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
 ) -> None:
     asked = []
     for name in ("examples", "imagine_sampled_rollouts", "ask"):
-        real = getattr(runner, name)
+        real = getattr(observers, name)
         monkeypatch.setattr(
-            runner, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
+            observers, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
         )
     do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
     assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("ask", purpose)}
 
 
-def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:
-    snapshot = load_newest(folder / "checkpoints")
-    assert snapshot is not None
-    return dict(snapshot.agent.arrays)
-
-
 def test_a_run_counts_what_happens(tmp_path: Path) -> None:
     told: list[Progress] = []
     spec = RunSpec(protocol=small(), agent="table", seed=3)
-    result = runner.run(spec, tmp_path / "run", told.append)
+    result = run_observed(spec, tmp_path / "run", told.append)
     assert [row.episodes for row in result.checkpoints] == [4, 9]
     assert result.training_length.shape == result.training_success.shape == (9,)
     assert [row.env_steps for row in result.checkpoints] == [
@@ -128,10 +95,6 @@ def test_the_runner_itself_learns_from_every_transition_once(tmp_path: Path) -> 
     assert np.array_equal(final_arrays(tmp_path / "run")["table"], agent.table)
 
 
-def context(seed: int = 0) -> AgentContext:
-    return AgentContext(n_actions=6, preprocessing="gray_strips", encoder=None, seeds=SeedTree(seed).child("agent"))
-
-
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
     seen = bench_fakes.NosyAgent.seen
     seen.clear()
@@ -164,7 +127,7 @@ def test_every_agent_and_seed_meets_the_same_test_starts() -> None:
     for seed in (0, 1):
         tally = EvaluationCounts()
         for _ in range(4):
-            tally.add_episode(env, bench_fakes.TableAgent(context(seed)), privileged=False)
+            play_test_episode(tally, env, bench_fakes.TableAgent(context(seed)), privileged=False, purpose="evaluation")
     env.close()
     assert starts[:4] == starts[4:]
     assert len(set(starts)) > 1
@@ -172,7 +135,9 @@ def test_every_agent_and_seed_meets_the_same_test_starts() -> None:
 
 def test_a_finished_run_is_read_and_not_repeated(tmp_path: Path) -> None:
     before = do(tmp_path / "run")
-    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*") if path.name != ".lock"}
+    times = {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*") if not path.name.startswith(".lock")
+    }
     assert same_but_for_time(before, do(tmp_path / "run"))
     assert times == {path: path.stat().st_mtime_ns for path in times}
 
@@ -213,7 +178,7 @@ class _KilledError(Exception):
 def test_stopping_anywhere_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
     """After any episode, of training or of a test, half way through counting: the result is the same."""
     whole = do(tmp_path / "whole")
-    real, calls = runner.save_snapshot, []
+    real, calls = run_state.save_snapshot, []
 
     def killing(folder: Path, snapshot: Any) -> Path:
         where = real(folder, snapshot)
@@ -222,10 +187,10 @@ def test_stopping_anywhere_changes_nothing(tmp_path: Path, monkeypatch: pytest.M
             raise _KilledError
         return where
 
-    monkeypatch.setattr(runner, "save_snapshot", killing)
+    monkeypatch.setattr(run_state, "save_snapshot", killing)
     with pytest.raises(_KilledError):
         do(tmp_path / "run", every_s=0.0)
-    monkeypatch.setattr(runner, "save_snapshot", real)
+    monkeypatch.setattr(run_state, "save_snapshot", real)
     assert same_but_for_time(whole, do(tmp_path / "run"))
     weights, again = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
     assert weights["table"].tobytes() == again["table"].tobytes()
@@ -235,18 +200,18 @@ _CHILD = """
 import json, signal, sys
 from pathlib import Path
 import bench_fakes
-from imagine_bench import runner
-from imagine_bench.protocol import Protocol
-from imagine_bench.runs import RunSpec
+from imagine_bench.bench import run_state, runner
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import RunSpec
 
-save, saves = runner.save_snapshot, iter(range(int(sys.argv[3])))
+save, saves = run_state.save_snapshot, iter(range(int(sys.argv[3])))
 def saying(folder, snapshot):
     if next(saves, None) is None:
         signal.pause()  # whoever is to kill this is late
     print("saving", flush=True)
     return save(folder, snapshot)
 
-runner.save_snapshot = saying
+run_state.save_snapshot = saying
 spec = RunSpec(protocol=Protocol.from_dict(json.loads(sys.argv[2])), agent="table", seed=0, checkpoint_every_s=0.0)
 runner.run(spec, Path(sys.argv[1]), lambda progress: None)
 """
@@ -280,7 +245,7 @@ def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> N
     (folder / "DONE").unlink()
     (folder / "metrics.csv").unlink()
     spec = RunSpec(protocol=small(), agent="table", seed=0, until=4)
-    assert runner.run(spec, folder, lambda progress: None) is not None
+    assert run_observed(spec, folder, lambda progress: None) is not None
     assert (folder / "metrics.csv").read_text() == table
 
 

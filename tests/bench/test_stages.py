@@ -3,49 +3,25 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runner import do, final_arrays, same_but_for_time, small
+from small_runs import Inline, do, final_arrays, same_but_for_time, small
 
 from imagine_bench.bench import bench as benches
-from imagine_bench.bench import protocol as protocols
-from imagine_bench.bench import runner
-from imagine_bench.bench.launchers import Failure, Job
-from imagine_bench.bench.protocol import protocol
-from imagine_bench.bench.runs import Observer
 from imagine_bench.errors import ArtefactError, RunFailedError
+from imagine_bench.protocols import control as protocols
+from imagine_bench.protocols.control import protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.store import run_folder
-from imagine_bench.store.partial import load_so_far
+from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import BenchResult
 
 
-class Inline:
-    """A launcher without processes that notes its order of work, and gives up after so many jobs."""
-
-    def __init__(self, patience: int = 1000) -> None:
-        self.order: list[tuple[str, int, int | None]] = []
-        self._patience = patience
-
-    def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
-        failures = []
-        for job in jobs:
-            if len(self.order) == self._patience:
-                raise KeyboardInterrupt
-            self.order.append((job.spec.agent, job.spec.seed, job.spec.until))
-            try:
-                runner.run(job.spec, job.folder, on_progress)
-            except RuntimeError as error:
-                failures.append(Failure(job=job, reason=str(error)))
-        return tuple(failures)
-
-
 @pytest.fixture(autouse=True)
-def early_wave(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocols, "_FIRST_WAVE", 4)
+def early_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocols, "_FIRST_STAGE", 4)
 
 
 def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
@@ -53,7 +29,7 @@ def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
     return benches.bench(wanted, None, root=root, launcher=launcher)
 
 
-def test_all_runs_come_to_a_wave_before_any_goes_on(tmp_path: Path) -> None:
+def test_all_runs_come_to_a_stage_before_any_goes_on(tmp_path: Path) -> None:
     launcher = Inline()
     result = bench(tmp_path, launcher)
     runs = [(agent, seed) for seed in (0, 1) for agent in ("table", "imaginer")]
@@ -63,15 +39,15 @@ def test_all_runs_come_to_a_wave_before_any_goes_on(tmp_path: Path) -> None:
     assert len(launcher.order) == 12, "a finished bench is only read"
 
 
-def test_waves_change_no_bit(tmp_path: Path) -> None:
-    in_waves = bench(tmp_path / "stages", Inline(), agents=("table",), seeds=(0,)).runs[0]
+def test_stages_change_no_bit(tmp_path: Path) -> None:
+    in_stages = bench(tmp_path / "stages", Inline(), agents=("table",), seeds=(0,)).runs[0]
     at_once = do(tmp_path / "once", agents=("table",), budgets=(2, 4, 6, 9))
-    assert len(in_waves.checkpoints) == 4 and same_but_for_time(in_waves, at_once)
-    ours, theirs = final_arrays(in_waves.folder), final_arrays(at_once.folder)
+    assert len(in_stages.checkpoints) == 4 and same_but_for_time(in_stages, at_once)
+    ours, theirs = final_arrays(in_stages.folder), final_arrays(at_once.folder)
     assert ours and all(np.array_equal(array, theirs[name]) for name, array in ours.items())
 
 
-def test_short_benches_have_one_wave(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_benches_have_one_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     assert protocol("arrow_puzzle", "quick").stages == (None,)
     assert protocol("arrow_puzzle", "thesis").stages == (2000, 3000, 4000, 5000, None)

@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 from imagine_bench.agents.imagination.chapter_5 import CHAPTER_5
 from imagine_bench.agents.presets import flatten
+from small_runs import do
 
-from imagine_bench.bench import runner
+from imagine_bench.bench import run_state
+from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.launchers import Failure, Job
-from imagine_bench.bench.runs import Observer
-from imagine_bench.bench.studies import STUDIES
-from imagine_bench.bench.study import BASE, Line, Study, Variant, run_study
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
+from imagine_bench.studies.catalogue import STUDIES
+from imagine_bench.studies.study import BASE, Line, Study, Variant, run_study
 
 STUDY = Study(
     name="fakes",
@@ -45,9 +47,9 @@ class Here:
     def __init__(self) -> None:
         self.done: list[Job] = []
 
-    def launch(self, jobs: Sequence[Job], on_progress: Observer) -> tuple[Failure, ...]:
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         for job in jobs:
-            runner.run(job.spec, job.folder, on_progress)
+            run_observed(job.spec, job.folder, on_progress)
             self.done.append(job)
         return ()
 
@@ -86,7 +88,7 @@ def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
 
 def test_tuning_runs_are_tested_on_starts_that_no_reported_run_meets(tmp_path: Path) -> None:
     seeds: dict[int, list[int]] = {}
-    real_reset = runner.gymnasium.make
+    real_reset = run_state.gymnasium.make
 
     def make(*arguments: object, **options: object) -> object:
         env = real_reset(*arguments, **options)
@@ -100,10 +102,8 @@ def test_tuning_runs_are_tested_on_starts_that_no_reported_run_meets(tmp_path: P
         return env
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner.gymnasium, "make", make)
+        patch.setattr(run_state.gymnasium, "make", make)
         for current in (0, 1000):
-            from test_runner import do
-
             do(tmp_path / str(current), seed=current, seeds=(current,))
     assert len(seeds[0]) == len(seeds[1000]) == 9 + 2 * 5
     assert not set(seeds[0]) & set(seeds[1000])

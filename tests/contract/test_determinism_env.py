@@ -89,7 +89,7 @@ def test_a_dirty_reset_is_a_fresh_environment(task, execution):
     fresh.close()
 
 
-def test_a_macro_action_depends_on_where_the_cubes_stand_and_on_nothing_else():
+def test_a_macro_action_depends_on_where_the_cubes_stand_alone():
     """The same cubes and action, reached by different pasts and in another MjData: the same bits."""
     env, other = make(), make()
     env.reset(seed=2, options={"macrostate": (1, 2, 0, 0)})

@@ -119,10 +119,11 @@ def test_the_horizon_truncates_and_does_not_terminate(task):
 
 
 @pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_names", "macrostate_values"])
-def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, monkeypatch):
+def test_a_task_unlike_its_registry_line_or_its_rules_is_named(field, monkeypatch):
     spec = registry.task("arrow_puzzle")
     wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
-    monkeypatch.setattr("imagine_bench.tasks.arrow_puzzle.spec.SPEC", dataclasses.replace(spec, **{field: wrong}))
+    changed = dataclasses.replace(spec, **{field: wrong})
+    monkeypatch.setattr("imagine_bench.tasks.arrow_puzzle.spec.spec_of", lambda goal: changed)
     numbers = {"action_names": "n_actions 5", "macrostate_names": "names 3", "macrostate_values": r"values \(4, 4, 4\)"}
     what = numbers.get(field, f"{field} {wrong!r}")
     with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
@@ -130,7 +131,7 @@ def test_a_task_that_contradicts_its_registry_line_or_its_rules_is_named(field, 
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_macrostate_can_be_the_start_and_the_rules_go_on_from_it(task):
+def test_every_macrostate_can_be_the_start_of_an_episode(task):
     spec, env = registry.task(task), make(task, **KINEMATIC).unwrapped
     generator = np.random.default_rng(0)
     for state in spec.rules.states:
@@ -177,7 +178,7 @@ def test_a_closed_environment_holds_no_opengl_context():
     env.reset(seed=0)
     env.render()
     env.human_view(64, 48)
-    renderers = env._eye, env._picture, env._human
+    renderers = env._agent_camera, env._render_camera, env._human_camera
     assert all(renderer._canvas is not None for renderer in renderers)
     env.close()
     assert all(renderer._canvas is None for renderer in renderers)
@@ -211,7 +212,7 @@ def test_rendering_draws_no_random_number():
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
-def test_a_cube_that_does_not_follow_is_a_fault_and_rewards_come_from_what_was_read():
+def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
     env = make().unwrapped
     model = env._world.model
@@ -257,9 +258,9 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
         ({"appearance": "wild"}, r"No appearance 'wild'\..*Known: clean, mild, strong"),
         ({"render_mode": "human"}, r"No render mode 'human'\..*Known: rgb_array"),
         ({"camera": "hunam"}, r"No camera 'hunam'\. Did you mean 'human'\? Known: .*human"),
-        ({"width": 0}, r"Picture width 0 must be an integer from 1 to 4096 pixels"),
-        ({"height": 99999}, r"Picture height 99999 must be an integer from 1 to 4096 pixels"),
-        ({"height": 64.5}, r"Picture height 64\.5 must be an integer"),
+        ({"width": 0}, r"Image width 0 must be an integer from 1 to 4096 pixels"),
+        ({"height": 99999}, r"Image height 99999 must be an integer from 1 to 4096 pixels"),
+        ({"height": 64.5}, r"Image height 64\.5 must be an integer"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
@@ -297,7 +298,7 @@ def test_reset_options_that_are_no_mapping_are_refused(kinematic, options):
         kinematic.reset(options=options)
 
 
-def test_where_not_every_combination_is_a_macrostate_the_list_is_named():
+def test_the_error_names_the_list_of_possible_macrostates():
     env = gymnasium.make("imagine_bench/PickPlace-v0", **KINEMATIC)
     with pytest.raises(InvalidValueError, match=r"one of the 19 of .*task\('pick_place'\)\.rules\.states, such as"):
         env.reset(options={"macrostate": (0, 1, 2, 0)})
@@ -457,7 +458,7 @@ def test_the_human_view_shows_the_whole_scene_at_the_asked_size():
     small = env.human_view(64, 48)
     assert small.shape == (48, 64, 3)
     assert small.std() > 20
-    with pytest.raises(InvalidValueError, match="Picture width -1"):
+    with pytest.raises(InvalidValueError, match="Image width -1"):
         env.human_view(-1, 48)
     env.close()
 

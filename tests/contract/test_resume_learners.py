@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from test_runner import final_arrays, small
+from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
-from imagine_bench.bench import runner
-from imagine_bench.bench.runs import RunSpec
+from imagine_bench.bench import run_state
+from imagine_bench.bench.control import run_observed
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.store import encoders
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
@@ -35,29 +35,7 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=own)
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.AGENTS[agent].encoder_kind)
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
-    return runner.run(spec, folder, lambda progress: None)
-
-
-def measured(result: RunResult) -> list[dict[str, Any]]:
-    """Every number of every row but the times; a NaN equals itself as text."""
-    rows = []
-    for row in result.checkpoints:
-        values = dataclasses.asdict(row)
-        values["diagnostics"] = {k: v for k, v in values["diagnostics"].items() if not k.startswith("time/")}
-        rows.append({name: exact(value) for name, value in values.items() if not name.endswith("_cpu_s")})
-    return rows
-
-
-def exact(value: Any) -> Any:
-    """A value to compare to the bit; the text of an array would round its numbers and leave most of them out."""
-    if isinstance(value, np.ndarray):
-        return value.shape, value.dtype.str, value.tobytes()
-    if isinstance(value, dict):
-        return {name: exact(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [exact(part) for part in value]
-    assert value is None or isinstance(value, int | float | str | np.generic), type(value)
-    return repr(value)
+    return run_observed(spec, folder, lambda progress: None)
 
 
 def own_values(folder: Path) -> str:
@@ -71,7 +49,7 @@ def own_values(folder: Path) -> str:
 @pytest.mark.parametrize("agent", LEARNERS)
 def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str) -> None:
     whole = do(tmp_path / "whole", agent, 1e9)
-    real, saves = runner.save_snapshot, []
+    real, saves = run_state.save_snapshot, []
 
     def killing(folder: Path, snapshot: Any) -> Path:
         saves.append(real(folder, snapshot))
@@ -79,7 +57,7 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
             raise KilledError
         return saves[-1]
 
-    monkeypatch.setattr(runner, "save_snapshot", killing)
+    monkeypatch.setattr(run_state, "save_snapshot", killing)
     for _ in range(3):
         with pytest.raises(KilledError):
             do(tmp_path / "run", agent, 0.0)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.bench.runs import RunSpec
-from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.capabilities import ImaginedRollout, Label
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.seeding import SeedTree
 
@@ -124,6 +124,48 @@ class NosyAgent(TableAgent):
         return super().act(observation, explore=explore)
 
 
+class Pupil(TableAgent):
+    """Notes all that it is shown, asks about random plans whenever it may, and counts what it carries over."""
+
+    made: list[Pupil] = []  # noqa: RUF012 - how a test finds it
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__(context)
+        self.asking = np.random.default_rng(0)
+        self.shown: list[tuple[int, Transition]] = []
+        self.seen: list[Observation] = []
+        self.answers: list[tuple[NDArray[np.int64], Label | None]] = []
+        self.carried: list[int] = []
+        self.made.append(self)
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        self.seen.append(observation)
+        return super().act(observation, explore=explore)
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        self.shown.append((episode, transition))
+        super().observe(transition, episode=episode)
+
+    def reset_for_new_task(self) -> None:
+        self.carried.append(len({episode for episode, _ in self.shown}))
+        self.shown.clear()
+
+    def query(self, observation: Observation) -> NDArray[np.int64] | None:
+        self.seen.append(observation)
+        return self.asking.integers(self.n_actions, size=3)
+
+    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+        self.answers.append((actions, label))
+
+    def state(self) -> AgentState:
+        state = super().state()
+        return AgentState(arrays=state.arrays, values={**state.values, "asking": self.asking.bit_generator.state})
+
+    def restore(self, state: AgentState) -> None:
+        super().restore(state)
+        self.asking.bit_generator.state = state.values["asking"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class FakeRunSpec(RunSpec):
     """A spec that makes a worker import this module."""
@@ -133,6 +175,7 @@ AGENTS.update(
     table=AgentEntry(make="bench_fakes:TableAgent", needs_encoder=False),
     imaginer=AgentEntry(make="bench_fakes:RulesImaginer", needs_encoder=False),
     failing=AgentEntry(make="bench_fakes:FailingAgent", needs_encoder=False),
+    pupil=AgentEntry(make="bench_fakes:Pupil", needs_encoder=False),
     nosy=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False),
     nosy_privileged=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False, privileged=True),
 )

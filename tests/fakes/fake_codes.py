@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from imagine_bench.agents.factored.agent import ImagineAgent
+from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.settings import resolve
+from torch.nn import functional
 
 from imagine_bench.interfaces import Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -21,8 +22,11 @@ class FakeCodes:
 
     card = SimpleNamespace(code_sizes=SIZES)
 
-    def codes(self, frame: Frame) -> tuple[int, ...]:
-        return tuple(int(value) for value in frame[0, : len(SIZES), 0])
+    def encode(self, frames: Frame) -> tuple[torch.Tensor, torch.Tensor]:
+        codes = torch.as_tensor(frames[:, 0, : len(SIZES), 0]).long()
+        hot = [functional.one_hot(codes[:, factor], size) for factor, size in enumerate(SIZES)]
+        mu = torch.cat(hot, dim=1).float()
+        return mu, torch.zeros_like(mu)
 
     def decode(self, latents: torch.Tensor) -> np.ndarray:
         return latents.mean(dim=1)[:, None, None].expand(-1, 64, 64).numpy()
@@ -70,12 +74,12 @@ def starts() -> list[tuple[int, ...]]:
     return [code for code in codes if code not in ((2, 1, 1), (1, 2, 0))]
 
 
-def agent(seed: int = 0, **overrides: object) -> ImagineAgent:
+def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
     settings = resolve("quick", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5")
-    return ImagineAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
+    return FactoredAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
 
 
-def live(learner: ImagineAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
+def live(learner: FactoredAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
     """Train on the tiny world; the actions taken."""
     taken = []
     for episode in episodes:
@@ -90,7 +94,7 @@ def live(learner: ImagineAgent, episodes: range, rng: np.random.Generator, horiz
     return taken
 
 
-def success(learner: ImagineAgent, horizon: int = 6) -> float:
+def success(learner: FactoredAgent, horizon: int = 6) -> float:
     """Share of starts from which the greedy agent ends well."""
     solved = 0
     for start in starts():

@@ -78,7 +78,7 @@ def context(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any] | None = 
     """A context whose encoder is the fake one and whose networks are tiny."""
     monkeypatch.setattr(perception, "Encoder", FakeEncoder)
     values = {"n_actions": ACTIONS, "preprocessing": "gray_strips", "encoder": Path("fake.safetensors")}
-    values |= {"seeds": SeedTree(0), "preset": "thesis", "overrides": {**SMALL, **(overrides or {})}}
+    values |= {"seeds": SeedTree(0), "hyperparameters": "published", "overrides": {**SMALL, **(overrides or {})}}
     return AgentContext(**(values | changes))
 
 

@@ -9,7 +9,7 @@ from scipy import integrate, stats
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge import calibration
 from imagine_bench.judge.calibration import auroc, coverage, crps, log_score, probability_transform, transform_distance
-from imagine_bench.regression import Mixtures
+from imagine_bench.regression.interfaces import Mixtures
 
 
 def mixture(seed: int = 0, rows: int = 4, components: int = 3, size: int = 2) -> Mixtures:
@@ -26,7 +26,7 @@ def distribution(m: Mixtures, row: int, d: int, y: np.ndarray) -> np.ndarray:
     return sum(w * stats.norm.cdf(y, mean, sigma) for w, mean, sigma in parts)
 
 
-def test_crps_is_the_integral_of_the_squared_difference_of_distributions() -> None:
+def test_crps_integrates_the_squared_difference_of_distributions() -> None:
     m, outcomes = mixture(), np.array([[0.3, -1.0], [5.0, 0.0], [-7.0, 2.0], [0.0, 0.0]])
     closed = crps(m, outcomes)
     for row in range(4):
@@ -64,7 +64,7 @@ def test_crps_prefers_the_truth() -> None:
     assert score[1.0] < min(score[0.5], score[2.0])
 
 
-def test_transforms_are_the_distribution_function_and_uniform_for_the_truth() -> None:
+def test_transforms_are_the_cdf_and_uniform_for_the_truth() -> None:
     m = mixture(rows=2000)
     rng = np.random.default_rng(1)
     chosen = np.array([rng.choice(3, p=w) for w in m.weights])

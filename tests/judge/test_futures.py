@@ -1,4 +1,4 @@
-"""Sampled futures against exact ones: hand-computed cases, perfect, collapsed and inventive samplers, one Gaussian."""
+"""Sampled futures against exact ones: by hand, and perfect, collapsed, hallucinating and learned samplers."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Follow, SampledFutures
-from imagine_bench.interfaces import Frame, Outcome, TaskSpec
+from imagine_bench.interfaces import Frame, Outcome, State, TaskSpec
 from imagine_bench.judge import futures
 from imagine_bench.seeding import SeedTree
 
-State = tuple[int, ...]
-ANSWERS = (0.5, 0.3, 0.2)
+SHARES = (0.5, 0.3, 0.2)
 """What action 0 leads to from state 0: states 1, 2 and 3."""
 
 
@@ -48,7 +47,7 @@ class Coin:
             return (Outcome(1.0, (5,), -5.0, terminated=True, success=False),)
         if action == 1:
             return (Outcome(1.0, (4,), 5.0, terminated=True, success=True),)
-        return tuple(Outcome(p, (1 + n,), 1.0, terminated=False, success=False) for n, p in enumerate(ANSWERS))
+        return tuple(Outcome(p, (1 + n,), 1.0, terminated=False, success=False) for n, p in enumerate(SHARES))
 
     def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
         return next(each for each in self.outcomes(macrostate, action) if each.macrostate == reached)
@@ -115,11 +114,11 @@ def test_distances_are_those_computed_by_hand() -> None:
     assert futures.total_variation(exact, exact) == 0.0
     assert futures.total_variation(exact, other) == pytest.approx(0.5)
     assert futures.total_variation(exact, {(9,): 1.0}) == 1.0
-    assert futures.missing_modes(exact, other) == 1
-    assert futures.invented_modes(exact, other) == 2
-    assert futures.missing_modes(exact, {(1,): 0.89, (2,): 0.11}) == 0, "0.11 is just above a fifth of 0.5"
-    assert futures.missing_modes(exact, {(1,): 0.91, (2,): 0.09}) == 1
-    assert futures.invented_modes(exact, {(1,): 0.48, (2,): 0.48, (3,): 0.04}) == 0, "below the least of a mode"
+    assert futures.missed_modes(exact, other) == 1
+    assert futures.hallucinated_modes(exact, other) == 2
+    assert futures.missed_modes(exact, {(1,): 0.89, (2,): 0.11}) == 0, "0.11 is just above a fifth of 0.5"
+    assert futures.missed_modes(exact, {(1,): 0.91, (2,): 0.09}) == 1
+    assert futures.hallucinated_modes(exact, {(1,): 0.48, (2,): 0.48, (3,): 0.04}) == 0, "below the least of a mode"
 
 
 def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
@@ -127,8 +126,8 @@ def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
     rng = np.random.default_rng(0)
     shares = rng.multinomial(50, list(exact.values()), size=20_000) / 50
     distance = 0.5 * np.abs(shares - np.array(list(exact.values()))).sum(axis=1)
-    assert futures.sampling_floor(exact, 50) == pytest.approx(distance.mean(), rel=0.01)
-    assert futures.sampling_floor({(1,): 1.0}, 50) == 0.0
+    assert futures.sampling_noise_floor(exact, 50) == pytest.approx(distance.mean(), rel=0.01)
+    assert futures.sampling_noise_floor({(1,): 1.0}, 50) == 0.0
 
 
 def test_a_perfect_sampler_shows_the_floor_and_no_fault() -> None:
@@ -137,8 +136,10 @@ def test_a_perfect_sampler_shows_the_floor_and_no_fault() -> None:
     assert int(found.samples) == 400
     assert found.total_variation.max() < 0.08  # floor 0.03 where three outcomes are possible
     ask = pair(found, 0, 0)
-    assert found.floor[:2, ask] == pytest.approx([futures.sampling_floor(dict(enumerate(ANSWERS)), 400), 0.0])
-    assert found.missing.sum() == found.hallucinated.sum() == 0
+    assert found.sampling_noise_floor[:2, ask] == pytest.approx(
+        [futures.sampling_noise_floor(dict(enumerate(SHARES)), 400), 0.0]
+    )
+    assert found.missed.sum() == found.hallucinated.sum() == 0
     assert found.reward_error.max() < 1e-6
     assert found.termination_error.max() < 1e-6
     assert found.survival_probability[:, ask].tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
@@ -153,19 +154,19 @@ def test_a_collapsed_sampler_misses_modes_and_says_how_many() -> None:
     found = measure(TableSampler(collapse))
     ask = pair(found, 0, 0)
     assert found.total_variation[0, ask] == pytest.approx(0.5)
-    assert found.missing[0, ask] == 2
-    assert found.missing[1, ask] == 0, "all of them end alike"
+    assert found.missed[0, ask] == 2
+    assert found.missed[1, ask] == 0, "all of them end alike"
     assert found.hallucinated.sum() == 0
 
 
-def test_an_inventive_sampler_is_caught_with_its_rewards_and_ends() -> None:
+def test_a_hallucinating_sampler_is_caught_with_rewards_and_ends() -> None:
     def invent(state: int, action: int, rng: np.random.Generator) -> tuple[int, float, bool]:
         return 0, -1.0, False
 
     found = measure(TableSampler(invent), samples=8)
     take = pair(found, 1, 1)
     assert found.total_variation[0, take] == 1.0
-    assert (found.missing[0, take], found.hallucinated[0, take]) == (1, 1)
+    assert (found.missed[0, take], found.hallucinated[0, take]) == (1, 1)
     assert found.reward_error[0, take] == pytest.approx(6.0)
     assert found.termination_error[:, take].tolist() == [1.0] * futures.DEPTH
 
@@ -203,19 +204,19 @@ class LearnedSampler:
         return sample_futures(self.imagination, FakeEncoder(), frames, actions, **options)  # type: ignore[arg-type]
 
 
-def test_a_mixture_learns_all_outcomes_and_a_single_gaussian_visibly_does_not() -> None:
+def test_a_mixture_learns_all_outcomes_and_one_gaussian_does_not() -> None:
     mixture, gaussian = (measure(LearnedSampler(components)) for components in (6, 1))  # type: ignore[arg-type]
     ask = pair(mixture, 0, 0)
     assert mixture.total_variation.mean(axis=1).max() < 0.1
     assert mixture.total_variation[0, ask] < 0.15
-    assert mixture.missing.sum() == mixture.hallucinated.sum() == 0
+    assert mixture.missed.sum() == mixture.hallucinated.sum() == 0
     assert gaussian.total_variation[0, ask] > 0.3
-    assert gaussian.missing[0, ask] + gaussian.hallucinated[0, ask] >= 1
+    assert gaussian.missed[0, ask] + gaussian.hallucinated[0, ask] >= 1
     certain = pair(gaussian, 2, 1)
     assert gaussian.total_variation[0, certain] < 0.1, "it fails where several outcomes are possible, not everywhere"
 
 
-def test_sampling_changes_no_generator_of_the_imagination_and_follows_its_own() -> None:
+def test_sampling_draws_from_its_own_generator_alone() -> None:
     imagination = learned(2)
     before = imagination.arrays()
     options = {"follow": lambda rows: futures.follow_optimum(RULES, rows), "samples": 5, "depth": 3}
@@ -231,7 +232,7 @@ def test_sampling_changes_no_generator_of_the_imagination_and_follows_its_own() 
     assert actions.tolist() == [0, 1], "the caller's arrays are left alone"
 
 
-def test_all_macro_actions_of_a_future_are_imagined_by_the_same_network() -> None:
+def test_one_network_imagines_all_macro_actions_of_a_future() -> None:
     """One draw of dropout masks, as in every other rollout: followed by hand, the same rewards are met."""
     model = WorldModelSettings(dynamics_hidden=(32, 32), dropout=0.5)
     settings = Settings(model=model, imagination=ImaginationSettings(weight_samples=1, temperature=0.0))

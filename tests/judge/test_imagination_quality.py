@@ -1,4 +1,4 @@
-"""Open-loop questions and their marking, with imaginers whose answers are known."""
+"""The open-loop comparison and its scores, with imaginers whose predictions are known."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import dataclasses
 import bench_fakes
 import numpy as np
 import pytest
-from test_runner import context
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
-from imagine_bench.interfaces import Outcome, TaskSpec
-from imagine_bench.judge.imagination_quality import EXAMPLES, Question, ask, examples, open_loop
+from imagine_bench.interfaces import AgentContext, Outcome, TaskSpec
+from imagine_bench.judge.imagination_quality import EXAMPLES, OpenLoopStart, ask, examples, open_loop
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
+
+AGENT = AgentContext(n_actions=6, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0).child("agent"))
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,7 @@ def spec() -> TaskSpec:
 
 
 @pytest.fixture(scope="module")
-def questions(spec: TaskSpec) -> tuple[Question, ...]:
+def starts(spec: TaskSpec) -> tuple[OpenLoopStart, ...]:
     return ask(spec, starts=40, depth=10, appearance="clean")
 
 
@@ -32,13 +33,13 @@ def only(belief: dict[tuple[int, ...], float]) -> tuple[int, ...]:
     return state
 
 
-def test_the_rules_keep_every_question_alive(spec: TaskSpec, questions: tuple[Question, ...]) -> None:
-    assert len(questions) == 40
-    for question in questions:
-        assert question.actions.shape == question.rewards.shape == (10,)
-        assert (question.rewards == -1.0).all()
+def test_the_rules_keep_every_rollout_alive(spec: TaskSpec, starts: tuple[OpenLoopStart, ...]) -> None:
+    assert len(starts) == 40
+    for start in starts:
+        assert start.actions.shape == start.rewards.shape == (10,)
+        assert (start.rewards == -1.0).all()
         before = None
-        for action, belief in zip(question.actions, question.beliefs, strict=True):
+        for action, belief in zip(start.actions, start.beliefs, strict=True):
             state = only(belief)
             assert not spec.rules.is_terminal(state)
             if before is not None:
@@ -59,30 +60,30 @@ def test_blind_random_actions_would_not_stay_alive(spec: TaskSpec) -> None:
     assert alive <= 1
 
 
-def test_actions_vary_and_questions_repeat(spec: TaskSpec, questions: tuple[Question, ...]) -> None:
+def test_actions_vary_and_starts_repeat(spec: TaskSpec, starts: tuple[OpenLoopStart, ...]) -> None:
     again = ask(spec, starts=40, depth=10, appearance="clean")
-    assert all(np.array_equal(a.frame, b.frame) for a, b in zip(questions, again, strict=True))
-    assert all(np.array_equal(a.actions, b.actions) for a, b in zip(questions, again, strict=True))
-    assert len({tuple(question.actions) for question in questions}) > 30
+    assert all(np.array_equal(a.frame, b.frame) for a, b in zip(starts, again, strict=True))
+    assert all(np.array_equal(a.actions, b.actions) for a, b in zip(starts, again, strict=True))
+    assert len({tuple(start.actions) for start in starts}) > 30
 
 
-class KnowsTheAnswers(bench_fakes.RulesImaginer):
-    """Right until ``wrong_from``, then wrong in one coordinate; finds its question by its frame and actions."""
+class KnowsTheTruth(bench_fakes.RulesImaginer):
+    """Right until ``wrong_from``, then wrong in one coordinate; finds its start by its frame and actions."""
 
-    def __init__(self, questions: tuple[Question, ...]) -> None:
-        super().__init__(context())
-        self.questions = questions
+    def __init__(self, starts: tuple[OpenLoopStart, ...]) -> None:
+        super().__init__(AGENT)
+        self.starts = starts
 
     def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
-        (question,) = [q for q in self.questions if q.frame is frame and q.actions is actions]
+        (start,) = [q for q in self.starts if q.frame is frame and q.actions is actions]
         blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
-        states = np.array([only(belief) for belief in question.beliefs])
+        states = np.array([only(belief) for belief in start.beliefs])
         states[self.wrong_from - 1 :, 3] += 1
         return dataclasses.replace(blank, macrostates=states)
 
 
-def test_marks_are_right_by_depth(questions: tuple[Question, ...]) -> None:
-    loop = open_loop(KnowsTheAnswers(questions), questions, SeedTree(0))
+def test_scores_by_depth(starts: tuple[OpenLoopStart, ...]) -> None:
+    loop = open_loop(KnowsTheTruth(starts), starts, SeedTree(0))
     assert loop.count.tolist() == [40] * 10
     assert loop.correct.tolist() == loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
     assert loop.correct_accepted[:3].tolist() == [1.0] * 3
@@ -92,17 +93,17 @@ def test_marks_are_right_by_depth(questions: tuple[Question, ...]) -> None:
     assert (loop.epistemic[0], loop.aleatoric[0], loop.modal[0]) == (0.25, 0.5, 0.75)
 
 
-class Doubts(bench_fakes.RulesImaginer):
+class Unsure(bench_fakes.RulesImaginer):
     """Wrong at depth 3 in every other rollout, where its epistemic uncertainty is high; modal is high where right."""
 
-    def __init__(self, questions: tuple[Question, ...]) -> None:
-        super().__init__(context())
-        self.questions = questions
+    def __init__(self, starts: tuple[OpenLoopStart, ...]) -> None:
+        super().__init__(AGENT)
+        self.starts = starts
 
     def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
-        (index,) = [i for i, q in enumerate(self.questions) if q.frame is frame and q.actions is actions]
+        (index,) = [i for i, q in enumerate(self.starts) if q.frame is frame and q.actions is actions]
         blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
-        states = np.array([only(belief) for belief in self.questions[index].beliefs])
+        states = np.array([only(belief) for belief in self.starts[index].beliefs])
         epistemic, modal = np.full(depth, 0.1, np.float32), np.full(depth, 0.9, np.float32)
         if index % 2:
             states[2:, 3] += 1
@@ -110,16 +111,16 @@ class Doubts(bench_fakes.RulesImaginer):
         return dataclasses.replace(blank, macrostates=states, epistemic=epistemic, modal=modal)
 
 
-def test_uncertainty_is_held_to_the_errors_it_should_find(questions: tuple[Question, ...]) -> None:
-    loop = open_loop(Doubts(questions), questions, SeedTree(0))
-    half = len(questions) // 2
-    assert loop.judged.tolist() == [len(questions)] * 3 + [len(questions) - half] * 7  # after an error nobody is judged
+def test_uncertainty_is_held_to_the_errors_it_should_find(starts: tuple[OpenLoopStart, ...]) -> None:
+    loop = open_loop(Unsure(starts), starts, SeedTree(0))
+    half = len(starts) // 2
+    assert loop.judged.tolist() == [len(starts)] * 3 + [len(starts) - half] * 7  # after an error nobody is judged
     assert loop.auroc_epistemic[2] == 1.0 and loop.auroc_modal[2] == 0.0 and loop.auroc_aleatoric[2] == 0.5
     assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
 
 
 def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
-    agent = bench_fakes.RulesImaginer(context())
+    agent = bench_fakes.RulesImaginer(AGENT)
     first = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
     again = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
     assert len(first) == EXAMPLES
@@ -131,7 +132,7 @@ def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
 
 
 def test_examples_of_a_run_that_tunes_begin_elsewhere(spec: TaskSpec) -> None:
-    agent = bench_fakes.RulesImaginer(context())
+    agent = bench_fakes.RulesImaginer(AGENT)
     reported, tuning = (
         examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=evaluation_split(seed))
         for seed in (0, TUNING_SEEDS)
@@ -153,7 +154,7 @@ class _Coin:
         return (pit, safe) if macrostate == (1,) else (dataclasses.replace(safe, probability=1.0),)
 
 
-def test_random_rules_are_asked_only_what_is_sure(spec: TaskSpec) -> None:
+def test_random_rules_give_only_starts_that_surely_stay_alive(spec: TaskSpec) -> None:
     coin = dataclasses.replace(
         spec,
         rules=_Coin(),  # type: ignore[arg-type]
@@ -162,4 +163,4 @@ def test_random_rules_are_asked_only_what_is_sure(spec: TaskSpec) -> None:
     )
     asked = ask(coin, starts=8, depth=3, appearance="clean")
     assert len(asked) == 8
-    assert all(question.actions.tolist() == [0, 0, 0] for question in asked)  # from (0,) alone, staying
+    assert all(start.actions.tolist() == [0, 0, 0] for start in asked)  # from (0,) alone, staying

@@ -1,10 +1,12 @@
-"""Plans: carried out blindly, counted against the rules, refused where the agent doubts."""
+"""Plans: carried out blindly, counted against the rules, refused where the agent is uncertain."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -15,30 +17,29 @@ import pytest
 from fake_results import bench_result
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
-from test_recording import rerun
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
-from imagine_bench.bench.runs import RunSpec
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Frame
-from imagine_bench.judge.plans import Plan, carry_out, fewest_actions, make_env, make_plans
+from imagine_bench.interfaces import Frame, State
+from imagine_bench.judge.plans import Plan, carry_out, make_env, make_plans
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.plans import plan_table, summarise, write_plans
+from imagine_bench.rules import fewest_actions
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
 from imagine_bench.store.trained import Trained, best_run
 
 TASK = registry.task("arrow_puzzle")
-State = tuple[int, ...]
 
 
 class Dreamer:
     """Plans by the rules from the true start, which a test lets it peep at, and imagines what ``lie`` makes of it."""
 
-    def __init__(self, *, choose: Callable[[State], int], doubt: float = 0.1, accepts: bool = True) -> None:
-        self.choose, self.doubt, self.accepts = choose, doubt, accepts
+    def __init__(self, *, choose: Callable[[State], int], uncertainty: float = 0.1, accepts: bool = True) -> None:
+        self.choose, self.uncertainty, self.accepts = choose, uncertainty, accepts
         self.env: Any = None
         self.frames: list[Frame] = []
 
@@ -64,7 +65,7 @@ class Dreamer:
             rewards=np.zeros(count, dtype=np.float32),
             p_terminated=np.zeros(count, dtype=np.float32),
             q_values=np.zeros((count, 6), dtype=np.float32),
-            epistemic=np.linspace(0.0, self.doubt, count, dtype=np.float32),
+            epistemic=np.linspace(0.0, self.uncertainty, count, dtype=np.float32),
             aleatoric=np.zeros(count, dtype=np.float32),
             modal=np.zeros(count, dtype=np.float32),
             accepted=np.full(count, self.accepts),
@@ -85,7 +86,7 @@ def carried_out(dreamer: Dreamer, count: int, execution: str = "kinematic", **op
 
 
 @pytest.mark.parametrize(("execution", "count"), [("kinematic", 40), ("physics", 8)])
-def test_optimal_plans_are_solved_by_the_arm_without_a_second_look(execution: str, count: int) -> None:
+def test_the_arm_solves_optimal_plans_without_a_second_look(execution: str, count: int) -> None:
     dreamer = Dreamer(choose=TASK.rules.optimal_action)
     done = carried_out(dreamer, count, execution)
     assert all(plan.solved and plan.optimal and plan.as_imagined.all() for plan in done)
@@ -94,7 +95,7 @@ def test_optimal_plans_are_solved_by_the_arm_without_a_second_look(execution: st
     assert len(dreamer.frames) == count, "one look a plan"
 
 
-def test_a_wrong_plan_is_found_out_and_stops_where_the_episode_does() -> None:
+def test_a_wrong_plan_stops_where_the_episode_does() -> None:
     done = carried_out(Dreamer(choose=lambda state: 0), 30)
     summary = summarise(done)
     assert summary.solved < 12
@@ -127,14 +128,14 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
     ("dreamer", "options", "words"),
     [
         (
-            Dreamer(choose=TASK.rules.optimal_action, doubt=0.9),
+            Dreamer(choose=TASK.rules.optimal_action, uncertainty=0.9),
             {"max_epistemic": 0.3},
             r"0.9 at macro-action \d is above 0.3",
         ),
         (Dreamer(choose=TASK.rules.optimal_action, accepts=False), {}, r"the agent's filter discards macro-action \d"),
     ],
 )
-def test_a_doubted_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[str, Any], words: str) -> None:
+def test_an_uncertain_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[str, Any], words: str) -> None:
     plan = next(plan for plan in carried_out(dreamer, 20, **options) if plan.length > 1)
     assert re.search(words, plan.refused) and not plan.solved and plan.done == 0
     assert plan.outcome.startswith("refused: ")
@@ -142,12 +143,12 @@ def test_a_doubted_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[s
 
 
 def test_a_bound_on_uncertainty_replaces_the_agents_own_filter() -> None:
-    dreamer = Dreamer(choose=TASK.rules.optimal_action, doubt=0.9, accepts=False)
+    dreamer = Dreamer(choose=TASK.rules.optimal_action, uncertainty=0.9, accepts=False)
     (refused,), (carried,) = carried_out(dreamer, 1), carried_out(dreamer, 1, max_epistemic=1.0)
     assert refused.refused and not carried.refused and carried.solved
 
 
-def test_the_starts_are_the_same_for_every_agent_and_others_for_tuning() -> None:
+def test_all_agents_have_the_same_starts_and_tuning_has_others() -> None:
     def starts(seed: int) -> list[State]:
         dreamer = Dreamer(choose=lambda state: 0)
         who = trained(dreamer, seed)
@@ -158,7 +159,7 @@ def test_the_starts_are_the_same_for_every_agent_and_others_for_tuning() -> None
     assert starts(0) == starts(3) != starts(1000)
 
 
-def test_the_fewest_macro_actions_are_those_of_the_rules_optimal_agent() -> None:
+def test_the_fewest_macro_actions_are_the_optimal_agents() -> None:
     rules = TASK.rules
     lengths = [fewest_actions(rules, start) for start in rules.start_states]
     assert np.mean(lengths) == pytest.approx(TASK.facts().mean_plan_length)
@@ -174,7 +175,7 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
 
 def test_what_is_written_holds_every_plan(tmp_path: Path) -> None:
     done = carried_out(Dreamer(choose=lambda state: 0), 12)
-    summary = write_plans(tmp_path / "plans", done, TASK, {"commit": "abc"}, strips=3)
+    summary = write_plans(tmp_path / "plans", done, TASK, {"commit": "abc"}, filmstrips=3)
     rows = (tmp_path / "plans" / "plans.csv").read_text().splitlines()
     assert len(rows) == 13 and rows[0].startswith("plan,start,shortest,planned,done,solved,optimal,refused")
     kept = json.loads((tmp_path / "plans" / "summary.json").read_text())
@@ -187,23 +188,21 @@ def test_what_is_written_holds_every_plan(tmp_path: Path) -> None:
 
 def test_what_is_written_is_json_where_no_plan_was_solved(tmp_path: Path) -> None:
     refused = carried_out(Dreamer(choose=lambda state: 0, accepts=False), 2)
-    write_plans(tmp_path / "plans", refused, TASK, {}, strips=1)
+    write_plans(tmp_path / "plans", refused, TASK, {}, filmstrips=1)
     text = (tmp_path / "plans" / "summary.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail)["mean_length"] is None
 
 
 def test_new_plans_leave_nothing_of_the_old_ones(tmp_path: Path) -> None:
     folder = tmp_path / "plans"
-    write_plans(folder, carried_out(Dreamer(choose=lambda state: 0), 12), TASK, {}, strips=3)
+    write_plans(folder, carried_out(Dreamer(choose=lambda state: 0), 12), TASK, {}, filmstrips=3)
     (folder / "recording.rrd").write_text("old")
     assert list(folder.glob("failed_*.png"))
-    write_plans(folder, carried_out(Dreamer(choose=TASK.rules.optimal_action), 3), TASK, {}, strips=3)
+    write_plans(folder, carried_out(Dreamer(choose=TASK.rules.optimal_action), 3), TASK, {}, filmstrips=3)
     assert sorted(path.name for path in folder.iterdir()) == ["plans.csv", "plans.md", "plans.png", "summary.json"]
 
 
-def test_the_recording_shows_the_same_plans_with_the_arm_moving(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_recording_shows_the_same_plans_and_the_arm_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dreamer = Dreamer(choose=TASK.rules.optimal_action)
     who = trained(dreamer)
 
@@ -213,7 +212,8 @@ def test_the_recording_shows_the_same_plans_with_the_arm_moving(
 
     monkeypatch.setattr("imagine_bench.recording.plans.make_env", env_for)
     path = record_plans(who, count=2, execution="physics", max_epistemic=None, path=tmp_path / "recording.rrd")
-    checked = rerun("rrd", "verify", path)
+    command = [sys.executable, "-m", "rerun", "rrd", "verify", str(path)]
+    checked = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert checked.returncode == 0, checked.stderr
     timelines: dict[str, set[str]] = {}
     rows: dict[str, int] = {}
@@ -227,7 +227,7 @@ def test_the_recording_shows_the_same_plans_with_the_arm_moving(
     assert timelines["/scene/right_l3"] >= {"sim_time", "env_step", "plan"}
 
 
-def test_of_runs_that_end_alike_the_one_that_was_there_first_is_asked(tmp_path: Path) -> None:
+def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None:
     quick = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1))
     result = bench_result(tmp_path, protocol=quick)
 

@@ -13,42 +13,49 @@ import numpy as np
 import pytest
 from bench_fakes import TableAgent
 from fake_agents import FakeAgent
+from inline_bench import Inline, bench
 from numpy.typing import NDArray
-from test_waves import Inline, bench
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import protocol
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Observation, TaskSpec
-from imagine_bench.judge.plans import fewest_actions
-from imagine_bench.judge.policy import FRAMES, Ends, Situations, choices, follow, optimal_length, situations
-from imagine_bench.judge.quality import generalisation_report
-from imagine_bench.report.policy import Followed, policy_table, write_policy
-from imagine_bench.rules import greedy
+from imagine_bench.interfaces import Observation, State, TaskSpec
+from imagine_bench.judge.policy import (
+    FRAMES,
+    EvalStates,
+    Terminations,
+    action_shares,
+    eval_states,
+    optimal_length,
+    terminations,
+)
+from imagine_bench.protocols.control import protocol
+from imagine_bench.report.analysis import Measured
+from imagine_bench.report.generalisation import generalisation_report
+from imagine_bench.report.policy import PolicyAnalysis
+from imagine_bench.rules import fewest_actions, greedy
 from imagine_bench.store import encoders
 from imagine_bench.store.files import lock
 from imagine_bench.store.trained import learners, load_trained
 
 HARD = registry.task("arrow_puzzle_hard")
 PICK = registry.task("pick_place")
-State = tuple[int, ...]
 
 
 @pytest.fixture(scope="module")
-def hard() -> Situations:
-    return situations(HARD, appearance="clean")
+def hard() -> EvalStates:
+    return eval_states(HARD, appearance="clean")
 
 
-def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Ends:
+def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Terminations:
     """Where a rule of choice leads; what the frames show does not matter to it."""
     states = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)])
-    met = Situations(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
+    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
     chosen = np.array([choose(tuple(state)) for state in states.tolist()])
-    return follow(spec, met, greedy(chosen, spec.n_actions))
+    return terminations(spec, shown, greedy(chosen, spec.n_actions))
 
 
-def means(ends: Ends) -> tuple[float, float, float, float]:
+def means(ends: Terminations) -> tuple[float, float, float, float]:
     return tuple(float(part.mean()) for part in (ends.success, ends.failure, ends.late_success, ends.endless))  # type: ignore[return-value]
 
 
@@ -110,13 +117,13 @@ def test_who_undoes_what_was_done_never_comes() -> None:
     assert 0.0 < ends.endless.mean() < 1.0
 
 
-def test_what_fails_after_the_horizon_is_told_from_what_never_ends() -> None:
+def test_late_failures_are_told_from_what_never_ends() -> None:
     """Where one frame in a hundred makes the agent break a rule, going to and fro ends that way, but mostly late."""
     states = np.array(HARD.rules.start_states)
     to_and_fro = greedy(np.array([legal(tuple(state))[0] for state in states.tolist()]), 6)
     illegal = greedy(np.array([min(set(range(6)) - set(legal(tuple(state)))) for state in states.tolist()]), 6)
-    met = Situations(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
-    pure, mixed = follow(HARD, met, to_and_fro), follow(HARD, met, 0.99 * to_and_fro + 0.01 * illegal)
+    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
+    pure, mixed = terminations(HARD, shown, to_and_fro), terminations(HARD, shown, 0.99 * to_and_fro + 0.01 * illegal)
     stuck = pure.endless == 1.0
     assert stuck.any() and mixed.endless == pytest.approx(0.0, abs=1e-4)
     assert mixed.failure[stuck] == pytest.approx(1 - 0.99**HARD.horizon)
@@ -145,13 +152,13 @@ def test_chance_in_the_rules_is_kept() -> None:
     assert total == pytest.approx(np.ones(len(total))) and idle.success.mean() < 0.9
 
 
-def test_doubt_between_two_ways_is_a_walk_by_chance() -> None:
+def test_wavering_between_two_ways_is_a_walk_by_chance() -> None:
     """Half of the frames say one legal turn and half the other: a fair walk on the ring, solved by hand."""
     half = {state: legal(state) for state in HARD.rules.start_states}
     states = np.array(list(half))
     policy = sum(greedy(np.array([half[tuple(s)][way] for s in states.tolist()]), 6) for way in (0, 1)) / 2
-    met = Situations(macrostates=states, frames=np.zeros((len(states), 2, 64, 64, 3), dtype=np.uint8))
-    ends = follow(HARD, met, policy)
+    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 2, 64, 64, 3), dtype=np.uint8))
+    ends = terminations(HARD, shown, policy)
     ring = np.zeros(13)  # the goal is at 0 and at 12, one turn a step
     ring[[0, 12]] = 1.0
     for _ in range(HARD.horizon):
@@ -163,11 +170,11 @@ def test_doubt_between_two_ways_is_a_walk_by_chance() -> None:
     )
 
 
-def test_every_frame_is_asked_once_and_greedily(hard: Situations) -> None:
+def test_every_frame_is_seen_once_and_acted_on_greedily(hard: EvalStates) -> None:
     assert len(hard.macrostates) == 66 == len(HARD.rules.start_states)
     assert hard.frames.shape == (66, FRAMES, 64, 64, 3)
     assert not np.array_equal(hard.frames[0, 0], hard.frames[0, 1]), "cubes lie a little otherwise each time"
-    again = situations(HARD, appearance="clean")
+    again = eval_states(HARD, appearance="clean")
     assert np.array_equal(again.frames, hard.frames)
 
     class Watched(FakeAgent):
@@ -178,19 +185,20 @@ def test_every_frame_is_asked_once_and_greedily(hard: Situations) -> None:
             self.seen.append(observation.frame)
             return 5 if len(self.seen) % FRAMES == 1 else 2
 
-    policy = choices(Watched(), hard, 6)
+    policy = action_shares(Watched(), hard, 6)
     assert np.array_equal(policy[5], np.full(66, 1 / FRAMES)) and np.array_equal(policy[2], np.full(66, 1 - 1 / FRAMES))
     assert np.array_equal(np.stack(Watched.seen), hard.frames.reshape(-1, 64, 64, 3))
 
 
 def test_table_and_files(tmp_path: Path) -> None:
     good, bad = ends_of(HARD, HARD.rules.optimal_action), ends_of(HARD, other_way)
-    followed = [
-        Followed(agent="dqn", seed=0, episodes=100, ends=good),
-        Followed(agent="dqn", seed=1, episodes=100, ends=bad),
-        Followed(agent="imagination", seed=0, episodes=50, ends=good),
+    runs = [
+        Measured(agent="dqn", seed=0, episodes=100, value=good),
+        Measured(agent="dqn", seed=1, episodes=100, value=bad),
+        Measured(agent="imagination", seed=0, episodes=50, value=good),
     ]
-    table = policy_table(followed, HARD)
+    analysis = PolicyAnalysis(HARD, appearance="clean")
+    table = analysis.table(runs)
     assert "All 66 starts" in table and "(optimal: 3.27)" in table
     assert f"| DQN | 100 | 2 | {50 + 50 * bad.success.mean():.1f} [" in table
     assert "| imagination | 50 | 1 | 100.0 | 0.0 | 0.0 | 0.0 | 0.0 | 3.27 |" in table
@@ -198,11 +206,11 @@ def test_table_and_files(tmp_path: Path) -> None:
     near = [end for end, need in zip(bad.success, optimal_length(HARD), strict=True) if need == 2]
     assert f"| 2 | 12 | {50 + 50 * np.mean(near):.1f} | 100.0 |" in table
     assert table.endswith("| 50.0 | 100.0 |") and table.split("Solved least:")[1].count("| 50.0 | 100.0 |") == 12
-    assert "Every run solves every start." in policy_table(followed[2:], HARD)
+    assert "Every run solves every start." in analysis.table(runs[2:])
     seldom = dataclasses.replace(good, success=np.where(np.arange(66) == 5, 0.998, 1.0))
-    many = [Followed(agent="dqn", seed=seed, episodes=9, ends=seldom if seed == 3 else good) for seed in range(5)]
-    assert "does not always solve: 1 of 66." in policy_table(many, HARD), "the mean of five is 99.96 %"
-    write_policy(tmp_path / "out", followed, HARD, {"commit": "abc"})
+    many = [Measured(agent="dqn", seed=seed, episodes=9, value=seldom if seed == 3 else good) for seed in range(5)]
+    assert "does not always solve: 1 of 66." in analysis.table(many), "the mean of five is 99.96 %"
+    analysis.write(tmp_path / "out", runs, {"commit": "abc"})
     with (tmp_path / "out" / "starts.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * 66
@@ -211,7 +219,7 @@ def test_table_and_files(tmp_path: Path) -> None:
     assert summary["commit"] == "abc" and summary["runs"][1]["success"] == pytest.approx(bad.success.mean())
 
 
-def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(KeyboardInterrupt):
         bench(tmp_path, Inline(patience=3))  # both agents of seed 0, and one of seed 1, to the end
     (folder,) = tmp_path.glob("*/*/")
@@ -232,7 +240,7 @@ def test_an_unfinished_bench_is_asked_as_it_stands(tmp_path: Path, capsys: pytes
     assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 192 * 6
 
 
-def test_a_bench_without_an_imagining_agent_has_no_model_to_ask(tmp_path: Path) -> None:
+def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None:
     result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
     with pytest.raises(ArtefactError, match=r"No agent of .* imagines"):
         generalisation_report(result.folder, root=tmp_path, task=None, encoder=None)
@@ -255,7 +263,7 @@ def test_folders_without_agents_are_named(
     assert complaint in capsys.readouterr().err
 
 
-def test_who_rehearses_before_tests_does_so_before_questions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
     left = [True, True, False]
     monkeypatch.setattr(TableAgent, "train_in_model", lambda agent: left.pop(0), raising=False)
@@ -263,7 +271,7 @@ def test_who_rehearses_before_tests_does_so_before_questions(tmp_path: Path, mon
     assert left == []
 
 
-def test_one_encoder_file_is_enough_where_agents_see_through_two_kinds(tmp_path: Path) -> None:
+def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> None:
     own = tmp_path / "own.safetensors"
     shutil.copy(encoders.resolve(HARD, "clean"), own)
     codes = encoders.resolve(HARD, "clean", kind="codes")

@@ -1,4 +1,4 @@
-"""Several imagined sampled_rollouts of one beginning: who gets them, what reality they stand beside, and how they are drawn."""
+"""Several rollouts sampled from one start: who gets them, what reality they stand beside, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.interfaces import Frame, TaskSpec
-from imagine_bench.judge import filmstrips as pictures
-from imagine_bench.judge import sampled_filmstrips as course_pictures
-from imagine_bench.judge.comparison import compare_rollout
-from imagine_bench.judge.imagination_quality import COURSES, examples, imagine_sampled_rollouts, is_random
+from imagine_bench.judge import filmstrips
+from imagine_bench.judge.imagination_quality import (
+    SAMPLED_ROLLOUTS,
+    compare_rollout,
+    examples,
+    imagine_sampled_rollouts,
+)
+from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.results import ComparedRollout
 
@@ -51,7 +55,7 @@ def compared(spec: TaskSpec, seed: int, *steps: tuple[int, tuple[int, ...]]) -> 
     return compare_rollout(spec, frame=frame, macrostate=START, rollout=rollout, appearance="clean", rng=rng)
 
 
-def test_reality_takes_the_course_that_was_imagined_where_it_may(spec: TaskSpec) -> None:
+def test_reality_goes_as_was_imagined_where_it_may(spec: TaskSpec) -> None:
     """Three wishes are possible: by luck, twenty draws would not all be the imagined one (3e-10)."""
     for seed in range(10):
         for wish in (ASKS_MIDDLE, ASKS_RIGHT):
@@ -63,13 +67,13 @@ def test_where_the_imagined_is_impossible_reality_is_drawn(spec: TaskSpec) -> No
     assert reached == {outcome.macrostate for outcome in spec.rules.outcomes(tuple(START), 0)}
 
 
-def test_only_a_task_with_chance_has_courses(spec: TaskSpec) -> None:
+def test_only_a_task_with_chance_has_sampled_rollouts(spec: TaskSpec) -> None:
     puzzle = registry.task("arrow_puzzle")
     assert is_random(spec.rules)
     assert not is_random(puzzle.rules)
     assert imagine_sampled_rollouts(FakeImaginer(), puzzle, appearance="clean", seeds=SeedTree(0)) == ()
     sampled_rollouts = imagine_sampled_rollouts(Dreamer((0, ASKS_RIGHT)), spec, appearance="clean", seeds=SeedTree(0))
-    assert len(sampled_rollouts) == COURSES
+    assert len(sampled_rollouts) == SAMPLED_ROLLOUTS
     for one in sampled_rollouts:
         assert np.array_equal(one.start_frame, sampled_rollouts[0].start_frame)
         assert np.array_equal(one.start_macrostate, sampled_rollouts[0].start_macrostate)
@@ -83,17 +87,17 @@ def test_a_task_with_few_starts_has_examples_too(spec: TaskSpec) -> None:
 
 def test_changes_are_named_and_judged_by_the_rules(spec: TaskSpec) -> None:
     wish = np.array(ASKS_RIGHT)
-    assert course_pictures.changes(START, wish, spec) == "left object picked, gesture right"
-    assert course_pictures.changes(wish, wish, spec) == "nothing changes"
-    assert course_pictures.is_possible(spec.rules, START, 0, wish)
-    assert not course_pictures.is_possible(spec.rules, START, 0, np.array(IMPOSSIBLE))
-    assert not course_pictures.is_possible(spec.rules, START, 1, wish), "another macro-action leads elsewhere"
-    assert not course_pictures.is_possible(spec.rules, np.array(IMPOSSIBLE), 0, wish), "nothing follows the impossible"
+    assert filmstrips.changes(START, wish, spec) == "left object picked, gesture right"
+    assert filmstrips.changes(wish, wish, spec) == "nothing changes"
+    assert filmstrips.is_possible(spec.rules, START, 0, wish)
+    assert not filmstrips.is_possible(spec.rules, START, 0, np.array(IMPOSSIBLE))
+    assert not filmstrips.is_possible(spec.rules, START, 1, wish), "another macro-action leads elsewhere"
+    assert not filmstrips.is_possible(spec.rules, np.array(IMPOSSIBLE), 0, wish), "nothing follows the impossible"
 
 
-def test_the_sheet_marks_what_is_impossible_and_grows_with_the_longest_course(spec: TaskSpec) -> None:
+def test_impossible_steps_are_marked_and_the_longest_fits(spec: TaskSpec) -> None:
     right, wrong = compared(spec, 0, (0, ASKS_RIGHT)), compared(spec, 0, (0, IMPOSSIBLE), (0, ASKS_RIGHT))
-    short, long = (course_pictures.courses_sheet(rows, spec) for rows in ((right, right), (right, wrong)))
+    short, long = (filmstrips.sampled_filmstrips(rows, spec) for rows in ((right, right), (right, wrong)))
     assert short.dtype == np.uint8
     assert long.shape[0] == short.shape[0]
     assert long.shape[1] > short.shape[1]
@@ -101,6 +105,6 @@ def test_the_sheet_marks_what_is_impossible_and_grows_with_the_longest_course(sp
     def inked(sheet: NDArray[np.uint8], color: tuple[int, int, int]) -> bool:
         return bool((sheet == color).all(axis=2).any())
 
-    assert inked(short, pictures.RIGHT)
-    assert inked(long, pictures.WRONG)
-    assert not inked(short, pictures.WRONG)
+    assert inked(short, filmstrips.RIGHT)
+    assert inked(long, filmstrips.WRONG)
+    assert not inked(short, filmstrips.WRONG)

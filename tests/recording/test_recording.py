@@ -19,7 +19,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
-from imagine_bench.judge.comparison import compare_rollout
+from imagine_bench.judge.imagination_quality import compare_rollout
 from imagine_bench.recording import episodes, q_table, record_run, recording_file
 from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
 

@@ -11,27 +11,28 @@ from typing import Any
 import numpy as np
 import pytest
 from imagine_bench.agents.regressors import settings as regressor_settings
-from test_recording import contents, times
+from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import plan
-from imagine_bench.bench.runs import Progress, RunSpec
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
-from imagine_bench.judge.quality import generalisation_report
-from imagine_bench.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext, runner
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.protocols.task_types import task_types
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
+from imagine_bench.regression import runner
 from imagine_bench.regression.calibration import calibrate
+from imagine_bench.regression.interfaces import SCORES, Dataset, Mixtures, Prediction, RegressorContext
 from imagine_bench.regression.results import RegressionResult, RegressionRun, finish, load_run
 from imagine_bench.regression.runner import run
+from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.trained import load_trained
-from imagine_bench.task_types import TASK_TYPES
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 
@@ -57,15 +58,10 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
 
 
 def test_every_kind_has_learners_and_all_names_load() -> None:
-    names = [name for kind in TASK_TYPES.values() for name in kind.tasks]
+    names = [name for kind in task_types().values() for name in kind.tasks]
     assert len(names) == len(set(names))
-    for kind in TASK_TYPES.values():
-        assert kind.tasks and kind.learners() and registry.load(kind.presets)
-        for target in (
-            kind.protocol, kind.plan, kind.run, kind.load_run, kind.load_so_far, kind.result, kind.write_report,
-            kind.summary_table,
-        ):  # fmt: skip
-            assert callable(registry.load(target))
+    for kind in task_types().values():
+        assert kind.tasks and kind.learners() and kind.presets
     for name in registry.REGRESSIONS:
         spec = registry.regression(name)
         assert (
@@ -93,7 +89,7 @@ def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> No
 
 
 @pytest.mark.parametrize("agent", sorted(registry.REGRESSORS))
-def test_variances_and_surprise_are_those_of_all_weight_samples_pooled(agent: str) -> None:
+def test_variances_and_nll_are_those_of_all_weight_samples_pooled(agent: str) -> None:
     """Of targets far from 0 and from unit variance, so that they must be scaled back rightly."""
     rng, context = np.random.default_rng(0), tiny_context(agent, scale=50.0, shift=300.0)
     regressor = registry.make_regressor(agent, context)
@@ -106,7 +102,7 @@ def test_variances_and_surprise_are_those_of_all_weight_samples_pooled(agent: st
     np.testing.assert_allclose(said.epistemic + said.aleatoric + said.modal, variance, rtol=1e-3)
     np.testing.assert_allclose(said.mean, mean[..., 0, :], rtol=1e-5)
     assert 10.0 < np.sqrt(variance).mean() < 250.0 and abs(mean.mean() - 300.0) < 100.0
-    np.testing.assert_allclose(said.surprise, log_score(pooled, said.prediction), atol=1e-3)
+    np.testing.assert_allclose(said.nll, log_score(pooled, said.prediction), atol=1e-3)
 
 
 def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
@@ -129,7 +125,7 @@ class Knowing:
         constant = np.zeros(wrong.shape)
         return Prediction(
             prediction=prediction, mean=prediction, epistemic=wrong, aleatoric=constant, modal=-wrong,
-            stationarity=constant[..., 0], drawn=constant[..., 0], surprise=-wrong[..., 0],
+            stationarity=constant[..., 0], sampled_variance=constant[..., 0], nll=-wrong[..., 0],
             predictive=self.pooled(inputs),
         )  # fmt: skip
 
@@ -144,7 +140,7 @@ def test_errors_are_paired_with_the_scores_of_the_same_points() -> None:
     assert arrays["error"].shape == (2, 60) and not np.array_equal(*arrays["error"])
     for row in rows:
         assert 0.0 < row["wrong"] < 1.0
-        assert row["auroc_epistemic"] == 1.0 and row["auroc_modal"] == row["auroc_surprise"] == 0.0
+        assert row["auroc_epistemic"] == 1.0 and row["auroc_modal"] == row["auroc_nll"] == 0.0
         assert row["auroc_total"] == row["auroc_aleatoric"] == row["auroc_stationarity"] == 0.5
         assert row["coverage_0.5"] == 1.0, "so wide a prediction has every outcome near its median"
 
@@ -399,7 +395,7 @@ def test_claims_and_ratios_by_hand() -> None:
     assert toy_regression.holds(values, "≤ 3").tolist() == [True, True, False]
     estimate = robot_ik.ratio_to_random(np.array([1.0, 2.0]), np.array([2.0, 4.0]), np.random.default_rng(0))
     assert estimate == pytest.approx((0.5, 0.5, 0.5))  # every network halves its own random error
-    assert set(SCORES) >= {"epistemic", "aleatoric", "modal", "stationarity", "surprise", "drawn_component"}
+    assert set(SCORES) >= {"epistemic", "aleatoric", "modal", "stationarity", "nll", "sampled_component"}
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,9 @@ import pytest
 from fake_results import bench_result, compared_rollout
 
 from imagine_bench import reference, registry
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.judge import filmstrips as pictures
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
@@ -390,20 +390,20 @@ def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) 
 def test_strip_marks_cut_error_and_end() -> None:
     names = tuple(f"turn cube {index}" for index in range(6))
     cut, whole = (
-        pictures.rollout_strip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None)
+        pictures.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None)
     )
     assert cut.shape == whole.shape
     assert (cut == pictures._CUT).all(axis=2).sum() > 500  # the line
     assert not (whole == pictures._CUT).all(axis=2).any()
     for color in (pictures.RIGHT, pictures.WRONG):
         assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
-    narrow = pictures.rollout_strip(compared_rollout(np.random.default_rng(0)), names, columns=2)
+    narrow = pictures.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
     assert narrow.shape[1] < whole.shape[1]
 
 
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
     compared = compared_rollout(np.random.default_rng(0), cut=None)
-    strip = pictures.rollout_strip(compared, tuple("abcdef"))
+    strip = pictures.filmstrip(compared, tuple("abcdef"))
     left, top = pictures._left(0), pictures._HEADER
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)

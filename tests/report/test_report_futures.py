@@ -12,8 +12,8 @@ from fake_results import bench_result, compared_rollout
 from PIL import Image
 
 from imagine_bench import registry
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.interfaces import TaskSpec
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
 from imagine_bench.store.results import BenchResult, Futures, RunResult
@@ -24,8 +24,8 @@ DEPTH, PAIRS = 5, 8
 def futures(spec: TaskSpec, rng: np.random.Generator) -> Futures:
     """Made up: eight pairs, one of them with a missing outcome at depth 2, half of them over after one macro-action."""
     states = np.array(spec.rules.states[: PAIRS // spec.n_actions])
-    missing = np.zeros((DEPTH, PAIRS))
-    missing[1, 3] = 1.0
+    missed = np.zeros((DEPTH, PAIRS))
+    missed[1, 3] = 1.0
     survival_probability = np.ones((DEPTH, PAIRS))
     survival_probability[1:, ::2] = 0.0
     return Futures(
@@ -33,8 +33,8 @@ def futures(spec: TaskSpec, rng: np.random.Generator) -> Futures:
         actions=np.tile(np.arange(spec.n_actions), len(states)),
         samples=np.array(400),
         total_variation=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
-        floor=np.where(np.arange(PAIRS) == 2, 0.01, 0.0) * np.ones((DEPTH, 1)),
-        missing=missing,
+        sampling_noise_floor=np.where(np.arange(PAIRS) == 2, 0.01, 0.0) * np.ones((DEPTH, 1)),
+        missed=missed,
         hallucinated=np.zeros((DEPTH, PAIRS)),
         reward_error=rng.uniform(0.0, 0.2, (DEPTH, PAIRS)),
         termination_error=rng.uniform(0.0, 0.1, (DEPTH, PAIRS)),

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runner import do, same_but_for_time, small
+from small_runs import do, same_but_for_time, small
 
 from imagine_bench.bench.bench import bench
 from imagine_bench.bench.launchers import launcher
 from imagine_bench.errors import ArtefactError, BusyError
-from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
+from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import write_json
-from imagine_bench.store.results import OpenLoop
+from imagine_bench.store.results import Checkpoint, OpenLoop
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
@@ -180,7 +180,8 @@ def test_imagined_rollouts_and_open_loop_come_back(tmp_path: Path) -> None:
         assert isinstance(row.open_loop, OpenLoop)
         assert row.open_loop.count.tolist() == [6] * 10
         assert row.open_loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
-        again = run_folder.checkpoint_from_json(json.loads(json.dumps(run_folder.checkpoint_to_json(row))))
+        values, arrays = pack(row)
+        again = unpack(Checkpoint, json.loads(json.dumps(values)), arrays)
         assert again.open_loop is not None
         np.testing.assert_array_equal(again.open_loop.correct_accepted, row.open_loop.correct_accepted)
         assert np.isnan(row.open_loop.correct_accepted[3:]).all()

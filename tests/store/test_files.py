@@ -26,7 +26,7 @@ from imagine_bench.store.files import (
 _HOLD = """
 import sys, time
 from pathlib import Path
-from imagine_bench.files import lock
+from imagine_bench.store.files import lock
 with lock(Path(sys.argv[1]), "The folder"):
     print("held", flush=True)
     time.sleep(60)
@@ -102,14 +102,14 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
         child.kill()
         child.wait()
     with lock(path, "The folder"):
-        assert str(os.getpid()) in path.read_text()
+        assert str(os.getpid()) in (tmp_path / ".lock.holder").read_text()
 
 
 def test_a_lock_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(handle: int, content: bytes) -> int:
+    def full(path: Path, text: str) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("imagine_bench.store.files.os.write", full)
+    monkeypatch.setattr(Path, "write_text", full)
     with lock(tmp_path / ".lock", "The folder"), pytest.raises(BusyError), lock(tmp_path / ".lock", "The folder"):
         pass
 

@@ -11,19 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_results import bench_result
-from test_runner import small
+from small_runs import small
 
 from imagine_bench.bench.bench import bench
 from imagine_bench.bench.launchers import launcher
-from imagine_bench.bench.protocol import Protocol
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
-from imagine_bench.store.archive import load_archive
+from imagine_bench.store.archive import is_archive, load_archive
 from imagine_bench.store.bench_folder import load_bench
-from imagine_bench.store.merge import load_merged
-from imagine_bench.store.partial import cut
+from imagine_bench.store.merge import cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult
+
+
+def load_merged(folders: list[Path], root: Path) -> BenchResult:
+    return merge([load_archive(each) if is_archive(each) else load_so_far(each) for each in folders], root)
 
 
 def do(root: Path, *agents: str, **changes: Any) -> Path:
@@ -54,7 +57,7 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     own = load_bench(second)
     assert np.array_equal(joined.success_rates("random")[0], own.success_rates("random")[0, 1:])
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
-    assert joined.folder not in (first, second) and joined.folder.name.startswith("together-")
+    assert joined.folder not in (first, second) and joined.folder.name.startswith("merged-")
     assert dataclasses.asdict(joined.protocol)["evaluation_episodes"] == 3
 
 
@@ -141,10 +144,10 @@ def test_seeds_of_other_settings_are_refused(tmp_path: Path, digest: str) -> Non
 
 def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
-    assert main(["report", str(first), "--beside", str(second), "--out", str(tmp_path)]) == 0
+    assert main(["report", str(first), "--merge", str(second), "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "oracle" in shown and "random" in shown
-    (page,) = tmp_path.glob("*/together-*/report/index.html")
+    (page,) = tmp_path.glob("*/merged-*/report/index.html")
     assert str(page) in shown
     assert not (second / "report").exists()
 

@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks import rendering
-from imagine_bench.tasks.arrow_puzzle.spec import SPEC
+from imagine_bench.tasks.arrow_puzzle.spec import spec_of
 from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
 from imagine_bench.tasks.graphics import choose_platform
-from imagine_bench.tasks.macro_env import agent_eye, picture_view
+from imagine_bench.tasks.macro_env import agent_camera, human_camera_view
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes.appearance import appearance
 
@@ -42,27 +42,27 @@ def run_script(script: str, **environment: str) -> subprocess.CompletedProcess[s
 
 
 def test_frames_are_new_upright_contiguous_arrays(world):
-    eye = agent_eye(world.model)
-    first, second = eye.frame(world.data), eye.frame(world.data)
+    camera = agent_camera(world.model)
+    first, second = camera.frame(world.data), camera.frame(world.data)
     assert first.shape == (64, 64, 3)
     assert first.dtype == np.uint8
     assert first.flags.c_contiguous
     assert np.array_equal(first, second)
     assert not np.shares_memory(first, second)
-    eye.close()
+    camera.close()
 
 
-def test_closing_one_renderer_leaves_the_others_frames_as_they_were(world):
-    first, second = agent_eye(world.model), agent_eye(world.model)
-    picture = Renderer(world.model, View(camera="human", width=96, height=72))
-    before, whole = second.frame(world.data), picture.frame(world.data)
+def test_closing_one_renderer_leaves_the_others_frames_alone(world):
+    first, second = agent_camera(world.model), agent_camera(world.model)
+    image = Renderer(world.model, View(camera="human", width=96, height=72))
+    before, whole = second.frame(world.data), image.frame(world.data)
     first.frame(world.data)
     first.close()
     assert np.array_equal(second.frame(world.data), before)
-    assert np.array_equal(picture.frame(world.data), whole)
+    assert np.array_equal(image.frame(world.data), whole)
     first.close()  # closing twice is allowed
     assert np.array_equal(first.frame(world.data), before)  # and a later frame makes a new context
-    for renderer in (first, second, picture):
+    for renderer in (first, second, image):
         renderer.close()
 
 
@@ -71,46 +71,46 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatc
         from mujoco.rendering.classic import gl_context
 
         monkeypatch.setattr(gl_context, "GLContext", pytest.importorskip("mujoco.egl").GLContext)
-    eye = agent_eye(world.model)
-    before = eye.frame(world.data)
+    camera = agent_camera(world.model)
+    before = camera.frame(world.data)
     foreign = mujoco.Renderer(world.model, 64, 64)
     foreign.update_scene(world.data)
     foreign.render()
-    assert np.array_equal(eye.frame(world.data), before)
+    assert np.array_equal(camera.frame(world.data), before)
     foreign._gl_context.make_current()
     foreign.close()
-    assert np.array_equal(eye.frame(world.data), before)
-    eye.close()
+    assert np.array_equal(camera.frame(world.data), before)
+    camera.close()
 
 
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
-    eye = agent_eye(world.model)
-    pickle.loads(pickle.dumps(eye)).close()
-    eye.close()
+    camera = agent_camera(world.model)
+    pickle.loads(pickle.dumps(camera)).close()
+    camera.close()
 
 
 def test_a_pickled_renderer_draws_the_same(world):
-    eye = agent_eye(world.model)
-    before = eye.frame(world.data)
-    twin = pickle.loads(pickle.dumps(eye))
+    camera = agent_camera(world.model)
+    before = camera.frame(world.data)
+    twin = pickle.loads(pickle.dumps(camera))
     assert np.array_equal(twin.frame(world.data), before)
-    eye.close()
+    camera.close()
     twin.close()
 
 
-def _draw_in_child(connection, eye, data):
-    connection.send(eye.frame(data))
-    eye.close()
+def _draw_in_child(connection, camera, data):
+    connection.send(camera.frame(data))
+    camera.close()
     connection.close()
 
 
 def test_a_renderer_inherited_through_a_fork_draws_in_the_child(world):
     """The parent has drawn already: its context must neither hang nor break in the child."""
-    eye = agent_eye(world.model)
-    before = eye.frame(world.data)
+    camera = agent_camera(world.model)
+    before = camera.frame(world.data)
     here, there = multiprocessing.Pipe()
-    child = multiprocessing.get_context("fork").Process(target=_draw_in_child, args=(there, eye, world.data))
+    child = multiprocessing.get_context("fork").Process(target=_draw_in_child, args=(there, camera, world.data))
     child.start()
     try:
         assert here.poll(60)
@@ -120,23 +120,23 @@ def test_a_renderer_inherited_through_a_fork_draws_in_the_child(world):
     finally:
         if child.is_alive():
             child.kill()
-    assert np.array_equal(eye.frame(world.data), before)
-    eye.close()
+    assert np.array_equal(camera.frame(world.data), before)
+    camera.close()
 
 
-def test_drawing_leaves_the_model_as_it_was_and_shows_its_changes(world):
+def test_drawing_shows_a_model_s_changes_and_makes_none(world):
     def quality():
         vis = world.model.vis
         return vis.quality.shadowsize, vis.quality.offsamples, vis.quality.numslices, vis.global_.offwidth
 
     before = quality()
-    picture = Renderer(world.model, picture_view("human", 64, 48))
-    plain = picture.frame(world.data)
+    image = Renderer(world.model, human_camera_view("human", 64, 48))
+    plain = image.frame(world.data)
     assert quality() == before
     world.model.material("table_top").rgba[:3] = (0.1, 0.6, 0.1)
-    assert not np.array_equal(picture.frame(world.data), plain)
+    assert not np.array_equal(image.frame(world.data), plain)
     assert plain.shape == (48, 64, 3)
-    picture.close()
+    image.close()
 
 
 def test_shadows_are_drawn_only_where_asked_for(world):
@@ -162,7 +162,7 @@ def test_missing_gl_says_what_to_install(world, monkeypatch, failure):
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr(module, "GLContext", broken)
     with pytest.raises(SetupError, match="apt-get install libegl1 libgl1-mesa-dri") as caught:
-        agent_eye(world.model).frame(world.data)
+        agent_camera(world.model).frame(world.data)
     assert (str(failure) or "AttributeError") in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -173,7 +173,7 @@ def test_a_display_that_is_missing_is_named_like_missing_gl(world, monkeypatch):
 
     monkeypatch.setattr(mujoco, "MjrContext", no_display)
     with pytest.raises(SetupError, match=r"has not been loaded .* 'apt-get install libegl1 libgl1-mesa-dri'"):
-        agent_eye(world.model).frame(world.data)
+        agent_camera(world.model).frame(world.data)
 
 
 _FRAME = """
@@ -181,16 +181,16 @@ _FRAME = """
     import gymnasium, imagine_bench
     env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", render_mode="rgb_array")
     frame, _ = env.reset(seed=0)
-    picture = env.render()
+    image = env.render()
     {after}
-    print(frame.sum() > 0 and picture.sum() > 0)
+    print(frame.sum() > 0 and image.sum() > 0)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
 @pytest.mark.parametrize(
     ("before", "after"),
-    [("", "del env"), ("import mujoco", "env.close()"), ("", "kept = [env, env.unwrapped._eye._canvas]")],
+    [("", "del env"), ("import mujoco", "env.close()"), ("", "kept = [env, env.unwrapped._agent_camera._canvas]")],
     ids=["collected", "mujoco_first_and_closed", "left_open"],
 )
 def test_a_headless_script_draws_and_exits_in_silence(before, after):
@@ -234,18 +234,19 @@ def test_scenes_of_several_threads_end_in_silence():
     script = """
         from concurrent.futures import ThreadPoolExecutor
         import numpy as np
-        from imagine_bench.tasks.arrow_puzzle import SPEC
-        from imagine_bench.tasks.macro_env import agent_eye
-        from imagine_bench.tasks.arrow_world import ArrowWorld
+        from imagine_bench.tasks.arrow_puzzle.spec import spec_of
+        from imagine_bench.tasks.macro_env import agent_camera
+        from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
         from imagine_bench.tasks.scenes.appearance import appearance
         states, world = np.array([[0, 1, 2, 1]]), ArrowWorld(appearance("clean"))
         world.place((0, 1, 2, 1), np.random.default_rng(0))
-        eye = agent_eye(world.model)
+        camera = agent_camera(world.model)
         with ThreadPoolExecutor(3) as pool:
-            drawn = [pool.submit(SPEC.render_macrostates, states, "clean", np.random.default_rng(0)) for _ in range(3)]
+            draw = spec_of().render_macrostates
+            drawn = [pool.submit(draw, states, "clean", np.random.default_rng(0)) for _ in range(3)]
             frames = [job.result() for job in drawn]
-            pool.submit(eye.frame, world.data).result()
-        eye.close()
+            pool.submit(camera.frame, world.data).result()
+        camera.close()
         print(all(np.array_equal(frames[0], frame) for frame in frames))
     """
     done = run_script(script)
@@ -253,20 +254,20 @@ def test_scenes_of_several_threads_end_in_silence():
 
 
 def test_drawing_in_another_thread_is_one_clear_error(world):
-    eye = agent_eye(world.model)
-    eye.frame(world.data)
+    camera = agent_camera(world.model)
+    camera.frame(world.data)
     with ThreadPoolExecutor(1) as pool:
         with pytest.raises(SetupError, match="drew its first frame in another thread"):
-            pool.submit(eye.frame, world.data).result()
-        theirs = agent_eye(world.model)
-        assert np.array_equal(pool.submit(theirs.frame, world.data).result(), eye.frame(world.data))
+            pool.submit(camera.frame, world.data).result()
+        theirs = agent_camera(world.model)
+        assert np.array_equal(pool.submit(theirs.frame, world.data).result(), camera.frame(world.data))
     theirs.close()  # its thread has ended: nothing to free it with, and nothing is said
-    eye.close()
+    camera.close()
 
 
 def test_frames_of_macrostates_may_be_drawn_in_any_thread():
     states = np.array([[0, 1, 2, 1]])
     here, there = (np.random.default_rng(0) for _ in range(2))
-    expected = SPEC.render_macrostates(states, "clean", here)
+    expected = spec_of().render_macrostates(states, "clean", here)
     with ThreadPoolExecutor(1) as pool:
-        assert np.array_equal(pool.submit(SPEC.render_macrostates, states, "clean", there).result(), expected)
+        assert np.array_equal(pool.submit(spec_of().render_macrostates, states, "clean", there).result(), expected)

@@ -42,7 +42,7 @@ def made_vae(recipe: Recipe, seed: int = 0) -> Vae:
     return vae
 
 
-def pictures(n: int, seed: int = 0) -> Tensor:
+def images(n: int, seed: int = 0) -> Tensor:
     frames, _ = draw_frames(arrow_spec(), "mild", n, np.random.default_rng(seed))
     return torch.from_numpy(gray_strips(frames))
 
@@ -73,7 +73,7 @@ def test_kl_is_zero_at_the_prior_and_positive_elsewhere() -> None:
 
 def test_strip_loss_is_gaussian_and_summed_over_pixels() -> None:
     vae = made_vae(TINY)
-    batch, noise = pictures(5), torch.zeros(5, 24)
+    batch, noise = images(5), torch.zeros(5, 24)
     terms = vae.elbo(batch, noise, beta=2.0)
     mu, log_variance = vae.posterior(batch)
     pixels = torch.distributions.Normal(vae.generate(mu), TINY.pixel_std)
@@ -86,7 +86,7 @@ def test_strip_loss_is_gaussian_and_summed_over_pixels() -> None:
 
 def test_thesis_loss_is_bernoulli_and_summed_over_pixels() -> None:
     vae = made_vae(TINY_CONV)
-    batch = pictures(3)
+    batch = images(3)
     mu, _ = vae.posterior(batch)
     target, p = vae.target(batch), vae.mean(mu)
     assert target.shape == p.shape == (3, 3, 64, 64)
@@ -97,7 +97,7 @@ def test_thesis_loss_is_bernoulli_and_summed_over_pixels() -> None:
 @pytest.mark.parametrize("recipe", [TINY, TINY_CONV], ids=lambda recipe: recipe.name)
 def test_gradient_agrees_with_finite_differences(recipe: Recipe) -> None:
     vae = made_vae(recipe).double()
-    batch = pictures(2).double()
+    batch = images(2).double()
     noise = torch.randn(2, vae.latent_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     vae.elbo(batch, noise, 2.0).loss.backward()
     step, chosen = 1e-6, np.random.default_rng(0)
@@ -115,7 +115,7 @@ def test_gradient_agrees_with_finite_differences(recipe: Recipe) -> None:
 
 
 def test_standardised_strips_do_not_see_light() -> None:
-    strips = pictures(4).flatten(2)
+    strips = images(4).flatten(2)
     bright = standardise(0.3 + 0.5 * strips)
     torch.testing.assert_close(bright, standardise(strips), rtol=0.01, atol=0.01)
     torch.testing.assert_close(bright.mean(dim=2), torch.zeros(4, 3), rtol=0, atol=1e-5)
@@ -124,7 +124,7 @@ def test_standardised_strips_do_not_see_light() -> None:
 
 
 def test_strips_are_encoded_apart_with_shared_weights() -> None:
-    vae, batch = made_vae(TINY), pictures(2)
+    vae, batch = made_vae(TINY), images(2)
     mu, _ = vae.posterior(batch)
     swapped, _ = vae.posterior(batch.flip(1))
     torch.testing.assert_close(mu.view(2, 3, 8).flip(1), swapped.view(2, 3, 8))
@@ -134,12 +134,12 @@ def test_strips_are_encoded_apart_with_shared_weights() -> None:
 @pytest.mark.parametrize(
     ("recipe", "preprocessing", "side", "latents"),
     [
-        (replace(TINY, architecture="picture", latents=4), "small_rgb", (32, 32), 4),
+        (replace(TINY, architecture="image", latents=4), "small_rgb", (32, 32), 4),
         (CHAPTER_5["joint"], "gray_strips", (64, 22), 8),
     ],
     ids=["small_rgb", "joint"],
 )
-def test_a_picture_is_read_whole_and_comes_back_whole(
+def test_an_image_is_read_whole_and_comes_back_whole(
     recipe: Recipe, preprocessing: str, side: tuple[int, int], latents: int
 ) -> None:
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
@@ -240,18 +240,18 @@ def test_training_lowers_the_loss_and_reports_progress() -> None:
     encoder = train_encoder(
         arrow_spec(), recipe=recipe, appearance="clean", seed=0, progress=lambda *at: stages.append(at)
     )
-    fresh = pictures(50, seed=9)
+    fresh = images(50, seed=9)
 
     def loss(vae: Vae) -> Elbo:
         return vae.elbo(fresh, torch.zeros(50, 24), recipe.beta)
 
-    assert loss(encoder._coder).loss < 0.9 * loss(made_vae(recipe)).loss
+    assert loss(encoder.network).loss < 0.9 * loss(made_vae(recipe)).loss
     assert [stage for stage, done in stages if done == 1.0] == ["frames", "frames", "training", "probe"]
 
 
 @pytest.mark.slow
 def test_thesis_recipe_trains() -> None:
-    """It first learns the mean picture; only after about 600 such steps do latents enter (measured), too long here."""
+    """It first learns the mean image; only after about 600 such steps do latents enter (measured), too long here."""
     recipe = replace(CHAPTER_5["thesis"], frames=300, held_out_frames=100, steps=120, batch=32, probe_steps=10)
     encoder = train_encoder(arrow_spec(), recipe=recipe, appearance="clean", seed=0)
     frames, _ = draw_frames(arrow_spec(), "clean", 200, np.random.default_rng(5))
@@ -267,7 +267,7 @@ def test_training_and_held_out_frames_differ(monkeypatch: pytest.MonkeyPatch) ->
     draw, sets = encoder_training.frame_set, list[encoder_training.FrameSet]()
     monkeypatch.setattr(encoder_training, "frame_set", lambda *how: (sets.append(draw(*how)), sets[-1])[1])
     train_encoder(arrow_spec(), recipe=TINY_CONV, appearance="mild", seed=0)
-    first, second = (found.pictures for found in sets)
+    first, second = (found.images for found in sets)
     assert (len(first), len(second)) == (TINY_CONV.frames, TINY_CONV.held_out_frames)
     assert not any(torch.equal(a, b) for a in first for b in second)
 
@@ -305,11 +305,11 @@ def test_shapes_types_and_ranges(recipe: Recipe) -> None:
         assert mu.shape == sigma.shape == (n, latent_size)
         assert mu.dtype == sigma.dtype == torch.float32 and not mu.requires_grad and not mu.is_inference()
         assert (sigma > 0).all()
-        pictures = encoder.decode(mu)
-        assert pictures.shape == (n, 64, 64) and pictures.dtype == np.float32
+        images = encoder.decode(mu)
+        assert images.shape == (n, 64, 64) and images.dtype == np.float32
         read = encoder.read_macrostate(mu)
         assert read.shape == (n, 4) and read.dtype == np.int64
-    assert 0.0 <= pictures.min() < pictures.max() <= 1.0
+    assert 0.0 <= images.min() < images.max() <= 1.0
     assert (read >= 0).all() and (read < (4, 4, 4, 3)).all()
     torch.testing.assert_close(
         encoder.encode(frames[500:501])[0], encoder.encode(frames)[0][500:501], rtol=0, atol=1e-5
@@ -330,8 +330,8 @@ def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -
     with pytest.raises(ArtefactError, match=r"No encoder at .*absent.safetensors; make one with"):
         Encoder.load(tmp_path / "absent.safetensors")
     whole, card = good.read_bytes(), json.loads(tiny.card.to_json())
-    state = {f"vae.{key}": value for key, value in tiny._coder.state_dict().items()}
-    state |= {f"probe.{key}": value for key, value in tiny._probe.state_dict().items()}
+    state = {f"vae.{key}": value for key, value in tiny.network.state_dict().items()}
+    state |= {f"probe.{key}": value for key, value in tiny.probe.state_dict().items()}
     bad = {
         "cut": whole[:5000],
         "text": b"not an encoder at all, only words",

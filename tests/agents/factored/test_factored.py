@@ -1,4 +1,4 @@
-"""The agent imagine: structure from evidence, known unknowns, planning, exact resumption, learning in few episodes."""
+"""The agent factored: structure from evidence, known unknowns, planning, exact resumption, learning in few episodes."""
 
 from __future__ import annotations
 
@@ -9,28 +9,19 @@ from types import SimpleNamespace
 import fake_codes
 import numpy as np
 import pytest
+from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
 from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.experience import CodeTransition
-from imagine_bench.agents.factored.model import StructuredModel
-from imagine_bench.agents.factored.outcomes import Outcomes
+from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.model import FactoredModel
+from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.planner import Planner
-from imagine_bench.agents.factored.settings import DynamicsSettings, ImagineSettings, OutcomeSettings, resolve
+from imagine_bench.agents.factored.settings import DynamicsSettings, FactoredSettings, OutcomeSettings, resolve
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Answer, Imaginer, ReplayReader, ValueReader
+from imagine_bench.capabilities import Imaginer, Label, ReplayReader, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
-
-
-def same(first: AgentState, second: AgentState) -> bool:
-    def untimed(state: AgentState) -> dict[str, object]:
-        meters = {name: value for name, value in state.values["meters"].items() if not name.startswith("time/")}
-        return {**state.values, "meters": meters}
-
-    return untimed(first) == untimed(second) and all(
-        np.array_equal(array, second.arrays[name]) for name, array in first.arrays.items()
-    )
 
 
 def test_an_action_s_parents_are_found_and_what_it_leaves_alone_is_known_to_stay() -> None:
@@ -39,7 +30,7 @@ def test_an_action_s_parents_are_found_and_what_it_leaves_alone_is_known_to_stay
         code = np.array([rng.integers(3), rng.integers(3), rng.integers(2)])
         following = np.array([(code[0] + code[2]) % 3, code[1], code[2]])  # the lamp decides whether the wheel turns
         dynamics.add(code, 0, following)
-    turning, still, _ = dynamics.parts
+    turning, still, _ = dynamics.factors
     best = turning.weights()[0].argmax() - 1
     assert turning.tables[best].parents == [0, 2]
     assert still.weights()[0, 0] > 0.95
@@ -62,20 +53,20 @@ def test_what_was_never_seen_is_unknown_and_chance_is_learned_as_chance() -> Non
 @pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7), (3, 3, 2)])
 def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, ...]) -> None:
     """Whether a tie between what was seen and the prior is rounded up or down must not decide it."""
-    model, rng = StructuredModel(sizes, 2, ImagineSettings()), np.random.default_rng(0)
+    model, rng = FactoredModel(sizes, 2, FactoredSettings()), np.random.default_rng(0)
     code = (0,) * len(sizes)
     for _ in range(3):
         model.add(CodeTransition(code, 0, code, -1.0, False))
     expected = [part.expected[0, 1] for part in model.dynamics.predict(np.array([code]))]
-    drawn = [model.sample(np.array(code), 1, rng) for _ in range(400)]
+    drawn = [model.sample(code, 1, rng) for _ in range(400)]
     assert [sure for _, sure in drawn] == pytest.approx([np.prod([chance.max() for chance in expected])] * 400)
-    stayed = np.mean([not following.any() for following, _ in drawn])
+    stayed = np.mean([not any(following) for following, _ in drawn])
     assert stayed == pytest.approx(np.prod([chance[0] for chance in expected]), abs=0.1) and stayed < 0.8
-    assert all(not model.sample(np.array(code), 0, rng)[0].any() for _ in range(20)), "seen to stay"
+    assert all(not any(model.sample(code, 0, rng)[0]) for _ in range(20)), "seen to stay"
 
 
-def outcomes_of(rows: list[CodeTransition], sizes: tuple[int, ...] = (3, 3, 2)) -> Outcomes:
-    learned = Outcomes(sizes, ACTIONS, OutcomeSettings())
+def outcomes_of(rows: list[CodeTransition], sizes: tuple[int, ...] = (3, 3, 2)) -> OutcomeModel:
+    learned = OutcomeModel(sizes, ACTIONS, OutcomeSettings())
     for row in rows:
         learned.add(row)
     learned.fit()
@@ -95,7 +86,7 @@ def test_causes_generalise_to_transitions_that_were_never_seen() -> None:
     lit = [code for code in starts() if code[2] == 1]
     learned = outcomes_of(rows([*lit, *[code for code in starts() if code[2] == 0][:2]]))
     assert learned.causes is not None
-    assert learned.causes.kinds[learned.causes.usual] == (-1.0, False)
+    assert learned.causes.outcomes[learned.causes.default] == (-1.0, False)
     ends = np.array([[0, 1, 0], [1, 2, 0]]), np.array([0, 0]), np.array([[1, 1, 0], [2, 2, 0]])
     chance, _ = learned.predict(*ends)
     assert (chance @ learned.ends > 0.8).all(), "equal wheels end it, lit or dark"
@@ -111,8 +102,8 @@ def test_an_untested_conjunction_is_doubted_until_it_is_tested() -> None:
 
 
 def test_plans_are_optimal_where_everything_is_known() -> None:
-    settings = ImagineSettings()
-    model = StructuredModel((3, 3, 2), ACTIONS, settings)
+    settings = FactoredSettings()
+    model = FactoredModel((3, 3, 2), ACTIONS, settings)
     for row in rows(starts()) * 30:
         model.add(row)
     model.outcomes.fit()
@@ -122,9 +113,9 @@ def test_plans_are_optimal_where_everything_is_known() -> None:
         values = {code: max(_backed_up(code, action, values) for action in range(ACTIONS)) for code in values}
     for code in starts():
         exact = [_backed_up(code, action, values) for action in range(ACTIONS)]
-        assert exact[planner.worth(code).argmax()] == pytest.approx(max(exact))
-        assert planner.worth(code) == pytest.approx(exact, abs=1.3), "a noisy-OR is never quite certain"
-        assert planner.novelty(code).max() < 0.1
+        assert exact[planner.values(code).argmax()] == pytest.approx(max(exact))
+        assert planner.values(code) == pytest.approx(exact, abs=1.3), "a noisy-OR is never quite certain"
+        assert planner.values(code, "novelty").max() < 0.1
 
 
 class _Chain:
@@ -136,25 +127,27 @@ class _Chain:
     def __init__(self, length: int, branches: int) -> None:
         self.length, self.branches = length, branches
 
-    def futures(self, codes: NDArray[np.int64]) -> SimpleNamespace:
+    def successors(self, codes: NDArray[np.int64]) -> SimpleNamespace:
         last = codes[:, :1] == self.length - 1  # [N, A]
         following = np.zeros((len(codes), 1, self.branches, 1), dtype=np.int64)
         following[:, 0, 0] = codes + 1
-        goes_on = np.zeros((len(codes), 1, self.branches))
-        goes_on[:, :, 0] = ~last
+        p_continues = np.zeros((len(codes), 1, self.branches))
+        p_continues[:, :, 0] = ~last
         ends = last.astype(float)
-        return SimpleNamespace(following=following, goes_on=goes_on, reward=10.0 * ends, unknown=ends, terminates=ends)
+        return SimpleNamespace(
+            following=following, p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends
+        )
 
 
 @pytest.mark.parametrize("depth", [1, 4, 5, 20])
 def test_values_are_discounted_once_a_macro_action_and_end_at_the_depth(depth: int) -> None:
-    settings = dataclasses.replace(ImagineSettings().planning, depth=depth, discount=0.9, novelty_discount=0.8)
+    settings = dataclasses.replace(FactoredSettings().planning, depth=depth, discount=0.9, novelty_discount=0.8)
     planner = Planner(_Chain(5, settings.branches), settings)  # type: ignore[arg-type]
     for place in range(5):
         steps = 4 - place  # before the one that is rewarded
         within = steps < depth
-        assert planner.worth((place,)) == pytest.approx([10.0 * 0.9**steps if within else 0.0], abs=1e-12)
-        assert planner.novelty((place,)) == pytest.approx([0.8**steps if within else 0.0], abs=1e-12)
+        assert planner.values((place,)) == pytest.approx([10.0 * 0.9**steps if within else 0.0], abs=1e-12)
+        assert planner.values((place,), "novelty") == pytest.approx([0.8**steps if within else 0.0], abs=1e-12)
 
 
 def _backed_up(code: tuple[int, ...], action: int, values: dict[tuple[int, ...], float]) -> float:
@@ -164,20 +157,20 @@ def _backed_up(code: tuple[int, ...], action: int, values: dict[tuple[int, ...],
 
 @pytest.mark.parametrize("states", [2, 4, 6, 8, 9, 10, 12, 18])
 def test_a_bounded_plan_does_not_depend_on_what_was_asked_before(states: int) -> None:
-    settings = ImagineSettings()
+    settings = FactoredSettings()
     planning = dataclasses.replace(settings.planning, states=states)
-    model = StructuredModel((3, 3, 2), ACTIONS, settings)
+    model = FactoredModel((3, 3, 2), ACTIONS, settings)
     for row in rows(starts()):
         model.add(row)
     model.outcomes.fit()
     used = Planner(model, planning)
     for code in starts():
-        used.novelty(code)
-        assert np.array_equal(used.worth(code), Planner(model, planning).worth(code))
-        for ask in (Planner.reward, Planner.unknown, Planner.terminates):  # whichever is asked first imagines
+        used.values(code, "novelty")
+        assert np.array_equal(used.values(code), Planner(model, planning).values(code))
+        for ask in (Planner.reward, Planner.unknown, Planner.p_terminated):  # whichever is asked first imagines
             assert np.array_equal(ask(Planner(model, planning), code), ask(used, code))
-        assert used.imagined <= states
-    assert states >= len(starts()) or used.imagined < len(starts()), "the bound must bind"
+        assert used.expanded <= states
+    assert states >= len(starts()) or used.expanded < len(starts()), "the bound must bind"
 
 
 def test_learns_the_tiny_task_far_above_chance_in_thirty_episodes() -> None:
@@ -286,7 +279,7 @@ def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored
     done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
     for code, action in done:
         learner.observe(fake_codes.transition(code, action), episode=0)
-    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Answer(reward=1.0, terminated=True))
+    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Label(reward=1.0, terminated=True))
     macrostates, actions = learner.replayed()
     assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
 

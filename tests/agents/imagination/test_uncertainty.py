@@ -7,7 +7,7 @@ import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose, drawn_variance, reduction, surprise
+from imagine_bench.agents.imagination.uncertainty import decompose, nll, reduction, sampled_component_variance
 
 from imagine_bench.errors import UnknownNameError
 
@@ -79,17 +79,17 @@ def test_a_drawn_value_is_as_uncertain_as_the_component_it_came_from() -> None:
     log_sigmas = torch.tensor([1.0, 3.0]).log().view(1, 1, 2, 1).expand(2, 1, 2, 1)
     both = Mixture(torch.full((2, 1, 2), 0.5).log(), means, log_sigmas)
     for value, variance in ((1.0, 1.0 + 1.0), (100.0, 9.0)):
-        found = drawn_variance(both, mdn.average(both), torch.tensor([[value]]))
+        found = sampled_component_variance(both, mdn.average(both), torch.tensor([[value]]))
         assert found.item() == pytest.approx(variance, rel=1e-5)
     for value, variance in ((0.0, 1.0), (2.0, 1.0), (100.0, 9.0)):  # two networks, whose components nobody averages
-        found = drawn_variance(both, mdn.average(both, 2), torch.tensor([[value]]), members=2)
+        found = sampled_component_variance(both, mdn.average(both, 2), torch.tensor([[value]]), members=2)
         assert found.item() == pytest.approx(variance, rel=1e-5)
 
 
-def test_surprise_is_the_negative_log_density_of_all_weight_samples_together() -> None:
+def test_nll_is_the_negative_log_density_of_all_weight_samples_together() -> None:
     mixtures, values = samples(torch.float64), torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), values).exp() for t in range(T)]
-    torch.testing.assert_close(surprise(mixtures, values), -torch.stack(densities).mean(dim=0).log())
+    torch.testing.assert_close(nll(mixtures, values), -torch.stack(densities).mean(dim=0).log())
 
 
 def test_an_unknown_reduction_lists_the_known_ones() -> None:

@@ -1,0 +1,288 @@
+"""Factors of a scene and the values each can take, discovered in unlabelled images; no label, no action, no reward.
+
+A *factor* is a set of pixels that depend on one another and hardly on any other: an object that is independent of the
+rest of the scene, wherever it may be. Its *values* are the separate clouds that its pixels form over many images: an
+object seen from a few sides, under any jitter of pose and light, is one cloud a side. An image becomes one value a
+factor, a product code. Nothing else is given: not how many factors there are, nor where, nor how many values each has.
+
+Sources: factored latent causes by independence (Bengio et al. 2013, "Representation learning", 3.5); clouds as
+connected components of a mutual nearest-neighbour graph (Brito et al. 1997; the density view of DBSCAN, Ester et al.
+1996); categorical latents for world models (DreamerV2, Hafner et al. 2021).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.cluster.hierarchy
+import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.spatial
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from imagine_bench.errors import InvalidValueError
+
+from .network import EncoderNetwork
+
+POOL = 2
+"""Pixels a side that are averaged: factors are larger, and jitter matters less."""
+FEATURES = 16
+"""Principal components of a factor's pixels in which values are told apart."""
+EXEMPLARS = 600
+"""Drawn, with replacement, of the images of a factor and kept; a new image takes the value of the nearest one."""
+_STILL = 0.02  # standard deviation, of the image's median brightness, below which a pixel shows nothing
+_INDEPENDENT = 0.8  # mean distance (1 - dependence) at which two groups of pixels are two factors
+_LEAST_VARIANCE = 0.02  # share of the image's variance that makes a factor
+_LEAST_SHARE = 0.02  # share of the images that makes a value
+_NEIGHBOURS = 16
+_LONELY = 0.05  # share of the images in the sparsest surroundings, which link nothing: they may lie between clouds
+_LEAST_GAP = 0.13  # of the root mean square of a factor's gaps; clouds with a narrower one between them are merged
+_IMAGES = 6000  # more find no other factors
+_DEPENDENCE_IMAGES = 3000
+_CERTAIN = -20.0  # log variance of a latent that is known
+_DARK = 0.01  # of full scale; the median brightness is not taken for less
+
+
+class DiscreteEncoder(EncoderNetwork):
+    """One-hot codes of factors, concatenated: factor p has the latents after those of the factors before it.
+
+    Args:
+        code_sizes: Values of each of the P factors.
+        channels: Channels C.
+        height: Pixels H.
+        width: Pixels W.
+    """
+
+    background: Tensor
+    appearance: Tensor
+    basis: Tensor
+    centre: Tensor
+    exemplars: Tensor
+    values: Tensor
+
+    def __init__(self, code_sizes: tuple[int, ...], channels: int, height: int, width: int) -> None:
+        super().__init__()
+        self.code_sizes, self.latent_size = tuple(code_sizes), sum(code_sizes)
+        factors, pixels = len(code_sizes), channels * -(-height // POOL) * -(-width // POOL)
+        self.register_buffer("background", torch.zeros(channels, height, width))
+        self.register_buffer("appearance", torch.zeros(self.latent_size, channels, height, width))
+        self.register_buffer("basis", torch.zeros(factors, FEATURES, pixels))
+        self.register_buffer("centre", torch.zeros(factors, FEATURES))
+        self.register_buffer("exemplars", torch.zeros(factors, EXEMPLARS, FEATURES))
+        self.register_buffer("values", torch.zeros(factors, EXEMPLARS))
+
+    def target(self, images: Tensor) -> Tensor:
+        """Images as they are."""
+        return images
+
+    def codes(self, images: Tensor) -> Tensor:
+        """The value of each factor of ``images`` (N, C, H, W). Shape (N, P), int64."""
+        features = torch.einsum("nx,pfx->pnf", smoothed(images), self.basis) - self.centre[:, None]
+        nearest = torch.cdist(features, self.exemplars).argmin(dim=2)  # [P, N]
+        return self.values.gather(1, nearest).T.long()
+
+    def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """One-hot codes, as good as certain."""
+        codes = self.codes(images)
+        hot = [functional.one_hot(codes[:, factor], size) for factor, size in enumerate(self.code_sizes)]
+        mu = torch.cat(hot, dim=1).to(self.background.dtype)
+        return mu, torch.full_like(mu, _CERTAIN)
+
+    def mean(self, latents: Tensor) -> Tensor:
+        """The mean appearance of every factor's value, before the background."""
+        return self.background + torch.einsum("nz,zchw->nchw", latents, self.appearance)
+
+    def decode(self, latents: Tensor, height: int, width: int) -> Tensor:
+        """The same, within [0, 1]."""
+        return self.mean(latents).clamp(0.0, 1.0)
+
+    def information(self, mu: Tensor, log_variance: Tensor) -> Tensor:
+        """That of certain codes from uniform ones: sum of log of the number of values."""
+        return mu.new_full((len(mu),), float(np.log(self.code_sizes).sum()))
+
+
+def smoothed(images: Tensor) -> Tensor:
+    """Images relative to their median brightness, pooled and slightly blurred. (N, C, H, W) to (N, pixels)."""
+    level = images.flatten(1).median(dim=1).values.clamp_min(_DARK)[:, None, None, None]
+    pooled = functional.avg_pool2d(images / level, POOL, ceil_mode=True)
+    kernel = torch.tensor([1.0, 2.0, 1.0], device=images.device) / 4.0
+    channels = pooled.shape[1]
+    blur = torch.outer(kernel, kernel).expand(channels, 1, 3, 3)
+    padded = functional.pad(pooled, (1, 1, 1, 1), mode="replicate")
+    return functional.conv2d(padded, blur, groups=channels).flatten(1)
+
+
+def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
+    """Find the factors of unlabelled images and their values.
+
+    Args:
+        images: Shape (N, C, H, W), in [0, 1]; at most 6000 of them are looked at.
+        generator: Draws which, and the exemplars.
+
+    Raises:
+        InvalidValueError: Nothing in the images ever changes, or no factor has more than one value.
+    """
+    chosen = images[torch.randperm(len(images), generator=generator)[:_IMAGES]]
+    pixels = torch.cat([smoothed(chunk) for chunk in chosen.split(500)]).double().numpy()  # [N, X]
+    found = [factor for group in pixel_groups(pixels) if (factor := _factor(pixels, group)) is not None]
+    if not found:
+        raise InvalidValueError("No factor with two values or more was found; the images hardly differ.")
+    network = DiscreteEncoder(tuple(int(factor.value.max()) + 1 for factor in found), *images.shape[1:])
+    for index, factor in enumerate(found):
+        rows = _balanced(factor.value, generator)
+        network.basis[index] = torch.from_numpy(factor.basis)
+        network.centre[index] = torch.from_numpy(factor.centre)
+        network.exemplars[index] = torch.from_numpy(factor.features[rows])
+        network.values[index] = torch.from_numpy(factor.value[rows].astype(np.float64))
+    _fit_appearance(network, chosen, [factor.group for factor in found])
+    return network
+
+
+@dataclass(frozen=True)
+class _Factor:
+    """A factor: its pixels (X,), basis (F, X) and centre (F,) of its features (N, F), and values (N,), -1 for none."""
+
+    group: NDArray[np.bool_]
+    basis: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    features: NDArray[np.float64]
+    value: NDArray[np.int64]
+
+
+def pixel_groups(pixels: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
+    """Groups of pixels that depend on one another, by average linkage; groups that hardly vary are left out.
+
+    Args:
+        pixels: Shape (N, X).
+
+    Returns:
+        Masks of shape (X,), the most varied first.
+    """
+    pixels = pixels[:_DEPENDENCE_IMAGES]
+    spread = pixels.std(axis=0)
+    moving = np.flatnonzero(spread > _STILL)
+    if len(moving) < 2:
+        return []
+    distance = 1.0 - dependence(pixels[:, moving])
+    condensed = scipy.spatial.distance.squareform(distance, checks=False)
+    tree = scipy.cluster.hierarchy.linkage(condensed, "average")
+    label = scipy.cluster.hierarchy.fcluster(tree, _INDEPENDENT, "distance")
+    variance = np.bincount(label, spread[moving] ** 2)
+    order = np.argsort(-variance, kind="stable")
+    kept = order[variance[order] > _LEAST_VARIANCE * variance.sum()]
+    return [np.isin(np.arange(pixels.shape[1]), moving[label == index]) for index in kept]
+
+
+def dependence(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much columns (N, X) depend on one another: the largest absolute correlation among each and its square.
+
+    The squares catch pixels that are uncorrelated but not independent. Shape (X, X), in [0, 1], ones on the diagonal.
+    """
+    linear = (pixels - pixels.mean(axis=0)) / pixels.std(axis=0)
+    square = linear**2 - 1.0
+    square /= np.maximum(square.std(axis=0), 1e-6)
+    both = np.concatenate([linear, square], axis=1)
+    correlation = np.abs(both.T @ both) / len(both)
+    size = pixels.shape[1]
+    blocks = [correlation[a : a + size, b : b + size] for a in (0, size) for b in (0, size)]
+    largest = np.clip(np.maximum.reduce(blocks), 0.0, 1.0)
+    np.fill_diagonal(largest, 1.0)
+    return np.maximum(largest, largest.T)
+
+
+def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Which separate cloud each point belongs to; the number of clouds is found, not given.
+
+    Two points are linked if each is among the other's nearest, and equal points always are; clouds are the connected
+    components. Clouds too small to be a value are left out; clouds with a narrow gap between them are merged.
+
+    Args:
+        points: Shape (N, F).
+
+    Returns:
+        Cloud of each point, numbered by size from 0; -1 for none. Shape (N,).
+    """
+    count = len(points)
+    # A tree splits just above a coordinate. With denormals flushed nothing is just above 0, so start at 1.
+    shifted = points - points.min(axis=0) + 1.0
+    distance, near = scipy.spatial.cKDTree(shifted).query(shifted, min(_NEIGHBOURS + 1, count))
+    rows = np.repeat(np.arange(count), near.shape[1])
+    links = scipy.sparse.csr_matrix((np.ones(near.size), (rows, near.ravel())), shape=(count, count))
+    crowded = distance[:, -1] <= np.quantile(distance[:, -1], 1.0 - _LONELY)
+    core = scipy.sparse.diags(crowded.astype(np.float64))
+    mutual = core @ links.minimum(links.T) @ core
+    _, first, twin = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    same = scipy.sparse.csr_matrix((np.ones(count), (np.arange(count), first[twin.ravel()])), shape=(count, count))
+    label = scipy.sparse.csgraph.connected_components(mutual + same, directed=False)[1]
+    sizes = np.bincount(label)
+    order = [index for index in np.argsort(-sizes, kind="stable") if sizes[index] > _LEAST_SHARE * count]
+    number = np.full(len(sizes), -1)
+    number[order] = np.arange(len(order))
+    return _merge_close(shifted, number[label])
+
+
+def _merge_close(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Clouds (N,) of points (N, F), -1 for none, with narrow gaps closed; numbered by size anew.
+
+    Pixels turn smooth motion into steps, and another factor behind this one changes its pixels: either splits a value.
+    Such gaps are narrow compared with those between values; comparing takes more than two clouds.
+    """
+    count = int(label.max()) + 1
+    if count < 3:
+        return label
+    apart = _gaps([points[label == index] for index in range(count)])
+    typical = np.sqrt((apart[np.triu_indices(count, 1)] ** 2).mean())
+    whole = scipy.sparse.csgraph.connected_components(apart < _LEAST_GAP * typical, directed=False)[1]
+    order = np.argsort(-np.bincount(whole[label[label >= 0]]), kind="stable")
+    return np.append(order.argsort()[whole], -1)[label]
+
+
+def _gaps(clouds: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Distances between the nearest points of clouds (N, F) each. Shape (K, K)."""
+    gaps = np.zeros((len(clouds), len(clouds)))
+    for a, b in itertools.combinations(range(len(clouds)), 2):
+        gaps[a, b] = gaps[b, a] = scipy.spatial.cKDTree(clouds[a]).query(clouds[b])[0].min()
+    return gaps
+
+
+def _factor(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> _Factor | None:
+    """The factor of a group of pixels (X,), or None where it has one value only."""
+    own = pixels[:, group]
+    centred = own - own.mean(axis=0)
+    directions = np.linalg.eigh(centred.T @ centred)[1][:, ::-1][:, :FEATURES]  # [X', F]
+    basis = np.zeros((FEATURES, pixels.shape[1]))
+    basis[: directions.shape[1], group] = directions.T
+    centre = basis @ pixels.mean(axis=0)
+    features = pixels @ basis.T - centre
+    value = clouds(features)
+    return _Factor(group, basis, centre, features, value) if value.max() > 0 else None
+
+
+def _balanced(value: NDArray[np.int64], generator: torch.Generator) -> NDArray[np.int64]:
+    """Rows of exemplars, drawn with replacement, as many of each value but for one."""
+    count = int(value.max()) + 1
+    rows: list[NDArray[np.int64]] = []
+    for index in range(EXEMPLARS):
+        own = np.flatnonzero(value == index % count)
+        rows.append(own[torch.randint(len(own), (1,), generator=generator).numpy()])
+    return np.concatenate(rows)
+
+
+def _fit_appearance(network: DiscreteEncoder, images: Tensor, groups: list[NDArray[np.bool_]]) -> None:
+    """Take the mean image as background, and of each value how the factor's own pixels differ from it."""
+    channels, height, width = images.shape[1:]
+    grid = (channels, -(-height // POOL), -(-width // POOL))
+    codes = torch.cat([network.codes(chunk) for chunk in images.split(500)])
+    network.background.copy_(images.mean(dim=0))
+    first = 0
+    for factor, size in enumerate(network.code_sizes):
+        mask = torch.from_numpy(groups[factor]).reshape(grid).repeat_interleave(POOL, 1).repeat_interleave(POOL, 2)
+        for value in range(size):
+            change = images[codes[:, factor] == value].mean(dim=0) - network.background
+            network.appearance[first + value] = change * mask[:, :height, :width]
+        first += size

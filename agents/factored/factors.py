@@ -1,0 +1,110 @@
+"""Codes of factors, transitions between them, and their replay memory.
+
+A *factor* is one independent object of the scene as a discrete encoder finds it; a *code* holds one value a factor.
+Shapes: ``N`` codes, ``P`` factors, ``A`` macro-actions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..snapshot import Arrays
+
+Code = tuple[int, ...]
+Codes = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+def as_codes(code: Code) -> Codes:
+    """A code as an array (P,)."""
+    return np.array(code, dtype=np.int64)
+
+
+def table_size(factors: tuple[int, ...], sizes: tuple[int, ...]) -> int:
+    """Joint values of some of the factors."""
+    return int(np.prod([sizes[factor] for factor in factors]))
+
+
+def strides(factors: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.int64]:
+    """Multipliers that number the joint values of ``factors``, the last one fastest."""
+    return np.array([table_size(factors[i + 1 :], sizes) for i in range(len(factors))], dtype=np.int64)
+
+
+class CodeTransition(NamedTuple):
+    """One transition between codes.
+
+    Attributes:
+        code: Before.
+        action: The macro-action.
+        following: After.
+        reward: Of this task.
+        terminated: Whether the episode ended.
+        has_dynamics: Whether it happened, and so shows what follows what; False if it was only asked about.
+        has_reward: Whether reward and end are known; False if a query about it got no label.
+    """
+
+    code: Code
+    action: int
+    following: Code
+    reward: float
+    terminated: bool
+    has_dynamics: bool = True
+    has_reward: bool = True
+
+
+class CodeReplay:
+    """Every transition that happened or was asked about, in that order; a few integers each, so none is dropped.
+
+    Args:
+        factors: P.
+    """
+
+    def __init__(self, factors: int) -> None:
+        self._factors = factors
+        self._rows: list[CodeTransition] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, row: CodeTransition) -> None:
+        """Append one."""
+        self._rows.append(row)
+
+    def rows(self, first: int = 0, end: int | None = None) -> list[CodeTransition]:
+        """The transitions from index ``first`` on, up to ``end``."""
+        return self._rows[first:end]
+
+    def count_real(self, first: int = 0) -> int:
+        """How many of them, from index ``first`` on, happened."""
+        return sum(row.has_dynamics for row in self.rows(first))
+
+    def count_labels(self, first: int = 0) -> int:
+        """How many of them, from index ``first`` on, are labels of an oracle."""
+        return sum(row.has_reward and not row.has_dynamics for row in self.rows(first))
+
+    @property
+    def without_label(self) -> frozenset[tuple[Code, int]]:
+        """Codes and actions that were asked about and got no label."""
+        return frozenset((row.code, row.action) for row in self._rows if not row.has_dynamics and not row.has_reward)
+
+    def arrays(self) -> Arrays:
+        """Copies of all rows, by column."""
+        shapes: dict[str, tuple[int, ...]] = {"code": (-1, self._factors), "following": (-1, self._factors)}
+        types = {"code": np.int64, "action": np.int64, "following": np.int64, "reward": np.float64}
+        return {
+            name: np.array([getattr(row, name) for row in self._rows], dtype=types.get(name, np.bool_)).reshape(
+                shapes.get(name, (-1,))
+            )
+            for name in CodeTransition._fields
+        }
+
+    def load(self, arrays: Arrays) -> None:
+        """Take up the rows of :meth:`arrays`."""
+        columns = (arrays[name].tolist() for name in CodeTransition._fields)
+        self._rows = [
+            CodeTransition(tuple(code), action, tuple(following), *rest)
+            for code, action, following, *rest in zip(*columns, strict=True)
+        ]

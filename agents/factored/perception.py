@@ -1,0 +1,102 @@
+"""Frames to codes of factors, and imagined codes back to images and macrostates for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.interfaces import Frame
+
+from ..encoders.encoder import Encoder
+from .factors import Code, Floats
+
+ACCEPTED = 0.5
+"""A transition of which more than this is unknown is not accepted, and neither is what follows from it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImaginedStep:
+    """One imagined transition.
+
+    Attributes:
+        action: The macro-action.
+        code: The code it leads to.
+        reward: Expected reward.
+        p_terminated: Probability that the episode ends.
+        values: Value of every action before it. Shape (A,).
+        unknown: Probability that something untested decides.
+        p_other: Probability that it leads elsewhere than to the likeliest code.
+    """
+
+    action: int
+    code: Code
+    reward: float
+    p_terminated: float
+    values: Floats
+    unknown: float
+    p_other: float
+
+
+class CodePerception:
+    """Frames to codes as the model takes them, and back.
+
+    Args:
+        encoder: A discrete encoder.
+        factored: Whether a code has one value a factor of the encoder; otherwise the whole code is one factor.
+
+    Attributes:
+        sizes: Values of each factor of a code. Length P.
+    """
+
+    def __init__(self, encoder: Encoder, *, factored: bool) -> None:
+        self._encoder, self._factored, self._encoded = encoder, factored, encoder.card.code_sizes
+        self.sizes = self._encoded if factored else (int(np.prod(self._encoded)),)
+        self._last: tuple[bytes, Code] | None = None
+
+    def code(self, frame: Frame) -> Code:
+        """The code of a frame (64, 64, 3); the last one is kept, because often it is asked for twice."""
+        key = frame.tobytes()
+        if self._last is None or self._last[0] != key:
+            hot = self._encoder.encode(frame[None])[0][0]  # [sum of the sizes]
+            code = tuple(int(values.argmax()) for values in hot.split(self._encoded))
+            whole = code if self._factored else (int(np.ravel_multi_index(code, self._encoded)),)
+            self._last = (key, whole)
+        return self._last[1]
+
+    def _latents(self, codes: Sequence[Code]) -> torch.Tensor:
+        """N codes as the encoder decodes them: one-hot. Shape (N, sum of the encoder's sizes)."""
+        if self._factored:
+            values = list(np.array(codes, dtype=np.int64).reshape(-1, len(self._encoded)).T)
+        else:
+            values = list(np.unravel_index(np.array(codes, dtype=np.int64).ravel(), self._encoded))
+        pairs = zip(values, self._encoded, strict=True)
+        return torch.cat([functional.one_hot(torch.as_tensor(value), size) for value, size in pairs], dim=1).float()
+
+    def macrostates(self, codes: Sequence[Code]) -> NDArray[np.int64]:
+        """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
+        return self._encoder.read_macrostate(self._latents(codes))
+
+    def rollout(self, start: Code, steps: Sequence[ImaginedStep]) -> ImaginedRollout:
+        """The rollout that bench and recordings show: codes decoded to images, and read by the evaluation's probe."""
+        codes = [start, *(step.code for step in steps)]
+        frames = self._encoder.decode(self._latents(codes))
+        unknown = np.array([step.unknown for step in steps], dtype=np.float32)
+        return ImaginedRollout(
+            actions=np.array([step.action for step in steps], dtype=np.int64),
+            frames=frames[1:],
+            start_frame=frames[0],
+            rewards=np.array([step.reward for step in steps], dtype=np.float32),
+            p_terminated=np.array([step.p_terminated for step in steps], dtype=np.float32),
+            q_values=np.array([step.values for step in steps], dtype=np.float32),
+            epistemic=unknown,
+            aleatoric=np.zeros_like(unknown),
+            modal=np.array([step.p_other for step in steps], dtype=np.float32),
+            accepted=np.logical_and.accumulate(unknown <= ACCEPTED),
+            macrostates=self.macrostates(codes[1:]),
+        )

@@ -1,1 +1,0 @@
-"""How fast the learners compute, beside plain PyTorch."""

@@ -1,0 +1,95 @@
+"""The commands that put questions to trained agents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from imagine_bench.cli.options import ANY, NEWEST
+from imagine_bench.interfaces import EXECUTIONS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves figures, a recording."""
+
+    run: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
+    """The folder of a run, or of a bench, whose best imagining run is taken."""
+    task: Annotated[str | None, ANY] = None
+    """Task whose newest bench is taken."""
+    count: int = 100
+    """Plans."""
+    recorded: int = 5
+    """Plans that are recorded too; 0 for none."""
+    execution: str = EXECUTIONS[0]
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    max_epistemic: Annotated[
+        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the agent's own filter)")
+    ] = None
+    """A plan with an imagined step of more epistemic uncertainty is refused."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the run's, if bundled)")
+    ] = None
+    """The encoder the run saw through, where it is not bundled."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Find, plan, report."""
+        from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
+        from imagine_bench.report.plans import plan_report  # noqa: PLC0415 - as above
+
+        print(
+            plan_report(
+                self.run,
+                root=self.out,
+                task=self.task,
+                count=self.count,
+                recorded=self.recorded,
+                record=record_plans,
+                execution=self.execution,
+                max_epistemic=self.max_epistemic,
+                encoder=self.encoder,
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OfBench:
+    """Which bench a question is put to."""
+
+    folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
+    """A bench's folder."""
+    task: Annotated[str | None, ANY] = None
+    """Task whose newest bench is taken."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the runs', if bundled)")
+    ] = None
+    """The encoder the runs saw through, where it is not bundled."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generalise(_OfBench):
+    """Ask the models of a bench, finished or not, for every transition: also those that no training can contain."""
+
+    def __call__(self) -> None:
+        """Ask and report."""
+        from imagine_bench.report.generalisation import generalisation_report  # noqa: PLC0415 - as above
+
+        print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy(_OfBench):
+    """Follow the policies of a bench, finished or not, from every start by the rules: what they miss, and how."""
+
+    def __call__(self) -> None:
+        """Ask and follow."""
+        from imagine_bench.report.policy import policy_report  # noqa: PLC0415 - as above
+
+        print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))

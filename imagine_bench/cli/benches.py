@@ -1,0 +1,219 @@
+"""The commands that run and report comparisons."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from imagine_bench import registry
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.bench.launchers import LAUNCHERS, launcher
+from imagine_bench.cli.options import ANY, NEWEST, PRESETS_OWN, added_up, listed, only, require_values
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.protocols.data import ProtocolData, digest
+from imagine_bench.protocols.task_types import Encoders, Result, task_type, task_types
+from imagine_bench.store.archive import is_archive, load_archive
+from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol
+from imagine_bench.store.encoders import bundled
+from imagine_bench.store.merge import load_so_far, merge
+from imagine_bench.store.results import BenchResult
+
+_LISTS = ("agents", "seeds", "budgets", "after")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Train and compare agents on a task; leaves a report and recordings. The same command again goes on."""
+
+    task: str
+    """Task to compare on; 'imagine-bench list' names them."""
+    preset: str = "quick"
+    """Size of the comparison; 'imagine-bench list' names them."""
+    agents: Annotated[tuple[str, ...] | None, listed("STR")] = None
+    """Agents to compare."""
+    seeds: Annotated[tuple[int, ...] | None, listed("INT")] = None
+    """Seeds; each agent has one run a seed."""
+    budgets: Annotated[tuple[int, ...] | None, listed("INT")] = None
+    """Real training episodes at which agents are tested, ascending."""
+    evaluation_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=PRESETS_OWN)] = None
+    """Test episodes at each budget."""
+    execution: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: physics)")] = None
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    appearance: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: clean)")] = None
+    """How much light, colors and poses vary: clean, mild or strong."""
+    variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR")] = ()
+    """Of regression tasks: datasets, or numbers of samples, to learn from."""
+    networks: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=PRESETS_OWN)] = None
+    """Of regression tasks: networks a run, each on data of its own."""
+    encoder: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
+    ] = None
+    """Another encoder: a bundled name or a .safetensors file."""
+    after: Annotated[tuple[str, ...] | None, listed("STR", "(default: none)")] = None
+    """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
+    after_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
+    """Real training episodes on each of them."""
+    demonstrations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    """First training episodes that the oracle plays and learners watch; budgets count them."""
+    queries: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    """Most oracle queries of a learner in a training episode."""
+    set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
+    """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    """Processes at a time."""
+    launcher: str = "local"
+    """Where runs are carried out: local processes, or ray (the cluster at RAY_ADDRESS, else one started here)."""
+    device: str = DEVICES[0]
+    """Where agents compute: cpu or cuda."""
+    out: Path = Path("runs")
+    """Folder of all benches."""
+
+    def planned(self) -> tuple[ProtocolData, Encoders]:
+        """The protocol of what it would run, and the encoders, checked."""
+        for name in _LISTS:
+            require_values(name, getattr(self, name))
+        names = (
+            *_LISTS, "evaluation_episodes", "execution", "appearance", "networks", "encoder", "after_episodes",
+            "demonstrations", "queries",
+        )  # fmt: skip
+        options: dict[str, Any] = {name: getattr(self, name) for name in names}
+        options["variants"] = added_up("variants", self.variants) or None
+        given = {name: value for name, value in options.items() if value is not None}
+        overrides = parse_settings(added_up("set", self.set))
+        return plan(self.task, self.preset, device=self.device, overrides=overrides, **given)
+
+    def __call__(self) -> None:
+        """Plan, run, report."""
+        wanted, encoders = self.planned()
+        where = launcher(self.launcher, self.workers)
+        _show(bench(wanted, encoders, root=self.out, launcher=where).folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write a bench's report again, from its files, and show its table; of agents' unfinished ones, what there is."""
+
+    folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
+    """The bench's folder."""
+    task: Annotated[str | None, ANY] = None
+    """Task whose newest bench is taken."""
+    merge: Annotated[tyro.conf.UseAppendAction[tuple[tuple[Path, ...], ...]], listed("PATH", "(default: none)")] = ()
+    """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
+    whose seeds; all else in their protocols must be the same."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Load and write."""
+        tasks = only(self.task, self.folder)
+        folder = self.folder or newest_bench(self.out, tasks)
+        others = added_up("merge", self.merge)
+        _show(folder, merge([_load_control(each) for each in (folder, *others)], self.out) if others else None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyCommand:
+    """Change one factor of a comparison at a time, on tuning seeds. The same command again goes on."""
+
+    task: str
+    """Task to study on; 'imagine-bench list' names them."""
+    name: str = "factors"
+    """Which study; 'imagine-bench list' names them."""
+    variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: all)")] = ()
+    """Only these variants and what they are compared with."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    """Processes at a time."""
+    launcher: str = "local"
+    """Where runs are carried out: local or ray."""
+    out: Path = Path("runs")
+    """Folder of all benches."""
+
+    def __call__(self) -> None:
+        """Run, compare, write."""
+        from imagine_bench.report.study import study_table, write_study  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.studies.catalogue import STUDIES  # noqa: PLC0415 - as above
+        from imagine_bench.studies.study import run_study  # noqa: PLC0415 - as above
+
+        study = STUDIES[require_known("study", self.name, STUDIES)].only(added_up("variants", self.variants))
+        where = launcher(self.launcher, self.workers)
+        lines = run_study(study, self.task, root=self.out, launcher=where)
+        runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
+        folder = self.out / self.task / f"study-{study.name}-{runs}"
+        write_study(folder, study, lines)
+        print(study_table(study, lines))
+        print(f"\nStudy:      {folder / 'study.md'}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """Name the tasks, agents, presets and bundled encoders."""
+
+    def __call__(self) -> None:
+        """List."""
+        from imagine_bench.studies.catalogue import STUDIES  # noqa: PLC0415 - no other command but study needs them
+
+        for title, names in {
+            **{f"{name} tasks": kind.tasks for name, kind in task_types().items()},
+            **{f"{name} learners": kind.learners() for name, kind in task_types().items()},
+            **{f"{name} presets": kind.presets for name, kind in task_types().items()},
+            "studies": STUDIES,
+            "executions": EXECUTIONS,
+            "launchers": LAUNCHERS,
+            "appearances": APPEARANCES,
+            "encoders": bundled(),
+        }.items():
+            print(f"{title:22}{', '.join(names)}")
+
+
+def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+    """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
+
+    Raises:
+        InvalidValueError: A word without ``=``, or a name given twice.
+    """
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise InvalidValueError(f"--set {pair!r} is not of the form name=value, such as controller.discount=0.9.")
+        if name in settings:
+            raise InvalidValueError(f"--set names {name!r} twice; give it once.")
+        settings[name] = _value(text)
+    return tuple(sorted(settings.items()))
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+_REPORTS = {"control": "imagine_bench.report", "regression": "imagine_bench.regression.report"}
+"""Modules that report benches of each type of task."""
+
+
+def _load_control(folder: Path) -> BenchResult:
+    """A bench of agents, finished or not, or in the form it is kept in."""
+    read_control(folder)
+    return load_archive(folder) if is_archive(folder) else load_so_far(folder)
+
+
+def _show(folder: Path, result: Result | None = None) -> None:
+    """Write a bench's report, or that of another result of its type, and print its table and where everything lies."""
+    kind = task_type(read_protocol(folder).task)
+    if result is None:
+        result = load_archive(folder) if is_archive(folder) else kind.load_so_far(folder)
+    report = next(_REPORTS[name] for name, each in task_types().items() if each is kind)
+    print(registry.load(f"{report}:summary_table")(result))  # first, as it needs no place to write
+    page = registry.load(f"{report}:write_report")(result)
+    print(f"\nReport:     {page}")
+    recordings = [run.recording for run in result.runs if run.recording is not None]
+    if recordings:
+        print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (make view opens the newest)")

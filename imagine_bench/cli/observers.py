@@ -1,0 +1,112 @@
+"""What looks at the runs of a bench: how right agents imagine, example rollouts, and recordings."""
+
+from __future__ import annotations
+
+from imagine_bench.bench.run_state import Run
+from imagine_bench.bench.runner import AtBudget, AtEnd
+from imagine_bench.capabilities import FutureSampler, Imaginer
+from imagine_bench.judge.futures import imagined_futures
+from imagine_bench.judge.imagination_quality import OpenLoopStart, ask, examples, imagine_sampled_rollouts, open_loop
+from imagine_bench.seeding import SeedTree, evaluation_split
+from imagine_bench.store import run_folder
+
+IMAGINED_DEPTH = 10
+"""Steps of the open-loop comparison, the thesis' I_D."""
+
+
+class _Observer:
+    """Measures nothing."""
+
+    def at_budget(self, run: Run, budget: int) -> AtBudget:
+        """See :class:`imagine_bench.bench.runner.RunObserver`."""
+        return {}
+
+    def at_end(self, run: Run) -> AtEnd:
+        """See :class:`imagine_bench.bench.runner.RunObserver`."""
+        return {}
+
+
+class OpenLoopObserver(_Observer):
+    """Compares open-loop imagination with the rules at every budget."""
+
+    def __init__(self) -> None:
+        self._questions: tuple[OpenLoopStart, ...] | None = None
+
+    def at_budget(self, run: Run, budget: int) -> AtBudget:
+        """``open_loop`` of an agent that imagines."""
+        if not isinstance(run.agent, Imaginer):
+            return {}
+        if self._questions is None:  # the same at every budget
+            self._questions = ask(
+                run.task,
+                starts=run.protocol.open_loop_starts,
+                depth=IMAGINED_DEPTH,
+                appearance=run.protocol.appearance,
+                purpose=evaluation_split(run.spec.seed),
+            )
+        if not self._questions:
+            return {}
+        run.tell("imagining", at_once=True)
+        return {"open_loop": open_loop(run.agent, self._questions, SeedTree(run.spec.seed).child("open_loop", budget))}
+
+
+class FuturesObserver(_Observer):
+    """Compares sampled futures with those that the rules allow at every budget."""
+
+    def at_budget(self, run: Run, budget: int) -> AtBudget:
+        """``futures`` of an agent that can sample them."""
+        protocol = run.protocol
+        if not isinstance(run.agent, FutureSampler) or protocol.sampled_futures == 0:
+            return {}
+        run.tell("imagining", at_once=True)
+        found = imagined_futures(
+            run.agent,
+            run.task,
+            samples=protocol.sampled_futures,
+            appearance=protocol.appearance,
+            seeds=SeedTree(run.spec.seed).child("futures", budget),
+            purpose=evaluation_split(run.spec.seed),
+        )
+        return {"futures": found}
+
+
+class ExamplesObserver(_Observer):
+    """Keeps a few imagined rollouts of the agent as it is at its end."""
+
+    def at_end(self, run: Run) -> AtEnd:
+        """``imagined`` from several starts, and ``sampled_rollouts`` from one."""
+        if not isinstance(run.agent, Imaginer):
+            return {}
+        run.tell("imagining", at_once=True)
+        agent, task, appearance, seeds = run.agent, run.task, run.protocol.appearance, SeedTree(run.spec.seed)
+        purpose, several = evaluation_split(run.spec.seed), seeds.child("sampled_rollouts")
+        return {
+            "imagined": examples(agent, task, appearance=appearance, seeds=seeds.child("examples"), purpose=purpose),
+            "sampled_rollouts": imagine_sampled_rollouts(
+                agent, task, appearance=appearance, seeds=several, purpose=purpose
+            ),
+        }
+
+
+class RecordingObserver(_Observer):
+    """Records some greedy episodes beside the results; the file appears whole or not at all."""
+
+    def at_end(self, run: Run) -> AtEnd:
+        """Nothing that the result holds."""
+        protocol = run.protocol
+        if protocol.recorded_episodes == 0:
+            return {}
+        from imagine_bench.recording import record_run  # noqa: PLC0415 - loading Rerun costs a second
+
+        run.tell("recording", at_once=True)
+        record_run(
+            protocol.task,
+            run.agent,
+            name=run.spec.agent,
+            seed=run.spec.seed,
+            execution=protocol.execution,
+            appearance=protocol.appearance,
+            episodes=protocol.recorded_episodes,
+            path=run_folder.recording_path(run.folder),
+        )
+        return {}

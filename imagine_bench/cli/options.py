@@ -1,0 +1,54 @@
+"""Options and helpers that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.protocols.task_types import task_type
+from imagine_bench.store.bench_folder import require_either
+
+PRESETS_OWN = "(default: the preset's)"
+NONE = tyro.conf.arg(help_behavior_hint="(default: none)")
+NEWEST = tyro.conf.arg(metavar="[PATH]", help_behavior_hint="(default: the newest)")
+ANY = tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")
+
+
+def listed(kind: str, hint: str = PRESETS_OWN) -> Any:
+    """How an option is shown that takes one or more values of a kind."""
+    return tyro.conf.arg(metavar=f"{kind} [{kind} ...]", help_behavior_hint=hint)
+
+
+def require_values(name: str, values: Sequence[object] | None) -> None:
+    """Raise InvalidValueError for an option that takes a list and was given without a value."""
+    if values is not None and (not values or "" in values):
+        raise InvalidValueError(f"--{name} has no value; give at least one behind it, or leave it out.")
+
+
+def added_up(name: str, each: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
+    """All values of an option that may be given several times.
+
+    Raises:
+        InvalidValueError: It was given without a value.
+    """
+    for values in each:
+        require_values(name, values)
+    return tuple(value for values in each for value in values)
+
+
+def only(task: str | None, given: Path | None) -> tuple[str, ...]:
+    """A task by itself, or none for any.
+
+    Raises:
+        UnknownNameError: No such task; the message lists those of every type.
+        InvalidValueError: A path was given too.
+    """
+    require_either(given, task)
+    if task is None:
+        return ()
+    task_type(task)  # knows every name
+    return (task,)

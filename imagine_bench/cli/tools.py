@@ -1,0 +1,111 @@
+"""The commands beside benches: viewing, encoders, films, speed, and what this machine has."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from imagine_bench import registry
+from imagine_bench.cli.options import ANY, NEWEST, only
+from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.store.bench_folder import newest_recording
+from imagine_bench.store.files import require_writable
+from imagine_bench.tools.doctor import examine
+
+_RETRAIN = "imagine_bench.agents.encoders.cli:retrain"
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Open a recording in the Rerun viewer."""
+
+    file: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
+    """The .rrd file."""
+    task: Annotated[str | None, ANY] = None
+    """Task whose newest recording is taken."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Find and open."""
+        from imagine_bench.recording import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
+
+        tasks = only(self.task, self.file)
+        open_in_viewer(self.file or newest_recording(self.out, *tasks))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoder:
+    """Train an encoder anew and say how it compares to the bundled one."""
+
+    task: str
+    """Task whose frames it learns."""
+    appearance: str = APPEARANCES[0]
+    """Appearance level of the frames."""
+    recipe: str = "default"
+    """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole image), or codes,
+    for agents that read factors and their values."""
+    seed: int = 0
+    """Seed of data and training."""
+    out: Path = Path("encoders")
+    """Folder for artefact, card and figure; never overwritten."""
+
+    def __call__(self) -> None:
+        """Train."""
+        retrain = registry.load(_RETRAIN)
+        spec = registry.task(self.task)
+        require_writable(self.out)
+        print(retrain(spec, recipe=self.recipe, appearance=self.appearance, seed=self.seed, out=self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """Film an episode of optimal macro-actions in contact physics, as a GIF."""
+
+    task: str
+    """Task to film."""
+    appearance: str = APPEARANCES[0]
+    """Appearance level."""
+    seed: int = 0
+    """Chooses the episode."""
+    out: Path = Path("film.gif")
+    """The GIF to write; never overwritten."""
+
+    def __call__(self) -> None:
+        """Film."""
+        from imagine_bench.tools.film import film  # noqa: PLC0415 - numpy and pillow only when filming
+
+        print(film(self.task, self.out, seed=self.seed, appearance=self.appearance))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed:
+    """Measure every speed and fidelity figure that has a target, beside the target."""
+
+    turns: int = 2_000
+    """Macro-actions of the fidelity measurement."""
+    out: Path = Path("runs/speed.json")
+    """Where the figures are kept, with the machine's description."""
+
+    def __call__(self) -> None:
+        """Measure."""
+        from imagine_bench.tools.speed import speed_report  # noqa: PLC0415 - nothing else needs it
+
+        if not speed_report(self.out, self.turns):
+            sys.exit(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Say what this machine and installation have, and in words what is wrong with them."""
+
+    def __call__(self) -> None:
+        """Examine."""
+        report = examine()
+        print(report)
+        if report.complaints:
+            sys.exit(1)

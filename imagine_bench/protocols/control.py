@@ -1,0 +1,187 @@
+"""The protocol of a bench of agents that act, and its presets: what is compared, on what, how long, how often."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.protocols.data import ProtocolData, require_ascending, require_different, require_seeds
+from imagine_bench.registry import agent_entry, task, task_entry
+
+_THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
+_ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
+_THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
+
+_AFTER_EPISODES = 100
+_FIRST_STAGE = 2000
+"""Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol(ProtocolData):
+    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others.
+
+    Attributes:
+        settings: Config group of the agents' settings, as the task names it.
+        hyperparameters: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
+        budgets: Real training episodes at which the agent is evaluated, ascending.
+        evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
+        execution: ``"physics"`` or ``"kinematic"``.
+        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
+        open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
+        sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
+            distribution at each budget; 0 asks for none.
+        recorded_episodes: Real episodes in each recording; 0 records none.
+        encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
+        codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
+        after: Tasks of the same world that learners are trained on before, in this order; what they know of the
+            world is carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
+        after_episodes: Real training episodes on each of them.
+        demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
+            observe; they are real episodes as any, and budgets count them.
+        queries: Most oracle queries of a learner in a training episode.
+    """
+
+    settings: str = "chapter_5"
+    hyperparameters: str = "fast"
+    agents: tuple[str, ...] = _ALL_AGENTS
+    seeds: tuple[int, ...] = (0, 1, 2)
+    budgets: tuple[int, ...] = (100, 250, 500, 1000)
+    evaluation_episodes: int = 200
+    execution: str = "physics"
+    appearance: str = "clean"
+    open_loop_starts: int = 100
+    sampled_futures: int = 16
+    recorded_episodes: int = 5
+    encoder: str | None = None
+    codes: str | None = None
+    after: tuple[str, ...] = ()
+    after_episodes: int = _AFTER_EPISODES
+    demonstrations: int = 0
+    queries: int = 0
+
+    def __post_init__(self) -> None:
+        task_entry(self.task)
+        for agent in self.agents:
+            agent_entry(agent)
+        require_known("appearance", self.appearance, APPEARANCES)
+        require_known("execution", self.execution, EXECUTIONS)
+        require_known("device", self.device, DEVICES)
+        require_ascending("budgets", self.budgets, at_least=1)
+        require_seeds(self.seeds)
+        require_different("agents", self.agents)
+        if self.evaluation_episodes < 1:
+            raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
+        require_same_world(self.task, self.after)
+        if self.after_episodes < 1:
+            raise InvalidValueError(f"after_episodes is {self.after_episodes}; give at least 1.")
+        if not self.after and self.after_episodes != _AFTER_EPISODES:
+            raise InvalidValueError(
+                f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
+            )
+        for name in ("demonstrations", "queries", "open_loop_starts", "sampled_futures", "recorded_episodes"):
+            if getattr(self, name) < 0:
+                raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least 0.")
+
+    def work(self, agent: str, until: int | None = None) -> int:
+        """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
+        budgets = [budget for budget in self.budgets if until is None or budget <= until]
+        tests = self.evaluation_episodes
+        return self.episodes_before + budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+
+    @property
+    def episodes_before(self) -> int:
+        """Real training episodes on earlier tasks."""
+        return len(self.after) * self.after_episodes
+
+    @property
+    def stages(self) -> tuple[int | None, ...]:
+        """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
+        return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_STAGE), None)
+
+    def encoder_of(self, kind: str) -> str | None:
+        """Identity of the encoder for the agents that take this kind."""
+        return self.codes if kind == "codes" else self.encoder
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        "hyperparameters": "minimal",
+        "seeds": (0,),
+        "budgets": (10, 20),
+        "evaluation_episodes": 20,
+        "open_loop_starts": 20,
+        "sampled_futures": 4,
+        "recorded_episodes": 2,
+    },
+    "quick": {"agents": (*_ALL_AGENTS, "factored")},
+    "thesis": {
+        "hyperparameters": "published",
+        "agents": _THESIS_AGENTS,
+        "seeds": tuple(range(5)),
+        "budgets": _THESIS_BUDGETS,
+        "evaluation_episodes": 1000,
+    },
+    "full": {
+        "hyperparameters": "published",
+        "agents": _ALL_AGENTS,
+        "seeds": tuple(range(20)),
+        "budgets": _THESIS_BUDGETS,
+        "evaluation_episodes": 1000,
+    },
+    "sample_efficiency": {
+        "agents": ("factored",),
+        "seeds": tuple(range(5)),
+        "budgets": tuple(range(20, 201, 20)),
+        "evaluation_episodes": 1000,
+        "recorded_episodes": 2,
+    },
+    "queries": {
+        "agents": ("factored",),
+        "seeds": tuple(range(5)),
+        "budgets": (10, 20, 30, 40, 60, 80, 100),
+        "evaluation_episodes": 100,
+        "execution": "kinematic",
+        "open_loop_starts": 0,
+        "sampled_futures": 0,
+        "recorded_episodes": 0,
+    },
+}
+"""What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
+default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
+thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``queries`` does so
+in little time, to compare many ways of being taught."""
+
+
+def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
+    """The protocol of a preset as the task has it, with ``changes`` to single fields.
+
+    Raises:
+        UnknownNameError: Unknown task, preset, agent, appearance or execution.
+        InvalidValueError: A value out of range.
+    """
+    require_known("preset", preset, PRESETS)
+    spec = task(task_name)
+    values = {"settings": spec.settings, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    if "seeds" in values:  # in whatever order they are given, it is the same bench
+        values["seeds"] = tuple(sorted(values["seeds"]))
+    return Protocol(task=task_name, preset=preset, **values)
+
+
+def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
+    """Raise InvalidValueError for an earlier task that is not of the world of task ``name``, or UnknownNameError.
+
+    Tasks are of one world if their frames are preprocessed and encoded alike and their macro-actions have one meaning.
+    """
+    for other in earlier:
+        task_entry(other)
+        for field in ("encoder", "preprocessing", "action_names"):
+            here, there = getattr(task(name), field), getattr(task(other), field)
+            if here != there:
+                raise InvalidValueError(
+                    f"{name} cannot come after {other}: what is known of one world is of no use in another ({field} is "
+                    f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
+                    "arrow_puzzle_hard."
+                )

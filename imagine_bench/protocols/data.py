@@ -1,0 +1,98 @@
+"""What protocols of every task type have in common: they are data, and a hash stands for everything in them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from dataclasses import dataclass
+from typing import Any, Self
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
+
+
+def digest(values: Any) -> str:
+    """Twelve hex digits that change when anything in JSON-like values does."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolData:
+    """A comparison, completely specified by JSON-like values.
+
+    Attributes:
+        task: Registered task.
+        preset: Name of this protocol.
+        agents: Registered agents or regressors, in the order of the report.
+        seeds: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing
+            settings and are tested on starts that no reported run meets; the two kinds never mix.
+        overrides: Settings that replace those of the hyper-parameter set, as sorted (dotted name, value) pairs.
+        settings_digest: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one
+            tomorrow, and what was run with it is then another bench. Empty in a protocol that no plan made.
+        device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
+    """
+
+    task: str
+    preset: str
+    agents: tuple[str, ...]
+    seeds: tuple[int, ...]
+    overrides: tuple[tuple[str, Any], ...] = ()
+    settings_digest: str = ""
+    device: str = "cpu"
+
+    def as_dict(self) -> dict[str, Any]:
+        """A JSON-serialisable copy."""
+        values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return values
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """The inverse of :meth:`as_dict`."""
+        tuples: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in data.items()}
+        tuples["overrides"] = tuple((name, value) for name, value in tuples.get("overrides", ()))
+        return cls(**tuples)
+
+    @property
+    def hash(self) -> str:
+        """Twelve hex digits that change when anything in the protocol does."""
+        return digest(self.as_dict())
+
+    @property
+    def stages(self) -> tuple[int | None, ...]:
+        """The order of work: all runs come to each of these budgets before any goes on; None is the end.
+
+        A long bench that is stopped early is then a whole bench of fewer episodes.
+        """
+        return (None,)
+
+    def work(self, agent: str, until: int | None = None) -> int:
+        """Parts of work of a run of this agent as far as the budget ``until``, of whatever the protocol counts."""
+        raise NotImplementedError
+
+
+def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
+    """Raise InvalidValueError unless values are different integers, ascending, of at least ``at_least``."""
+    ascending = all(a < b for a, b in itertools.pairwise(values))
+    if not values or not ascending or values[0] < at_least:
+        raise InvalidValueError(
+            f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
+        )
+
+
+def require_different(name: str, values: tuple[str, ...]) -> None:
+    """Raise InvalidValueError for names that are none or given twice."""
+    if not values or len(set(values)) != len(values):
+        raise InvalidValueError(f"{name} {values} must be at least one name, none of them twice.")
+
+
+def require_seeds(seeds: tuple[int, ...]) -> None:
+    """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
+    if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
+        raise InvalidValueError(f"seeds {seeds} must be one or more different integers from 0 to {SEEDS - 1}.")
+    if len({is_tuning_seed(seed) for seed in seeds}) > 1:
+        raise InvalidValueError(
+            f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
+            "reported ones; give them to separate benches."
+        )

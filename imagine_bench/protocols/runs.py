@@ -1,0 +1,87 @@
+"""What a run is, and how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, Literal, TypeVar
+
+from imagine_bench import registry
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.seeding import SeedTree
+
+P_co = TypeVar("P_co", bound=ProtocolData, covariant=True)
+Phase = Literal["training", "training in the model", "testing", "imagining", "recording", "done", "failed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec(Generic[P_co]):
+    """What one run is.
+
+    Attributes:
+        protocol: The comparison it belongs to.
+        agent: Registered agent or regressor.
+        seed: One of the protocol's seeds.
+        encoder: The encoder artefact, or None if the agent needs none.
+        until: Budget after which it pauses, or None to the end.
+        checkpoint_every_s: Seconds of work that a kill may cost.
+    """
+
+    protocol: P_co
+    agent: str
+    seed: int
+    encoder: Path | None = None
+    until: int | None = None
+    checkpoint_every_s: float = 20.0
+
+    @property
+    def work(self) -> int:
+        """Parts of work to do, of whatever the protocol counts."""
+        return self.protocol.work(self.agent, self.until)
+
+    def context(self: RunSpec[Protocol]) -> AgentContext:
+        """What the run's agent is built from."""
+        protocol, entry = self.protocol, registry.agent_entry(self.agent)
+        task = registry.task(protocol.task)
+        return AgentContext(
+            n_actions=task.n_actions,
+            preprocessing=task.preprocessing,
+            encoder=self.encoder if entry.needs_encoder else None,
+            seeds=SeedTree(self.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
+            config_group=protocol.settings,
+            hyperparameters=protocol.hyperparameters,
+            overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
+            device=protocol.device,
+            optimal_action=task.rules.optimal_action if entry.privileged else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        agent: Registered agent.
+        seed: The run's seed.
+        phase: What it is doing.
+        done: Episodes played, for training and for tests.
+        work: Episodes to play.
+        episode: Training episodes done.
+        success: Share of successes among recent training episodes, or in the running test; None before the first.
+        detail: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
+    """
+
+    agent: str
+    seed: int
+    phase: Phase
+    done: int
+    work: int
+    episode: int = 0
+    success: float | None = None
+    detail: str | None = None
+
+
+OnProgress = Callable[[Progress], None]

@@ -1,0 +1,122 @@
+"""The types of task, and what each brings to the one machinery.
+
+A *control* task is acted in, by agents that learn from episodes; a *regression* task is learned from data, by
+regressors. Launchers, locks, run folders, progress, store and command line are the same for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+from typing import Protocol as Interface
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.runs import OnProgress, P_co, RunSpec
+
+P = TypeVar("P", bound=ProtocolData)
+Encoders = Mapping[str, Path]
+"""The encoder artefacts of a bench, by kind; none where nothing needs one."""
+
+
+class FinishedRun(Interface):
+    """What runs of every type leave."""
+
+    @property
+    def agent(self) -> str:
+        """Registered agent or regressor."""
+
+    @property
+    def seed(self) -> int:
+        """The run's seed."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the run's files lie."""
+
+    @property
+    def recording(self) -> Path | None:
+        """Its Rerun recording, or None."""
+
+
+class Result(Interface):
+    """What benches of every type measured."""
+
+    @property
+    def protocol(self) -> ProtocolData:
+        """What was compared."""
+
+    @property
+    def runs(self) -> Sequence[FinishedRun]:
+        """One an agent and seed."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the bench's files lie."""
+
+
+class Plan(Interface[P_co]):
+    """Makes the protocol of a bench, with everything checked that can be before anything is run."""
+
+    def __call__(self, task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[P_co, Encoders]:
+        """The protocol of a preset, with ``changes`` to single fields, and the encoders it needs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskType(Generic[P]):
+    """What a type of task brings along.
+
+    Attributes:
+        tasks: Its registered tasks.
+        learners: Gives its agents or regressors, by name.
+        draws: Whether its runs need OpenGL.
+        protocol: The class of its protocols.
+        presets: What each protocol preset changes, by name.
+        plan: Makes a protocol.
+        run: Carries out a run in a folder.
+        load_run: Reads a finished run folder.
+        load_so_far: Reads a bench folder, as far as it can be reported.
+        result: Class of a finished bench.
+    """
+
+    tasks: Mapping[str, object]
+    learners: Callable[[], Mapping[str, object]]
+    draws: bool
+    protocol: type[P]
+    presets: Mapping[str, Mapping[str, Any]]
+    plan: Plan[P]
+    run: Callable[[RunSpec[P], Path, OnProgress], object]
+    load_run: Callable[[Path], FinishedRun]
+    load_so_far: Callable[[Path], Result]
+    result: Callable[..., Result]
+
+
+@functools.cache
+def task_types() -> dict[str, TaskType[ProtocolData]]:
+    """The types by name."""
+    return {name: registry.load(target) for name, target in registry.TASK_TYPES.items()}
+
+
+def task_type(task: str) -> TaskType[ProtocolData]:
+    """The type of a registered task.
+
+    Raises:
+        UnknownNameError: No such task; the message lists those of every type.
+    """
+    for kind in task_types().values():
+        if task in kind.tasks:
+            return kind
+    raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks])
+
+
+def require_options(task: str, options: Mapping[str, Any]) -> None:
+    """Raise InvalidValueError for an option that protocols of this task's type do not have."""
+    fields = [field.name for field in dataclasses.fields(task_type(task).protocol)]
+    for name in options:
+        if name not in fields:
+            raise InvalidValueError(f"{task} takes no --{name.replace('_', '-')}; leave it out.")

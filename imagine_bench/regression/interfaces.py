@@ -1,0 +1,219 @@
+"""The interfaces of regression tasks and regressors: numpy and the standard library only.
+
+A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. The bench
+knows both by these interfaces. One run trains several *networks*, each on data drawn for it, on every *variant* of
+the task. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight
+samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import AgentState, Motion, Shape3D
+from imagine_bench.seeding import SeedTree
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset:
+    """Pairs to learn from or to be tested on.
+
+    Attributes:
+        inputs: Shape (N, X).
+        targets: Shape (N, D).
+    """
+
+    inputs: Floats
+    targets: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mixtures:
+    """Gaussian mixtures with diagonal components.
+
+    Attributes:
+        weights: Each row sums to 1. Shape (..., K).
+        means: Shape (..., K, D).
+        sigmas: Standard deviations, above 0. Shape (..., K, D).
+    """
+
+    weights: Floats
+    means: Floats
+    sigmas: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """What E networks predict, and how uncertain they are.
+
+    Attributes:
+        prediction: One value sampled from the predictive mixture. Shape (E, N, D).
+        mean: Mean over the weight samples. Shape (E, N, D).
+        epistemic: Variance of the mean over weight samples (equation 4.25). Shape (E, N, D).
+        aleatoric: Mean variance of the components (equation 4.26). Shape (E, N, D).
+        modal: Mean spread of the components (equation 4.27). Shape (E, N, D).
+        stationarity: Jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
+        sampled_variance: Variance of the component that the prediction was sampled from, noise and weights together,
+            summed over the outputs. Shape (E, N).
+        nll: Negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
+        predictive: The mixture that predictions are sampled from. Leading axes (E, N).
+    """
+
+    prediction: Floats
+    mean: Floats
+    epistemic: Floats
+    aleatoric: Floats
+    modal: Floats
+    stationarity: Floats
+    sampled_variance: Floats
+    nll: Floats
+    predictive: Mixtures
+
+
+SCORES: dict[str, Callable[[Prediction], Floats]] = {
+    "epistemic": lambda p: p.epistemic.sum(axis=-1),
+    "aleatoric": lambda p: p.aleatoric.sum(axis=-1),
+    "modal": lambda p: p.modal.sum(axis=-1),
+    "epistemic_plus_aleatoric": lambda p: (p.epistemic + p.aleatoric).sum(axis=-1),
+    "total": lambda p: (p.epistemic + p.aleatoric + p.modal).sum(axis=-1),
+    "stationarity": lambda p: p.stationarity,
+    "sampled_component": lambda p: p.sampled_variance,
+    "nll": lambda p: p.nll,
+}
+"""One number a row, (E, N), from a prediction: variances summed over the outputs. The higher, the less sure."""
+
+
+class Regressor(Protocol):
+    """E networks that learn to predict distributions."""
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+
+    @property
+    def epochs(self) -> int:
+        """Epochs to do."""
+
+    def train(self, epochs: int) -> None:
+        """Train for so many more epochs.
+
+        Raises:
+            DivergedError: A loss is no longer finite.
+        """
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call, by slashed name."""
+
+    def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
+        """Predict, with uncertainties.
+
+        Args:
+            inputs: Each network's own. Shape (E, N, X).
+            rng: Samples predictions and Monte-Carlo sums.
+        """
+
+    def pooled(self, inputs: Floats) -> Mixtures:
+        """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
+
+    def state(self) -> AgentState:
+        """A snapshot for a checkpoint."""
+
+    def restore(self, state: AgentState) -> None:
+        """Continue from ``state``, bit for bit.
+
+        Raises:
+            ArtefactError: The snapshot does not fit.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorContext:
+    """What a regressor is built from.
+
+    Attributes:
+        datasets: One a network, all of the same size. Length E.
+        seeds: One node of the seed tree a network. Length E.
+        hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
+        overrides: Single settings that replace the set's.
+        device: ``"cpu"`` or ``"cuda"``.
+    """
+
+    datasets: tuple[Dataset, ...]
+    seeds: tuple[SeedTree, ...]
+    hyperparameters: str = "fast"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
+
+
+Predict = Callable[[Floats, str], Prediction]
+"""Inputs (E, N, X) and a name, which stands for the random numbers, to what the networks predict for them."""
+
+
+class Evaluate(Protocol):
+    """A task's own measurements of trained networks."""
+
+    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+        """Everything the task's figures and tables are made of, by name; the first axis is the network, if there is
+        one.
+
+        Args:
+            variant: What the networks were trained on.
+            predict: Gives their predictions.
+            seeds: One node a network, for test inputs.
+        """
+
+
+class MovingScene(Protocol):
+    """A robot that predictions are carried out with, for recordings."""
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable shape."""
+
+    def movement(self, prediction: Floats, hz: float) -> Motion:
+        """How every body moves while one prediction (D,) is carried out, sampled ``hz`` a second."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionSpec:
+    """Everything the bench needs to know of a regression task. Building one is cheap.
+
+    Attributes:
+        id: Registry name.
+        title: A few words for headings.
+        description: Two sentences for a reader of the report.
+        variants: The variants of the thesis, in its order.
+        require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
+        training: Data of a variant, drawn from a generator.
+        testing: The given number of rows of the same process, never trained on.
+        errors: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
+        error_name: What ``errors`` gives, with its unit.
+        wrong_above: Above this error a prediction counts as wrong.
+        evaluate: The task's own measurements.
+        sections: ``"module:attr"`` of the function that turns them into sections of the report.
+        recorder: ``"module:attr"`` of the function that records them, or None.
+        scene: Gives the robot that carries out predictions, where there is one.
+        reference: Name of the thesis' tables, or None.
+    """
+
+    id: str
+    title: str
+    description: str
+    variants: tuple[str, ...]
+    require_variant: Callable[[str], None]
+    training: Callable[[str, np.random.Generator], Dataset]
+    testing: Callable[[str, np.random.Generator, int], Dataset]
+    errors: Callable[[str, Floats, Floats], Floats]
+    error_name: str
+    wrong_above: float
+    evaluate: Evaluate
+    sections: str
+    recorder: str | None = None
+    scene: Callable[[], MovingScene] | None = None
+    reference: str | None = None

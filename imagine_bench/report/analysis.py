@@ -1,0 +1,181 @@
+"""Analyses of trained agents: find a bench, take its agents up again, measure each, and keep a table, page and rows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from imagine_bench import registry
+from imagine_bench.bench.progress import counted
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.machine import describe_environment
+from imagine_bench.protocols.task_types import task_type
+from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
+from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
+from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol, require_either
+from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json
+from imagine_bench.store.trained import Trained, learners, load_trained, require_control, require_runs
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured(Generic[Value]):
+    """What an analysis measured of one run after ``episodes`` real training episodes."""
+
+    agent: str
+    seed: int
+    episodes: int
+    value: Value
+
+    @property
+    def head(self) -> dict[str, Any]:
+        """Which run it is."""
+        return {"agent": self.agent, "seed": self.seed, "episodes": self.episodes}
+
+
+class Groups(dict[tuple[str, int], list[Value]]):
+    """The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these.
+
+    Args:
+        runs: Every run.
+        name: Of the analysis; the intervals are drawn from a generator of its own.
+    """
+
+    def __init__(self, runs: Sequence[Measured[Value]], name: str) -> None:
+        self._seeds = SeedTree(0).child("report", name)
+        for run in runs:
+            self.setdefault((run.agent, run.episodes), []).append(run.value)
+
+    @property
+    def titles(self) -> list[str]:
+        """What each group is called."""
+        return [f"{agent_words(agent).title}, {episodes:,} episodes" for agent, episodes in self]
+
+    @property
+    def caution(self) -> str:
+        """What the figures are, and a warning where few seeds carry an interval."""
+        fewest = min((len(seeds) for seeds in self.values() if len(seeds) > 1), default=1)
+        return " ".join(["mean over seeds [95 % interval over seeds].", *few_words(fewest)])
+
+    def cell(self, values: Sequence[float], name: str, words: Callable[[float], str] = percent) -> str:
+        """Mean over seeds with its interval."""
+        return mean_text(values, self._seeds.child(name).generator(), words)
+
+
+class Analysis(ABC, Generic[Value]):
+    """One analysis of a task's agents; a bench's folder keeps it as ``<name>/``.
+
+    Args:
+        spec: The task.
+        appearance: Appearance level of the frames (kinematic mode).
+        purpose: What it is for; tuning has frames of its own.
+    """
+
+    name: ClassVar[str]
+    heading: ClassVar[str]
+    rows_file: ClassVar[str]
+
+    def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
+        self.spec = spec
+
+    @abstractmethod
+    def measure(self, trained: Trained) -> Value | None:
+        """Measure one agent, which is not changed; None where it has nothing to measure."""
+
+    @abstractmethod
+    def table(self, runs: Sequence[Measured[Value]]) -> str:
+        """Means over the seeds of each agent with 95 % intervals, as Markdown."""
+
+    @abstractmethod
+    def rows(self, runs: Sequence[Measured[Value]]) -> Iterable[Sequence[object]]:
+        """Every figure of every run, the head first."""
+
+    @abstractmethod
+    def summary(self, value: Value) -> dict[str, Any]:
+        """One run in a few numbers."""
+
+    def write(self, folder: Path, runs: Sequence[Measured[Value]], provenance: dict[str, Any]) -> None:
+        """Write all rows, ``summary.json`` and ``<name>.md``.
+
+        Raises:
+            SetupError: The folder cannot be written.
+        """
+        make_folder(folder)
+        write_bytes(folder / self.rows_file, csv_text(self.rows(runs)).encode())
+        summaries = [{**run.head, **self.summary(run.value)} for run in runs]
+        write_json(folder / "summary.json", {**provenance, "runs": with_null(summaries)})
+        page = f"# {self.spec.title}: {self.heading}\n\n{self.table(runs)}\n\n{origin(provenance)}\n"
+        write_bytes(folder / f"{self.name}.md", page.encode())
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """The lines of a table."""
+    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
+    return [first, f"|{'---|' * len(head)}", *others]
+
+
+def analyse(
+    analysis: type[Analysis[Value]], folder: Path | None, *, root: Path, task: str | None, encoder: str | None
+) -> str:
+    """Measure every learner of a bench, and leave the analysis in its folder.
+
+    An unfinished bench will do: every run is measured as its last checkpoint left it.
+
+    Args:
+        analysis: Which one.
+        folder: A bench's folder; None for the newest.
+        root: Folder of all benches.
+        task: Whose newest bench; None for that of any task.
+        encoder: See :func:`imagine_bench.store.trained.load_trained`.
+
+    Returns:
+        What to print.
+
+    Raises:
+        ImagineBenchError: No bench, or none with an agent that can be taken up again and has something to measure.
+        BusyError: Another process is at the same analysis.
+        SetupError: The bench's folder cannot be written.
+    """
+    bench = chosen(folder, root, task)
+    require_control(read_protocol(bench).task, str(bench))
+    require_runs(bench)
+    where = bench / analysis.name
+    with lock(bench / f".{analysis.name}.lock", f"The folder {where}"):
+        protocol, folders = read_control(bench), learners(bench)
+        spec, appearance = registry.task(protocol.task), protocol.appearance
+        found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
+        runs = []
+        for run in counted(folders, "runs", total=len(folders)):
+            trained = load_trained(run, encoder=encoder)
+            value = found.measure(trained)
+            if value is not None:
+                name, seed = trained.spec.agent, trained.spec.seed
+                runs.append(Measured(agent=name, seed=seed, episodes=trained.episodes, value=value))
+        if not runs:
+            raise ArtefactError(f"No agent of {bench} imagines; give a bench with one that does.")
+        found.write(where, runs, {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic"})
+    return f"{spec.title}, {appearance}\n\n{found.table(runs)}\n\nAll rows:   {where / found.rows_file}"
+
+
+def chosen(given: Path | None, root: Path, task: str | None) -> Path:
+    """What was given, or else the newest bench of a task in which agents act, or of all such tasks.
+
+    Raises:
+        ImagineBenchError: Both are given, or there is no such bench.
+    """
+    require_either(given, task)
+    if task is not None:
+        task_type(task)  # knows every name
+        require_control(task, f"Task {task!r}")
+    return given or newest_bench(root, tuple(registry.TASKS) if task is None else (task,))
+
+
+def provenance(protocol_hash: str) -> dict[str, Any]:
+    """Protocol, commit and command of a figure."""
+    environment = describe_environment()
+    return {"protocol_hash": protocol_hash, **{name: environment.get(name) for name in ("commit", "command")}}

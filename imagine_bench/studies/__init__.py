@@ -1,0 +1,1 @@
+"""Studies: one comparison, one factor changed at a time."""

@@ -1,0 +1,120 @@
+"""The studies that come with the package, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from imagine_bench.studies.study import BASE, Study, Variant
+
+_DQN, _FILTERED = "dqn", "imagination_uncertainty"
+_MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25}
+
+
+def _variant(factor: str, name: str, settings: Mapping[str, Any], agent: str = _FILTERED) -> Variant:
+    return Variant(name=name, factor=factor, agent=agent, against=_FILTERED, settings=settings)
+
+
+def _pair(factor: str, value: str, settings: Mapping[str, Any], appearance: str | None = None) -> tuple[Variant, ...]:
+    """A factor that concerns DQN too: both agents have it."""
+    return (
+        Variant(name=f"dqn, {value}", factor=factor, agent=_DQN, settings=settings, appearance=appearance),
+        Variant(
+            name=f"imagination, {value}", factor=factor, agent=_FILTERED, against=f"dqn, {value}",
+            settings=settings, appearance=appearance,
+        ),
+    )  # fmt: skip
+
+
+_BASE = (
+    Variant(name=_DQN, factor=BASE, agent=_DQN),
+    Variant(name=_FILTERED, factor=BASE, agent=_FILTERED, against=_DQN),
+)
+
+_FACTORS = (
+    *_BASE,
+    Variant(
+        name="dqn, as many updates", factor="updates", agent=_DQN, against=_DQN,
+        settings={"controller.updates_per_step": 5},
+    ),
+    _variant("updates", "one imagined update a step", {"imagination.updates_per_step": 1}),
+    _variant("model's data", "latents not spread", {"model.spread": 1.0}),
+    _variant("model's data", "uniform draws", {"model.balance": 0.0}),
+    _variant("model", "MC-dropout 25 %, one network", _MC_DROPOUT),
+    _variant("reward", "reward and end from the transition", {"model.head_input": "transition"}),
+    _variant("reward", "reward counted in tens", {"model.reward_scale": 10.0}),
+    _variant("rollouts", "from the current state", {"imagination.start_states": "current"}),
+    _variant("rollouts", "depth 10, breadth 3", {"imagination.depth": 10, "imagination.breadth": 3}),
+    _variant("rollouts", "half the actions random", {"imagination.exploration": 0.5}),
+    _variant("start of imagination", "I_start 300", {"imagination.start_episode": 300}),
+    _variant("sampling", "temperature 0.5", {"imagination.temperature": 0.5}),
+    _variant("sampling", "temperature 1", {"imagination.temperature": 1.0}),
+    _variant("filter", "none", {}, "imagination"),
+    _variant("filter", "dynamics only", {"imagination.termination_threshold": None}),
+    _variant("filter", "dynamics below 0.03", {"imagination.threshold": 0.03}),
+    _variant("filter", "sum below 0.3", {"imagination.reduction": "sum"}),
+    _variant("filter", "mean below 0.3", {"imagination.reduction": "mean"}),
+    _variant("filter", "dynamics below the 90 % quantile", {"imagination.threshold_quantile": 0.9}),
+    _variant(
+        "filter", "MC-dropout, doubt about the reward below 2.5",
+        {**_MC_DROPOUT, "imagination.reward_threshold": 2.5, "imagination.termination_threshold": None},
+    ),
+    *_pair("targets", "target network", {"controller.target_rate": 0.02}),
+    *_pair("exploration", "thesis' epsilon", {"controller.epsilon_decay": 0.03}),
+    *_pair("discount", "0.9", {"controller.discount": 0.9}),
+    *_pair("discount", "0.99", {"controller.discount": 0.99}),
+    *_pair("appearance", "clean", {}, "clean"),
+    *_pair("appearance", "strong", {}, "strong"),
+)  # fmt: skip
+
+_DEVIATIONS = (
+    *_BASE,
+    _variant("networks", "dynamics 3 x 256", {"model.dynamics_hidden": (256, 256, 256)}),
+    _variant("networks", "five components", {"model.components": 5}),
+    _variant("networks", "reward 3 x 512", {"model.reward_hidden": (512, 512, 512)}),
+    _variant("networks", "ends 2 x 256", {"model.termination_hidden": (256, 256)}),
+    _variant("likelihood", "z' instead of z' - z", {"model.predict_change": False}),
+    _variant("likelihood", "sigma from 0.01", {"model.sigma_floor": 0.01}),
+    _variant("model's updates", "rate 0.001", {"model.learning_rate": 1e-3}),
+    _variant("model's updates", "sixteen a step", {"model.updates_per_step": 16}),
+    _variant("model's updates", "batches of 512", {"model.batch_size": 512}),
+    _variant("model's updates", "gradients not clipped", {"model.gradient_clip": None}),
+    _variant("model's updates", "bfloat16", {"model.precision": "bfloat16"}),
+    _variant("rollouts", "breadth 3", {"imagination.breadth": 3}),
+    _variant("rollouts", "greedy", {"imagination.exploration": 0.0}),
+)
+
+
+def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
+    """At low budgets, where agents differ most."""
+    return Study(
+        name=name, question=question, budgets=(250, 500), seeds=(1000, 1001, 1002), evaluation_episodes=300,
+        appearance="mild", execution="kinematic", variants=variants,
+    )  # fmt: skip
+
+
+_SMOKE = Study(
+    name="smoke",
+    question="Does every part of a study work?",
+    budgets=(5,),
+    seeds=(1000, 1001),
+    evaluation_episodes=5,
+    appearance="clean",
+    execution="kinematic",
+    variants=(
+        Variant(name="dqn", factor=BASE, agent=_DQN),
+        Variant(
+            name="dqn, more updates", factor="updates", agent=_DQN, against="dqn",
+            settings={"controller.updates_per_step": 2},
+        ),
+    ),
+)  # fmt: skip
+
+STUDIES: dict[str, Study] = {
+    study.name: study
+    for study in (
+        _study("factors", "When does imagination help? One factor at a time", _FACTORS),
+        _study("deviations", "What is a value of the thesis worth in place of that of quick?", _DEVIATIONS),
+        _SMOKE,
+    )
+}

@@ -1,0 +1,196 @@
+"""Studies: variants of one comparison, one factor changed at a time, through the ordinary bench.
+
+A study chooses settings, so it runs on tuning seeds, which are tested on starts of their own; what it finds is then
+confirmed by an ordinary bench on seeds that no study may use. The protocol holds the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.bench.launchers import Launcher
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.task_types import Encoders, task_type
+from imagine_bench.registry import TASKS
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, is_tuning_seed
+from imagine_bench.store.results import BenchResult
+
+if TYPE_CHECKING:
+    from imagine_bench.statistics import Estimate
+
+BASE = "base"
+"""Name of the factor of what the other variants are compared with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One line of a study.
+
+    Attributes:
+        name: Unique within the study.
+        factor: What it varies, :data:`BASE` for a reference.
+        agent: Registered agent.
+        against: Name of the variant whose success its own is compared with, or None.
+        settings: Agent settings, by dotted name.
+        appearance: Appearance level, or None for the study's.
+    """
+
+    name: str
+    factor: str
+    agent: str
+    against: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    appearance: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What a study runs.
+
+    Attributes:
+        name: Its name on the command line.
+        question: One sentence for the reader of its page.
+        budgets: Real training episodes, ascending.
+        seeds: Tuning seeds.
+        evaluation_episodes: Test episodes at each budget.
+        appearance: Appearance level.
+        execution: ``"physics"`` or ``"kinematic"``.
+        variants: What is compared.
+
+    Raises:
+        InvalidValueError: A name given twice, a comparison with nothing, or a seed that reports results.
+    """
+
+    name: str
+    question: str
+    budgets: tuple[int, ...]
+    seeds: tuple[int, ...]
+    evaluation_episodes: int
+    appearance: str
+    execution: str
+    variants: tuple[Variant, ...]
+
+    def __post_init__(self) -> None:
+        names = [variant.name for variant in self.variants]
+        if not names or len(set(names)) != len(names):
+            raise InvalidValueError(f"Study {self.name!r} has the variants {names}; give at least one, each name once.")
+        for variant in self.variants:
+            if variant.against not in (None, *names):
+                raise InvalidValueError(
+                    f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
+                )
+        reported = [seed for seed in self.seeds if not is_tuning_seed(seed)]
+        if reported or not self.seeds:
+            raise InvalidValueError(
+                f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
+                "are tested on starts of their own."
+            )
+
+    def only(self, names: tuple[str, ...]) -> Study:
+        """The same study with the named variants and those they are compared with; all of them where none is named.
+
+        Raises:
+            UnknownNameError: A variant that the study lacks; the message lists those it has.
+        """
+        known = {variant.name: variant for variant in self.variants}
+        wanted = {require_known("variant", name, known) for name in names} or set(known)
+        while True:
+            more = {str(known[name].against) for name in wanted if known[name].against} - wanted
+            if not more:
+                break
+            wanted |= more
+        return replace(self, variants=tuple(variant for variant in self.variants if variant.name in wanted))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """What a variant reached.
+
+    Attributes:
+        variant: Which.
+        success: Success shares. Shape (seeds, budgets).
+        train_cpu_s: Mean CPU seconds of training a run.
+        difference: Against the variant it is compared with, one a budget; None where it is compared with nothing.
+        folder: Where its runs lie.
+        environment: Command, commit, versions and machine of its first session; JSON-like.
+    """
+
+    variant: Variant
+    success: NDArray[np.float64]
+    train_cpu_s: float
+    difference: tuple[Estimate, ...] | None
+    folder: Path
+    environment: Mapping[str, Any]
+
+
+def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
+    """Run what is missing of every variant, in order, and compare; the same call goes on where it stopped.
+
+    Args:
+        study: What to run.
+        task: Registered task.
+        root: Folder of all benches.
+        launcher: Carries out the runs.
+
+    Raises:
+        ImagineBenchError: As for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
+    """
+    if task not in TASKS:
+        task_type(task)  # knows every name
+        raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
+    planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run
+    results: dict[str, BenchResult] = {}
+    for variant, protocol, paths in planned:
+        result = bench(protocol, paths, root=root, launcher=launcher)
+        assert isinstance(result, BenchResult), "of a control task"
+        results[variant.name] = result
+    success = {variant.name: results[variant.name].success_rates(variant.agent) for variant in study.variants}
+    return tuple(
+        Line(
+            variant=variant,
+            success=success[variant.name],
+            train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in results[variant.name].runs])),
+            difference=None if variant.against is None else _differences(study, variant, success),
+            folder=results[variant.name].folder,
+            environment=results[variant.name].environment,
+        )
+        for variant in study.variants
+    )
+
+
+def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
+    return plan(
+        task,
+        "quick",
+        agents=(variant.agent,),
+        seeds=study.seeds,
+        budgets=study.budgets,
+        evaluation_episodes=study.evaluation_episodes,
+        appearance=variant.appearance or study.appearance,
+        execution=study.execution,
+        overrides=tuple(sorted(variant.settings.items())),
+        open_loop_starts=0,
+        recorded_episodes=0,
+    )
+
+
+def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
+    from imagine_bench.statistics import difference  # noqa: PLC0415 - scipy loads slowly, and lists name studies
+
+    ours, theirs = success[variant.name], success[str(variant.against)]
+    return tuple(
+        difference(
+            ours[:, index],
+            theirs[:, index],
+            SeedTree(0).child("study", study.name, variant.name, budget).generator(),
+        )
+        for index, budget in enumerate(study.budgets)
+    )

@@ -1,0 +1,218 @@
+"""The tasks behind dm_env's interface and in dm_control's viewer, beside the same tasks in Gymnasium."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import unittest
+from unittest import mock
+
+import gymnasium
+import numpy as np
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
+
+pytest.importorskip("dm_control", reason="dm_control needs Python below 3.13")
+dm_env = pytest.importorskip("dm_env")
+
+from dm_env import test_utils  # noqa: E402
+
+from imagine_bench.adapters.dm_env import as_dm_env  # noqa: E402
+
+ARROWS = "imagine_bench/ArrowPuzzle-v0"
+
+
+class ContractTest(test_utils.EnvironmentTestMixin, unittest.TestCase):
+    """dm_env's own tests, on episodes that end within the sequence."""
+
+    def make_object_under_test(self):
+        return as_dm_env(ARROWS, seed=0, execution="kinematic")
+
+    def make_action_sequence(self):
+        return iter([0, 2, 4, 1, 3, 5] * 4)
+
+
+class MotionContractTest(ContractTest):
+    """The same, where one step is one sample of a macro-action's motion."""
+
+    def make_object_under_test(self):
+        return as_dm_env(ARROWS, seed=0, motion_hz=2)
+
+    def make_action_sequence(self):
+        return iter([0, 2, 4, 1] * 4)
+
+
+@pytest.mark.parametrize("execution", ["kinematic", "physics"])
+@pytest.mark.parametrize("task", registry.TASKS)
+def test_equals_gymnasium_step_for_step(task, execution):
+    env_id = registry.TASKS[task].env_id
+    ours = gymnasium.make(env_id, execution=execution)
+    theirs = as_dm_env(env_id, seed=3, execution=execution)
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        observation, info = ours.reset(seed=3 if episode == 0 else None)
+        step, ended = theirs.reset(), False
+        assert step.first() and step.reward is None and step.discount is None
+        while not ended:
+            np.testing.assert_array_equal(step.observation, observation)
+            np.testing.assert_array_equal(theirs.info["macrostate"], info["macrostate"])
+            action = int(rng.integers(ours.action_space.n))
+            observation, reward, terminated, truncated, info = ours.step(action)
+            step, ended = theirs.step(action), terminated or truncated
+            assert step.reward == reward
+            assert step.last() == ended
+            assert step.discount == (0.0 if terminated else 1.0)
+        np.testing.assert_array_equal(step.observation, observation)
+    ours.close()
+    theirs.close()
+
+
+class _From(gymnasium.Wrapper):
+    """Every episode starts in one macrostate."""
+
+    def __init__(self, env, macrostate):
+        super().__init__(env)
+        self._options = {"macrostate": macrostate}
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options=self._options)
+
+
+def test_truncation_keeps_the_discount_of_1():
+    rules = registry.task("arrow_puzzle").rules
+    start = next(state for state in rules.start_states if not rules.is_terminal(rules.turned(state, 0)))
+    env = as_dm_env(_From(gymnasium.make(ARROWS, execution="kinematic"), start))
+    env.reset()
+    steps = [env.step(number % 2) for number in range(10)]  # back and forth: the time limit alone ends it
+    assert [step.last() for step in steps] == [False] * 9 + [True]
+    assert {step.discount for step in steps} == {1.0}
+    assert env.step(0).first()
+    env.close()
+
+
+def test_specs_say_what_is_given():
+    env = as_dm_env("imagine_bench/PickPlace-v0", execution="kinematic")
+    assert (env.action_spec().num_values, env.action_spec().dtype) == (4, np.int32)
+    assert (env.observation_spec().shape, env.observation_spec().dtype) == ((64, 64, 3), np.uint8)
+    assert (env.observation_spec().minimum.min(), env.observation_spec().maximum.max()) == (0, 255)
+    env.close()
+
+
+def test_physics_shows_the_scene_and_cannot_change_it():
+    task = gymnasium.make(ARROWS)
+    env, scene = as_dm_env(task, seed=0), task.unwrapped
+    env.reset()
+    for action in (1, 2):
+        before_s = env.physics.data.time
+        env.step(action)
+        np.testing.assert_array_equal(env.physics.data.qpos, scene.data.qpos)
+        np.testing.assert_array_equal(env.physics.data.mocap_pos, scene.data.mocap_pos)
+        np.testing.assert_allclose(env.physics.data.xpos, scene.data.xpos, atol=1e-12)
+        assert env.physics.data.time == before_s + env.info["sim_time_s"] > before_s
+    env.physics.data.qpos[:] = 0.0
+    assert scene.data.qpos.any()
+    env.close()
+
+
+def test_motion_turns_the_cube_before_the_reward():
+    env = as_dm_env(ARROWS, seed=0, motion_hz=10)
+    start, yaws, steps = env.reset(), [], []
+    arm_before, moved = env.physics.named.data.xpos["right_hand"].copy(), 0.0
+    while not steps or steps[-1].reward == 0.0:  # every macro-action has a reward
+        steps.append(env.step(0))
+        yaws.append(np.arctan2(*env.physics.named.data.xmat["cube_0"][[3, 0]]))
+        moved = max(moved, np.linalg.norm(env.physics.named.data.xpos["right_hand"] - arm_before))
+    assert 10 < len(steps) < 60
+    assert all(step.mid() and step.observation is start.observation for step in steps[:-1])
+    turned = np.abs((np.array(yaws) - yaws[0] + np.pi) % (2 * np.pi) - np.pi)
+    assert turned[-1] == pytest.approx(np.pi / 2, abs=np.radians(5))
+    assert ((turned > 0.3) & (turned < 1.3)).any()
+    assert moved > 0.1
+    env.close()
+
+
+def test_viewer_runs_and_the_scene_moves():
+    from dm_control.viewer import application, runtime
+
+    env, pixels, times, yaws = as_dm_env(ARROWS, seed=0, motion_hz=30), [], [], []
+
+    def frames(tick_func):
+        app._pause_subject.value = False
+        app._frame_timer.tick = lambda: 0.1
+        for _ in range(20):
+            pixels.append(tick_func().copy())
+            times.append(env.physics.data.time)
+            yaws.append(np.arctan2(*env.physics.named.data.xmat["cube_0"][[3, 0]]))
+
+    with mock.patch.object(application, "gui"):  # the window alone: no display is needed
+        app = application.Application()
+        app._window.shape, app._window.event_loop.side_effect = (320, 240), frames
+        app.launch(env, policy=lambda step: 0)
+    assert app._runtime.state is runtime.State.RUNNING
+    assert times == sorted(times)
+    assert times[-1] - times[1] == pytest.approx(1.8, abs=0.1)  # in real time
+    assert abs(yaws[-1] - yaws[0]) > 0.3
+    assert pixels[-1].shape == (240, 320, 3)
+    changed = [(frame != pixels[1]).any(axis=2).mean() for frame in pixels[2:]]
+    assert changed[-1] > 0.01
+    app._renderer.release()
+    app._render_surface.free()
+    env.close()
+
+
+def test_dm_controls_renderer_lives_beside_ours():
+    task = gymnasium.make(ARROWS, execution="kinematic")
+    env = as_dm_env(task, seed=0)
+    before = env.reset().observation
+    assert env.physics.render(64, 64, camera_id="wrist").std() > 10
+    np.testing.assert_array_equal(task.unwrapped.agent_view(), before)
+    env.close()
+
+
+def test_open_renderers_end_quietly():
+    code = (
+        "from imagine_bench.adapters.dm_env import as_dm_env\n"
+        f"env = as_dm_env({ARROWS!r}, execution='kinematic')\n"
+        "from dm_control import _render\n"
+        "surface = _render.Renderer(64, 64)\n"  # as the viewer does, before it asks for physics
+        "surface.make_current(); env.physics.render(64, 64, camera_id='human'); env.reset()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert ended.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env": ARROWS, "motion_hz": -1.0}, "No motion at -1.0 Hz"),
+        ({"env": ARROWS, "motion_hz": float("nan")}, "No motion at nan Hz"),
+        ({"env": gymnasium.make("CartPole-v1"), "motion_hz": 10.0}, "No motion at 10.0 Hz"),
+        ({"env": gymnasium.make("CartPole-v1"), "render_mode": None}, "give them with an id"),
+        ({"env": "Pendulum-v1"}, "No adapter for the spaces"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_error(arguments, message):
+    with pytest.raises(InvalidValueError, match=message):
+        as_dm_env(**arguments)
+
+
+def test_other_environments_step_but_show_nothing():
+    env = as_dm_env("CartPole-v1", seed=1)
+    env.reset()
+    assert env.step(0).reward == 1.0
+    with pytest.raises(InvalidValueError, match="no MuJoCo scene"):
+        _ = env.physics
+    env.close()
+
+
+def test_missing_dm_control_is_one_clear_error():
+    code = (
+        "import sys; sys.modules['dm_control'] = None\n"
+        "from imagine_bench.errors import SetupError\n"
+        "try:\n    import imagine_bench.adapters.dm_env\n"
+        "except SetupError as error:\n    print(error)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
+    assert "dm_control is not installed" in said and "Python 3.11 or 3.12" in said

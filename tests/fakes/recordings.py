@@ -1,0 +1,33 @@
+"""What a recording holds, read from its file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from rerun.chunk import RrdReader
+
+
+def rerun(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run Rerun's own command line."""
+    command = [sys.executable, "-m", "rerun", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def contents(path: Path) -> dict[str, set[str]]:
+    """Entity paths and their timelines."""
+    found: dict[str, set[str]] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
+    return found
+
+
+def times(path: Path, entity: str, timeline: str) -> set[int]:
+    """When something was logged for an entity."""
+    return {
+        time
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and timeline in chunk.timeline_names
+        for time in chunk.to_record_batch().column(timeline).to_pylist()
+    }

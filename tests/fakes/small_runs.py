@@ -1,0 +1,101 @@
+"""Small runs and benches in this process, and what their results are compared by."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bench_fakes  # noqa: F401 - registers its agents
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.bench.control import run_observed
+from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.results import Checkpoint, RunResult
+
+_TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
+
+
+def small(**changes: Any) -> Protocol:
+    few: dict[str, Any] = {
+        "agents": ("table",),
+        "seeds": (0,),
+        "budgets": (4, 9),
+        "evaluation_episodes": 5,
+        "execution": "kinematic",
+        "open_loop_starts": 0,
+        "recorded_episodes": 0,
+    }
+    return protocol("arrow_puzzle", "smoke", **{**few, **changes})
+
+
+def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:
+    spec = RunSpec(protocol=small(**changes), agent=agent, seed=seed, checkpoint_every_s=every_s)
+    return run_observed(spec, folder, lambda progress: None)
+
+
+def same_but_for_time(a: RunResult, b: RunResult) -> bool:
+    def rows(result: RunResult) -> list[Checkpoint]:
+        return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
+
+    arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
+    return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
+
+
+def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:
+    snapshot = load_newest(folder / "checkpoints")
+    assert snapshot is not None
+    return dict(snapshot.agent.arrays)
+
+
+def context(seed: int = 0) -> AgentContext:
+    return AgentContext(n_actions=6, preprocessing="gray_strips", encoder=None, seeds=SeedTree(seed).child("agent"))
+
+
+def measured(result: RunResult) -> list[dict[str, Any]]:
+    """Every number of every row but the times; a NaN equals itself as text."""
+    rows = []
+    for row in result.checkpoints:
+        values = dataclasses.asdict(row)
+        values["diagnostics"] = {k: v for k, v in values["diagnostics"].items() if not k.startswith("time/")}
+        rows.append({name: exact(value) for name, value in values.items() if not name.endswith("_cpu_s")})
+    return rows
+
+
+def exact(value: Any) -> Any:
+    """A value to compare to the bit; the text of an array would round its numbers and leave most of them out."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    if isinstance(value, dict):
+        return {name: exact(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [exact(part) for part in value]
+    assert value is None or isinstance(value, int | float | str | np.generic), type(value)
+    return repr(value)
+
+
+class Inline:
+    """A launcher without processes that notes its order of work, and gives up after so many jobs."""
+
+    def __init__(self, patience: int = 1000) -> None:
+        self.order: list[tuple[str, int, int | None]] = []
+        self._patience = patience
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        failures = []
+        for job in jobs:
+            if len(self.order) == self._patience:
+                raise KeyboardInterrupt
+            self.order.append((job.spec.agent, job.spec.seed, job.spec.until))
+            try:
+                run_observed(job.spec, job.folder, on_progress)
+            except RuntimeError as error:
+                failures.append(Failure(job=job, reason=str(error)))
+        return tuple(failures)

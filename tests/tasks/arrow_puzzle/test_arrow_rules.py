@@ -1,0 +1,208 @@
+"""The rules against the exact facts that the thesis' puzzle has (chapter 5), counted by enumeration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.rules import GOALS, LEFT, TOWARD_AGENT, TOWARD_HUMAN, ArrowPuzzleRules
+from imagine_bench.tasks.arrow_puzzle.spec import make_env, spec_of
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.interfaces import Outcome
+from imagine_bench.rules import evaluate, facts, greedy, optimal_policy, tabulate
+
+FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(ArrowPuzzleRules(goal) for goal in GOALS.values())
+NAMES = ["easy", "hard", "toward", "clockwise"]
+ALL = pytest.mark.parametrize("rules", FAMILY, ids=NAMES)
+
+
+def test_counts_of_macrostates():
+    assert len(EASY.states) == len(set(EASY.states)) == 192
+    legal = [state for state in EASY.states if EASY.is_legal(state)]
+    assert len(legal) == 72
+    assert [sum(map(rules.is_goal, rules.states)) for rules in FAMILY] == [18, 6, 18, 6]
+    assert [len(rules.start_states) for rules in FAMILY] == [54, 66, 54, 66]
+
+
+def test_goals_are_what_their_tasks_say():
+    """The directions of the pointed and of all arrows in every goal, written out."""
+
+    def goals(rules):
+        return {(state[state[3]], frozenset(state[:3])) for state in filter(rules.is_goal, rules.states)}
+
+    with_human, with_agent = ({0, 1, 2}, {0, 2, 3}, {0, 1, 3}), ({0, 1, 2}, {0, 2, 3}, {1, 2, 3})
+    assert goals(EASY) == {(TOWARD_HUMAN, frozenset(arrows)) for arrows in with_human}
+    assert goals(HARD) == {(TOWARD_HUMAN, frozenset({0, 1, 3}))}
+    assert goals(TOWARD) == {(TOWARD_AGENT, frozenset(arrows)) for arrows in with_agent}
+    assert goals(CLOCKWISE) == {(LEFT, frozenset({1, 2, 3}))}
+
+
+def test_each_goal_has_a_task_that_says_it():
+    specs = {goal: spec_of(goal) for goal in GOALS}
+    assert [spec.rules.goal for spec in specs.values()] == list(GOALS.values())
+    assert "to point toward the human, and no two" in specs["toward_human"].description
+    assert "toward the human, with no arrow toward the agent, and no two" in specs["toward_human_alone"].description
+    assert "to point left, with no arrow toward the human, and no two" in specs["left"].description
+    assert specs["left"].action_names[3] == "turn the middle cube counter-clockwise"
+    for make in (spec_of, lambda goal: make_env(goal=goal)):
+        with pytest.raises(UnknownNameError, match=r"goal 'lefft'.*'left'"):
+            make("lefft")
+
+
+def test_the_family_shares_everything_but_the_goal():
+    for rules in FAMILY[1:]:
+        assert rules.states == EASY.states
+        for state in EASY.states:
+            assert rules.is_legal(state) == EASY.is_legal(state)
+            for action in range(6):
+                assert rules.turned(state, action) == EASY.turned(state, action)
+                (own,), (other,) = rules.outcomes(state, action), EASY.outcomes(state, action)
+                if not rules.is_goal(own.macrostate) and not EASY.is_goal(own.macrostate):
+                    assert own == other
+
+
+@ALL
+def test_exactly_two_actions_are_legal_in_every_legal_macrostate(rules):
+    for state in filter(rules.is_legal, rules.states):
+        assert sum(rules.is_legal(rules.turned(state, action)) for action in range(6)) == 2
+
+
+@pytest.mark.parametrize(
+    ("rules", "chance", "optimal_return", "mean_length"),
+    [
+        (EASY, 0.04602, 48.222, 2.778),
+        (HARD, 0.03766, 47.727, 3.273),
+        (TOWARD, 0.04602, 48.222, 2.778),
+        (CLOCKWISE, 0.03766, 47.727, 3.273),
+    ],
+    ids=NAMES,
+)
+def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
+    known = facts(rules, 10)
+    assert known.chance_level == pytest.approx(chance, abs=5e-6)
+    assert known.optimum == pytest.approx(1.0, abs=1e-12)
+    assert known.optimal_return == pytest.approx(optimal_return, abs=5e-4)
+    assert known.mean_plan_length == pytest.approx(mean_length, abs=5e-4)
+
+
+def _shortest_by_search(rules, start):
+    """Breadth-first search: an oracle that shares no code with value iteration."""
+    frontier, seen, depth = {start}, {start}, 0
+    while frontier:
+        depth += 1
+        reached = {outcome.macrostate: outcome for s in frontier for a in range(6) for outcome in rules.outcomes(s, a)}
+        if any(outcome.success for outcome in reached.values()):
+            return depth
+        frontier = {state for state, outcome in reached.items() if not outcome.terminated} - seen
+        seen |= frontier
+    raise AssertionError("no plan")
+
+
+@ALL
+def test_optimal_plans_are_as_short_as_breadth_first_search_says(rules):
+    lengths = Counter()
+    for start in rules.start_states:
+        shortest = _shortest_by_search(rules, start)
+        state, total, steps, terminated = start, 0.0, 0, False
+        while not terminated:
+            (outcome,) = rules.outcomes(state, rules.optimal_action(state))
+            state, terminated, steps, total = outcome.macrostate, outcome.terminated, steps + 1, total + outcome.reward
+        assert outcome.success
+        assert steps == shortest
+        assert total == 50.0 - (steps - 1)
+        lengths[steps] += 1
+    assert set(lengths) == set(range(1, 7 if len(rules.start_states) == 66 else 6))
+
+
+def test_chance_level_agrees_with_play():
+    rng = np.random.default_rng(0)
+    wins, n = 0, 20_000
+    starts = rng.integers(len(EASY.start_states), size=n)
+    actions = rng.integers(6, size=(n, 10))
+    for row, start in enumerate(starts):
+        state = EASY.start_states[start]
+        for action in actions[row]:
+            (outcome,) = EASY.outcomes(state, int(action))
+            state = outcome.macrostate
+            if outcome.terminated:
+                wins += outcome.success
+                break
+    assert wins / n == pytest.approx(0.04602, abs=4 * np.sqrt(0.046 * 0.954 / n))
+
+
+@ALL
+def test_turning_there_and_back_and_four_times_changes_nothing(rules):
+    for state in rules.states:
+        for cube in range(3):
+            clockwise, back = 2 * cube, 2 * cube + 1
+            assert rules.turned(rules.turned(state, clockwise), back) == state
+            assert rules.turned(state, clockwise)[cube] == (state[cube] + 1) % 4
+            four_times = state
+            for _ in range(4):
+                four_times = rules.turned(four_times, clockwise)
+            assert four_times == state
+
+
+def test_rewards_and_ends():
+    (goal,) = EASY.outcomes((3, 1, 2, 0), 0)
+    assert goal == Outcome(1.0, (0, 1, 2, 0), 50.0, terminated=True, success=True)
+    (spoiled,) = HARD.outcomes((3, 1, 2, 0), 0)
+    assert spoiled == Outcome(1.0, (0, 1, 2, 0), -1.0, terminated=False, success=False)
+    (illegal,) = EASY.outcomes((0, 3, 2, 1), 1)
+    assert illegal == Outcome(1.0, (3, 3, 2, 1), -5.0, terminated=True, success=False)
+    (plain,) = EASY.outcomes((0, 1, 3, 1), 2)
+    assert plain == Outcome(1.0, (0, 2, 3, 1), -1.0, terminated=False, success=False)
+    with pytest.raises(InvalidValueError, match="Action 6 does not exist; give an integer from 0 to 5"):
+        EASY.outcomes((0, 1, 3, 1), 6)
+
+
+@dataclass(frozen=True)
+class _Gamble:
+    """Action 0 wins with probability 1/4 and otherwise stays; action 1 loses."""
+
+    forever: float = 0.0
+    total: float = 1.0
+    n_actions: int = 2
+    states: tuple = ((0,), (1,))
+    start_states: tuple = ((0,),)
+
+    def outcomes(self, macrostate, action):
+        if action == 1:
+            return (Outcome(1.0, (1,), -5.0, terminated=True, success=False),)
+        return (
+            Outcome(0.25, (1,), 8.0, terminated=True, success=True),
+            Outcome(self.total - 0.25, (0,), self.forever, terminated=False, success=False),
+        )
+
+
+def test_stochastic_rules_by_hand():
+    known = facts(_Gamble(), 2)
+    assert known.optimum == pytest.approx(1 - 0.75**2)
+    assert known.chance_level == pytest.approx(0.125 + 0.375 * 0.125)
+    assert known.optimal_return == pytest.approx(2.0 + 0.75 * 2.0)
+    assert known.mean_plan_length == pytest.approx(1 + 0.75)
+    tables = tabulate(_Gamble())
+    policy = optimal_policy(tables)
+    assert policy.tolist() == [0, 0]
+    assert evaluate(tables, greedy(policy, 2), 200).returns[0] == pytest.approx(8.0)
+
+
+def test_the_solver_names_what_is_wrong():
+    with pytest.raises(InvalidValueError, match=r"action 0 in macrostate \(0,\) sum to 0.9"):
+        facts(_Gamble(total=0.9), 2)
+    with pytest.raises(InvalidValueError, match="Horizon 0 is too short"):
+        facts(_Gamble(), 0)
+
+
+@dataclass(frozen=True)
+class _Endless(_Gamble):
+    def outcomes(self, macrostate, action):
+        return (Outcome(1.0, (0,), 1.0, terminated=False, success=False),)
+
+
+def test_an_endless_return_is_refused():
+    with pytest.raises(InvalidValueError, match="the rules allow an endless return"):
+        facts(_Endless(), 2)

@@ -1,0 +1,297 @@
+"""The compiled scene, its parts, its looks, and what the agent's camera sees of them."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
+from imagine_bench.tasks.arrow_puzzle.spec import spec_of
+from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+from imagine_bench.tasks.macro_env import agent_camera
+from imagine_bench.tasks.rendering import Renderer, View
+from imagine_bench.tasks.scenes import constants as c
+from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+
+from imagine_bench.errors import UnknownNameError
+from imagine_bench.preprocessing import STRIP_WIDTH
+
+FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
+OBJECT_KINDS = ("BODY", "JOINT", "GEOM", "SITE", "CAMERA", "LIGHT", "MESH", "MATERIAL", "TEXTURE", "ACTUATOR")
+
+
+@pytest.fixture(scope="module")
+def world():
+    return ArrowWorld(FIXED)
+
+
+@pytest.fixture(scope="module")
+def camera(world):
+    renderer = agent_camera(world.model)
+    yield renderer
+    renderer.close()
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+# --- compiled model ----------------------------------------------------------------------------------------------
+
+
+def test_every_element_is_named(world):
+    for kind in OBJECT_KINDS:
+        object_type = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
+        sizes = {"BODY": "nbody", "JOINT": "njnt", "CAMERA": "ncam", "MATERIAL": "nmat", "TEXTURE": "ntex",
+                 "ACTUATOR": "nu"}  # fmt: skip
+        count = getattr(world.model, sizes.get(kind, f"n{kind.lower()}"))
+        assert count > 0, kind
+        for index in range(count):
+            assert mujoco.mj_id2name(world.model, object_type, index), f"{kind} {index} has no name"
+
+
+def test_physics_options(world):
+    option = world.model.opt
+    assert option.timestep == c.TIMESTEP_S
+    assert option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert option.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    assert option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    assert option.impratio == 1.0
+    assert option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    assert option.iterations >= 20  # fewer blow the grip up
+    assert world.model.vis.quality.shadowsize == world.model.vis.quality.offsamples == 0
+
+
+def test_cubes_have_their_mass_and_rest_still_on_their_slots(world):
+    world.place((0, 1, 2, 0), rng())
+    before = world.data.qpos.copy()
+    for cube in range(3):
+        body = world.model.body(f"cube_{cube}")
+        assert body.mass[0] == pytest.approx(c.CUBE_MASS_KG)
+        assert world.data.body(f"cube_{cube}").xpos == pytest.approx([*c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M])
+    mujoco.mj_forward(world.model, world.data)
+    contacts = world.data.contact[: world.data.ncon]
+    assert len(contacts) >= 3
+    assert min(contact.dist for contact in contacts) > -1e-6
+    names = {frozenset(world.model.geom(int(g)).name for g in contact.geom) for contact in contacts}
+    assert names == {frozenset(("table_top", f"cube_{cube}_box")) for cube in range(3)}
+    mujoco.mj_step(world.model, world.data, 200)
+    assert np.abs(world.data.qpos - before).max() < 5e-4
+
+
+def test_models_are_one_s_own():
+    first, second = compile_arrow_scene(), compile_arrow_scene()
+    first.mat_rgba[:] = 0.5
+    assert not np.array_equal(first.mat_rgba, second.mat_rgba)
+
+
+@pytest.mark.parametrize("pointed", range(3))
+def test_the_gripper_passes_the_pointing_finger(world, pointed):
+    world.place((1, 2, 0, pointed), rng())
+    hand = world.model.geom("hand_skin").id
+    arm = np.flatnonzero(world.model.geom_group == c.ARM_GROUP)
+
+    def clearance_m():
+        gaps = [mujoco.mj_geomDistance(world.model, world.data, hand, int(geom), 1.0, None) for geom in arm]
+        return min(gaps)
+
+    result = world.execute(2 * pointed, (1, 2, 0, pointed), 20.0)
+    assert result.fault is None
+    closest = 1.0
+    for qpos in result.qpos:
+        world.data.qpos[:] = qpos
+        world._update()
+        closest = min(closest, clearance_m())
+    assert 0.0 < closest < 0.05  # near, so the check is not vacuous, and free
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_macrostate_is_read_back_at_every_level(level):
+    world, generator = ArrowWorld(appearance(level)), rng()
+    for state in spec_of().rules.states:
+        world.place(state, generator)
+        world.vary(generator)
+        reading = world.read()
+        assert reading.macrostate == state
+        assert reading.problem is None
+
+
+def _move(world, cube, *, x_m=0.0, yaw_deg=0.0, roll_deg=0.0):
+    start = int(world.model.joint(f"cube_{cube}_joint").qposadr[0])
+    turn, roll, quat = np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), np.radians(yaw_deg))
+    mujoco.mju_axisAngle2Quat(roll, np.array([1.0, 0.0, 0.0]), np.radians(roll_deg))
+    mujoco.mju_mulQuat(quat, turn, roll)
+    world.data.qpos[start] += x_m
+    world.data.qpos[start + 3 : start + 7] = quat
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"x_m": 0.016}, "cube 1 stands 16 mm off its slot"),
+        ({"x_m": 0.014}, None),
+        ({"yaw_deg": 21.0}, "cube 1 stands 21 degrees off a right angle"),
+        ({"yaw_deg": 19.0}, None),
+        ({"roll_deg": 90.0}, "cube 1 is tipped by 90 degrees"),
+    ],
+)
+def test_a_cube_off_its_place_is_a_problem(world, change, problem):
+    world.place((0, 0, 0, 0), rng())
+    _move(world, 1, **change)
+    reading = world.read()
+    assert reading.problem == problem
+    assert reading.macrostate[1] == 0
+
+
+# --- what the camera sees ----------------------------------------------------------------------------------------
+
+
+def test_the_arm_is_out_of_the_agent_s_view(world, camera):
+    world.place((0, 1, 2, 1), rng())
+    hidden = camera.frame(world.data)
+    with_arm = Renderer(world.model, View(camera=c.AGENT_CAMERA, groups=(c.SCENE_GROUP, c.ARM_GROUP)))
+    assert np.array_equal(hidden, with_arm.frame(world.data))
+    with_arm.close()
+    human = {groups: Renderer(world.model, View(camera=c.HUMAN_CAMERA, groups=groups)) for groups in ((0,), (0, 2))}
+    images = [renderer.frame(world.data) for renderer in human.values()]
+    for renderer in human.values():
+        renderer.close()
+    assert not np.array_equal(*images)  # hiding a group does something
+
+
+def _strip_of_column(column):
+    return [strip for strip, start in enumerate((0, 21, 42)) if start <= column < start + STRIP_WIDTH]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_each_strip_shows_its_own_cube_only(level):
+    world, generator = ArrowWorld(appearance(level)), rng()
+    camera = world.model.camera(c.AGENT_CAMERA)
+    focal_px = 32 / np.tan(np.radians(camera.fovy[0]) / 2)
+    corners = np.array([(x, y, 1.0) for x in (-1, 1) for y in (-1, 1)]) * c.CUBE_EDGE_M / 2
+    centers, extremes = [], []
+    for _ in range(200):
+        world.place((0, 1, 2, 1), generator)
+        world.vary(generator)
+        rotation, position = world.data.cam(c.AGENT_CAMERA).xmat.reshape(3, 3), world.data.cam(c.AGENT_CAMERA).xpos
+        for cube in range(3):
+            body = world.data.body(f"cube_{cube}")
+            seen = (corners @ body.xmat.reshape(3, 3).T + body.xpos - position) @ rotation
+            columns = 32 + focal_px * seen[:, 0] / -seen[:, 2]
+            centers.append((cube, columns.mean()))
+            extremes.append((cube, columns.min() - 21.5 * cube, columns.max() - 21.5 * cube))
+    assert all(_strip_of_column(int(column)) == [cube] for cube, column in centers)
+    spill_px = 3.5 if level == "strong" else 0.5
+    assert min(low for _, low, _ in extremes) > -spill_px
+    assert max(high for _, _, high in extremes) < 21.5 + spill_px
+
+
+def _is_dark(frame):
+    return frame.max(axis=2) < 70
+
+
+def _pointing(dark):
+    """An arrow's tip is its narrow end, its tail the broad one; across, both ends are barbs and alike."""
+    dark = dark[np.ix_(dark.any(axis=1), dark.any(axis=0))]
+    down = int(dark[:2].sum()) - int(dark[-2:].sum())
+    right = int(dark[:, :2].sum()) - int(dark[:, -2:].sum())
+    assert min(abs(down), abs(right)) <= 1
+    assert max(abs(down), abs(right)) >= 2
+    return ("down" if down > 0 else "up") if abs(down) > abs(right) else ("right" if right > 0 else "left")
+
+
+def test_arrows_point_where_their_names_say(world, camera):
+    for direction, name in enumerate(("up", "right", "down", "left")):
+        world.place((direction,) * 3 + (1,), rng())
+        dark = _is_dark(camera.frame(world.data))[34:]
+        assert [_pointing(dark[:, columns]) for columns in (slice(0, 20), slice(22, 42), slice(45, 64))] == [name] * 3
+
+
+def _skin(frame):
+    red, green, blue = (frame[..., channel].astype(int) for channel in range(3))
+    return (red - blue > 45) & (red - green > 20)
+
+
+def test_the_hand_is_at_the_top_its_finger_in_its_cube_s_strip(world, camera):
+    for pointed in range(3):
+        world.place((0, 1, 2, pointed), rng())
+        rows, columns = np.nonzero(_skin(camera.frame(world.data)))
+        assert len(rows) > 100
+        assert rows.max() < 36
+        tip = columns[rows >= rows.max() - 6]
+        assert {strip for column in tip for strip in _strip_of_column(int(column))} == {pointed}
+
+
+# --- appearance --------------------------------------------------------------------------------------------------
+
+
+def test_levels_are_ordered_and_named():
+    assert tuple(LEVELS) == ("clean", "mild", "strong")
+    for weaker, stronger in (("clean", "mild"), ("mild", "strong")):
+        for field in ("object_offset_m", "object_yaw_rad", "light_fraction", "hand_offset_m"):
+            assert getattr(LEVELS[weaker], field) < getattr(LEVELS[stronger], field)
+    with pytest.raises(
+        UnknownNameError, match=r"No appearance 'mid'\. Did you mean 'mild'\? Known: clean, mild, strong"
+    ):
+        appearance("mid")
+
+
+def test_clean_frames_differ_by_cubes_alone_other_levels_by_more(camera):
+    changed = {}
+    for level in LEVELS:
+        world, generator = ArrowWorld(appearance(level)), rng()
+        own = agent_camera(world.model)
+        frames = []
+        for _ in range(2):
+            world.place((0, 1, 2, 1), generator)
+            world.vary(generator)
+            frames.append(own.frame(world.data))
+        own.close()
+        changed[level] = np.abs(frames[0].astype(int) - frames[1]).max(axis=2) > 0
+    assert not changed["clean"][:34].any()
+    assert changed["clean"][34:].any()
+    assert changed["mild"][:34].mean() > 0.5
+    assert changed["strong"][:34].mean() > 0.5
+
+
+def test_looks_vary_within_what_their_level_allows_and_cover_it():
+    for level in LEVELS.values():
+        world, generator = ArrowWorld(level), rng()
+        model, camera = world.model, world.model.camera(c.AGENT_CAMERA).id
+        colors, place_m, light = model.mat_rgba.copy(), model.cam_pos[camera].copy(), model.light_diffuse.copy()
+        quat = model.cam_quat[camera].copy()
+        tint, shift_m, turn_rad, brightness = 0.0, 0.0, 0.0, 0.0
+        for _ in range(200):
+            world.vary(generator)
+            tint = max(tint, np.abs(model.mat_rgba / np.where(colors > 0, colors, 1.0) - (colors > 0)).max())
+            shift_m = max(shift_m, np.abs(model.cam_pos[camera] - place_m).max())
+            turn_rad = max(turn_rad, 2.0 * math.acos(min(1.0, abs(model.cam_quat[camera] @ quat))))
+            brightness = max(brightness, np.abs(model.light_diffuse - light).max() / light.max())
+        for found, most in (
+            (tint, level.color_fraction),
+            (shift_m, level.camera_offset_m),
+            (turn_rad, math.sqrt(3.0) * level.camera_angle_rad),
+            (brightness, level.light_fraction),
+        ):
+            assert 0.75 * most <= found <= most + 1e-6
+
+
+def test_samples_of_looks_do_not_add_up():
+    """The hundredth sample is as near the nominal looks as the first, and one draw alone decides it."""
+    frames = []
+    for warm_up in (0, 100):
+        world = ArrowWorld(appearance("strong"))
+        own, warm, last = agent_camera(world.model), rng(), np.random.default_rng(7)
+        for _ in range(warm_up):
+            world.vary(warm)
+        world.place((0, 1, 2, 1), last)
+        world.vary(last)
+        frames.append(own.frame(world.data))
+        own.close()
+    assert np.array_equal(*frames)

@@ -1,0 +1,341 @@
+"""Macro-actions in contact: turns do what the rules say, by friction, within the robot's limits, bit for bit."""
+
+import itertools
+import math
+import pickle
+import re
+import tempfile
+
+import mujoco
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.executor import REST_OPENING_M, MacroExecutor
+from imagine_bench.tasks.motion.ik import ArmIK
+from imagine_bench.tasks.motion.trajectory import Waypoint, plan
+from imagine_bench.tasks.motion.turn import TurnExecutor
+from imagine_bench.tasks.scenes.constants import (
+    CUBE_EDGE_M,
+    OBSERVATION_QPOS_RAD,
+    SLOTS_XY_M,
+    TABLE_HEIGHT_M,
+    TIMESTEP_S,
+)
+
+from imagine_bench.errors import DivergedError, InvalidValueError
+
+QUARTER_RAD = math.pi / 2
+CUBE_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ArmModel()
+
+
+@pytest.fixture(scope="module")
+def turner():
+    return TurnExecutor(compile_arrow_scene())
+
+
+def cube_slice(model, cube):
+    start = int(model.joint(f"cube_{cube}_joint").qposadr[0])
+    return slice(start, start + 7)
+
+
+def place(model, data, yaws_rad, offsets_m=((0, 0), (0, 0), (0, 0))):
+    """Stand the cubes on their slots, turned and shifted."""
+    mujoco.mj_resetData(model, data)
+    for cube, (yaw, (dx, dy)) in enumerate(zip(yaws_rad, offsets_m, strict=True)):
+        x, y = SLOTS_XY_M[cube]
+        data.qpos[cube_slice(model, cube)] = [x + dx, y + dy, CUBE_Z_M, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]
+
+
+def poses(model, data):
+    """Position and yaw of each cube, read from the rotation matrix. Shape (3, 4)."""
+    rows = []
+    for cube in range(3):
+        position, quat = np.split(data.qpos[cube_slice(model, cube)], [3])
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, quat)
+        rows.append([*position, math.atan2(matrix[3], matrix[0])])
+    return np.array(rows)
+
+
+def wrap(angle_rad):
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
+
+
+def test_planning_and_scene_have_the_same_servos(arm, turner):
+    model = turner.executor.model
+    servos = [model.actuator(f"right_j{index}_servo").id for index in range(7)]
+    np.testing.assert_array_equal(model.actuator_gainprm[servos, 0], arm.stiffness_nm_rad)
+    dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
+    damping = model.dof_damping[dofs] - model.actuator_biasprm[servos, 2]
+    np.testing.assert_allclose(damping, arm.damping_nms_rad, rtol=1e-3)  # frozen fingers change the inertia a little
+
+
+@pytest.mark.parametrize(("cube", "clockwise"), list(itertools.product(range(3), (True, False))))
+def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0.05, -0.05, QUARTER_RAD))
+    result = turner.turn(data, cube=cube, clockwise=clockwise, capture_motion_hz=1 / TIMESTEP_S)
+    assert result.fault is None
+    np.testing.assert_allclose(result.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
+    arm_qpos = turner.executor.arm_qpos_rad(result.qpos)
+    speed_rad_s = np.abs(np.diff(arm_qpos, axis=0)) / TIMESTEP_S
+    assert (speed_rad_s.max(axis=0) <= arm.speed_limit_rad_s).all()
+    assert (speed_rad_s.max(axis=0) / arm.speed_limit_rad_s).max() > 0.9
+    np.testing.assert_allclose(arm_qpos[[0, -1]], [OBSERVATION_QPOS_RAD] * 2, atol=1e-3)
+
+
+def test_servo_forces_stay_below_their_limits(turner):
+    """Replay one turn step by step and read the forces: within the limits, at rest far below, the grip firm.
+
+    Gravity is compensated beside the servos, so that a motor would give the sum: the shoulder's goes beyond its limit.
+    """
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0))
+    peak, motor_peak_nm = np.zeros(model.nu), np.zeros(7)
+    arm_dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
+    planned = {}
+    original = turner.executor.run
+
+    def keep(data, trajectory, **options):
+        planned["trajectory"] = trajectory
+        return original(data, trajectory, **options)
+
+    turner.executor.run = keep
+    try:
+        turner.turn(data, cube=0, clockwise=True)
+    finally:
+        del turner.executor.run
+    stepped = mujoco.MjData(model)
+    place(model, stepped, (0, 0, 0))
+    turner.executor.rest(stepped)
+    trajectory = planned["trajectory"]
+    for command, opening in zip(trajectory.arm_command_rad, trajectory.opening_m, strict=True):
+        for index in range(7):
+            stepped.ctrl[model.actuator(f"right_j{index}_servo").id] = command[index]
+        for side in ("left", "right"):
+            stepped.ctrl[model.actuator(f"finger_{side}_servo").id] = opening
+        mujoco.mj_step(model, stepped)
+        peak = np.maximum(peak, np.abs(stepped.actuator_force))
+        motor_peak_nm = np.maximum(motor_peak_nm, np.abs(stepped.qfrc_actuator + stepped.qfrc_gravcomp)[arm_dofs])
+    shoulder_share, *other_shares = (motor_peak_nm / model.actuator_forcerange[:7, 1])[[1, 0, 2, 3, 4, 5, 6]]
+    assert max(other_shares) < 1.0 and 1.1 < shoulder_share < 1.15  # as the page on environments says
+    assert (peak[:6] < 0.95 * model.actuator_forcerange[:6, 1]).all()  # only the wrist's plan is near its limit
+    assert (np.abs(stepped.actuator_force) < 0.1 * model.actuator_forcerange[:, 1]).all()
+    assert 10 < peak[-1] < 30  # the grip
+    np.testing.assert_array_equal(stepped.qpos, data.qpos)  # rollout and stepping agree, bit for bit
+
+
+def run_turns(turner, number, per_start, seed):
+    """Random turns in unreset sequences; returns yaw errors (deg), slot errors (m), others' motion (m), faults."""
+    rng = np.random.default_rng(seed)
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    yaw_deg, slot_m, others_m, faults = [], [], [], []
+    for index in range(number):
+        if index % per_start == 0:
+            yaws = rng.integers(4, size=3) * QUARTER_RAD + rng.uniform(-0.14, 0.14, 3)
+            place(model, data, yaws, rng.uniform(-0.01, 0.01, (3, 2)))
+        cube, clockwise = int(rng.integers(3)), bool(rng.integers(2))
+        before = poses(model, data)
+        result = turner.turn(data, cube=cube, clockwise=clockwise)
+        after = poses(model, data)
+        target = round(before[cube, 3] / QUARTER_RAD) * QUARTER_RAD + (-QUARTER_RAD if clockwise else QUARTER_RAD)
+        yaw_deg.append(abs(math.degrees(wrap(after[cube, 3] - target))))
+        slot_m.append(math.dist(after[cube, :2], SLOTS_XY_M[cube]))
+        others = [other for other in range(3) if other != cube]
+        others_m.append(np.abs(after[others, :3] - before[others, :3]).max())
+        faults.append(result.fault)
+    return np.array(yaw_deg), np.array(slot_m), np.array(others_m), faults
+
+
+def check_turns(yaw_deg, slot_m, others_m, faults):
+    right = (yaw_deg < 10) & (others_m < 1e-3) & np.array([fault is None for fault in faults])
+    assert right.mean() >= 0.999, [fault for fault in faults if fault]
+    assert others_m.max() < 1e-3
+    assert np.percentile(yaw_deg, 99) < 1.0
+    assert np.percentile(slot_m, 99) < 2e-3
+
+
+def test_turns_do_what_the_rules_say(turner):
+    check_turns(*run_turns(turner, number=60, per_start=10, seed=0))
+
+
+@pytest.mark.slow
+def test_two_thousand_turns_do_what_the_rules_say(turner):
+    check_turns(*run_turns(turner, number=2000, per_start=100, seed=1))
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+def test_very_skew_cubes_are_squared(turner, clockwise):
+    """Even 25 degrees off, where the wrist would leave its range if it took the usual faces."""
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    for skew_rad in (-math.radians(25), math.radians(25)):
+        place(model, data, (skew_rad, 0, 0))
+        assert turner.turn(data, cube=0, clockwise=clockwise).fault is None
+        target = -QUARTER_RAD if clockwise else QUARTER_RAD
+        assert abs(math.degrees(wrap(poses(model, data)[0, 3] - target))) < 1
+
+
+def test_a_turn_is_a_pure_function_of_positions_and_action(turner):
+    """Twice, in two MjData, before and after other actions, in two executors: the same bits."""
+    model = turner.executor.model
+    data, used = mujoco.MjData(model), mujoco.MjData(model)
+    place(model, data, (0.1, QUARTER_RAD, -0.1), ((0.003, -0.002), (0, 0.004), (0.001, 0)))
+    turner.turn(data, cube=0, clockwise=True)
+    start = data.qpos.copy()
+    turner.turn(data, cube=1, clockwise=False)
+    first = data.qpos.copy()
+    assert np.abs(first - start).max() > 0.5
+    for _ in range(2):
+        turner.turn(used, cube=2, clockwise=True)
+        used.qpos[:] = start
+        used.qvel[:] = 3.0  # whatever was left over does not matter
+        used.qacc_warmstart[:] = 5.0
+        turner.turn(used, cube=1, clockwise=False)
+        np.testing.assert_array_equal(used.qpos, first)
+    other = pickle.loads(pickle.dumps(turner))
+    fresh = mujoco.MjData(other.executor.model)
+    fresh.qpos[:] = start
+    other.turn(fresh, cube=1, clockwise=False)
+    np.testing.assert_array_equal(fresh.qpos, first)
+
+
+def test_turns_leave_mocap_bodies_where_they_are(turner):
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0))
+    assert model.nmocap > 0
+    data.mocap_pos[0] = (0.9, 0.1, 0.2)
+    turner.turn(data, cube=0, clockwise=True)
+    np.testing.assert_array_equal(data.mocap_pos[0], (0.9, 0.1, 0.2))
+
+
+def tips(model):
+    return [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
+
+
+def turned_deg(turner, model, change=None):
+    """How far cube 1 turns in a clockwise macro-action on a changed scene, and the fault."""
+    if change:
+        change(model)
+    executor = TurnExecutor(model)
+    data = mujoco.MjData(model)
+    place(model, data, (0, 0, 0))
+    result = executor.turn(data, cube=1, clockwise=True)
+    return -math.degrees(poses(model, data)[1, 3]), result.fault
+
+
+def test_only_contact_turns_the_cube(turner):
+    """No weld, no teleport: fingertips that pass through the cube leave it alone, and the robot feels it holds none."""
+
+    def ghost_tips(model):
+        model.geom_contype[tips(model)] = 0
+        model.geom_conaffinity[tips(model)] = 0
+
+    assert turned_deg(turner, compile_arrow_scene())[0] == pytest.approx(90, abs=1)
+    angle, fault = turned_deg(turner, compile_arrow_scene(), ghost_tips)
+    assert angle == pytest.approx(0, abs=0.1)
+    assert fault == "the fingers closed past cube 1"
+
+
+def test_an_arm_that_does_not_come_back_is_a_fault(turner):
+    def pulled_wrist(model):
+        joint = model.joint("right_j6")
+        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 16.0, OBSERVATION_QPOS_RAD[6] + 1.0
+
+    fault = turned_deg(turner, compile_arrow_scene(), pulled_wrist)[1]
+    assert re.fullmatch(r"the arm ended 0\.\d{3} rad off its observation pose", fault)
+
+
+def lifted_m(model):
+    """How high cube 1 is after the fingers close on it as for a turn and go up by 60 mm."""
+    arm, executor, data = ArmModel(), MacroExecutor(model), mujoco.MjData(model)
+    place(model, data, (0, 0, 0))
+    ik, at = ArmIK(arm), np.array([*SLOTS_XY_M[1], CUBE_Z_M])
+    down, up = (ik.solve(position_in_base_m=at + np.array((0, 0, z)), yaw_rad=0.0).qpos_rad for z in (0, 0.06))
+    squeezed_m = CUBE_EDGE_M / 2 - 0.004
+    waypoints = [
+        Waypoint(name="above", qpos_rad=up, opening_m=REST_OPENING_M),
+        Waypoint(name="down", qpos_rad=down, opening_m=REST_OPENING_M),
+        Waypoint(name="close", qpos_rad=down, opening_m=squeezed_m, min_duration_s=0.1),
+        Waypoint(name="up", qpos_rad=up, opening_m=squeezed_m, min_duration_s=0.4),
+    ]
+    start = np.array(OBSERVATION_QPOS_RAD)
+    executor.run(
+        data,
+        plan(
+            arm,
+            start_qpos_rad=start,
+            start_opening_m=REST_OPENING_M,
+            waypoints=waypoints,
+            timestep_s=model.opt.timestep,
+        ),
+    )
+    return data.qpos[cube_slice(model, 1)][2] - CUBE_Z_M
+
+
+def test_the_grip_is_friction():
+    """The same motion lifts the cube with rubber tips and leaves it standing with slippery ones."""
+    model = compile_arrow_scene()
+    assert lifted_m(model) > 0.055
+    model.geom_friction[tips(model)] = (0.02, 0.001, 0.0001)
+    assert lifted_m(model) < 0.001
+
+
+@pytest.mark.parametrize(
+    ("quat", "position", "message"),
+    [
+        ((math.cos(0.4), math.sin(0.4), 0, 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 46 degrees"),
+        ((1, 0, 0, 0), (1.4, 0, CUBE_Z_M), "cube 1 is out of reach: The gripper cannot reach"),
+    ],
+    ids=["tipped", "far"],
+)
+def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0))
+    data.qpos[cube_slice(model, 1)] = [*position, *quat]
+    before = poses(model, data)
+    result = turner.turn(data, cube=1, clockwise=True, capture_motion_hz=10)
+    assert message in result.fault
+    assert result.sim_time_s == 0.0
+    assert result.qpos.shape == (0, model.nq)
+    np.testing.assert_array_equal(poses(model, data), before)
+
+
+def test_unknown_cube_is_named(turner):
+    with pytest.raises(InvalidValueError, match="No cube 3; there are 0 to 2"):
+        turner.turn(mujoco.MjData(turner.executor.model), cube=3, clockwise=True)
+
+
+def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0))
+    data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
+    with pytest.raises(DivergedError, match="its start state and controls were saved in"):
+        turner.turn(data, cube=0, clockwise=True)
+    (saved,) = tmp_path.glob("imagine_bench_diverged_*.npz")
+    with np.load(saved) as contents:
+        assert contents["start_state"].max() == 1e11
+        assert contents["control"].shape[1] == model.nu
+
+
+@pytest.mark.parametrize(("motion_hz", "rows"), [(0.0, 0), (20.0, None), (1e6, None)])
+def test_captured_motion_is_even_and_complete(turner, motion_hz, rows):
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0))
+    result = turner.turn(data, cube=0, clockwise=True, capture_motion_hz=motion_hz)
+    expected = rows if rows is not None else 1 + math.ceil(result.sim_time_s * min(motion_hz, 1 / TIMESTEP_S) - 1e-6)
+    assert result.qpos.shape == (expected, model.nq)
+    assert result.time_s.shape == (expected,)
+    if expected:
+        assert result.time_s[0] == 0.0
+        np.testing.assert_allclose(result.time_s[-1], result.sim_time_s)
+        assert (np.diff(result.time_s) > 0).all()
+        np.testing.assert_array_equal(result.qpos[-1], data.qpos)
+        np.testing.assert_array_equal(turner.executor.opening_m(result.qpos[0]), [REST_OPENING_M] * 2)

@@ -1,0 +1,135 @@
+"""Pick-and-place with a human: the machine of the thesis' table 3.1, and its facts as worked out by hand."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.pick_place.rules import (
+    HAND_OVER,
+    HANDED_OVER,
+    OPEN_PALM,
+    PICKED,
+    WITHDRAWN,
+    PickPlaceRules,
+    held_object,
+)
+from imagine_bench.tasks.pick_place.spec import HORIZON
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.rules import facts, optimal_values, tabulate
+
+RULES = PickPlaceRules()
+PLAY = [state for state in RULES.states if not RULES.is_terminal(state)]
+TABLE_3_1 = [
+    (0, 0, 0, 0), (0, 0, 0, 1), (0, 0, 0, 2),
+    (1, 0, 0, 1), (1, 0, 0, 2), (1, 0, 0, 3),
+    (0, 1, 0, 0), (0, 1, 0, 2), (0, 1, 0, 3),
+    (0, 0, 1, 0), (0, 0, 1, 1), (0, 0, 1, 3),
+]  # fmt: skip
+
+
+def test_play_is_table_3_1_in_its_order():
+    assert list(RULES.states[:12]) == TABLE_3_1 == PLAY
+    assert len(set(RULES.states)) == len(RULES.states) == 19
+    assert RULES.start_states == tuple(TABLE_3_1[:3])
+
+
+def test_outcomes_are_distributions_over_known_states():
+    for state, action in itertools.product(RULES.states, range(RULES.n_actions)):
+        outcomes = RULES.outcomes(state, action)
+        assert sum(outcome.probability for outcome in outcomes) == pytest.approx(1.0)
+        assert len({outcome.macrostate for outcome in outcomes}) == len(outcomes)
+        for outcome in outcomes:
+            assert outcome.macrostate in RULES.states
+            assert RULES.judge(state, action, outcome.macrostate) == outcome
+            assert outcome.terminated == RULES.is_terminal(outcome.macrostate)
+
+
+def test_one_action_is_asked_for_in_play_and_none_after_an_end():
+    for state in RULES.states:
+        right = [action for action in range(4) if RULES.is_asked_for(state, action)]
+        assert len(right) == (0 if RULES.is_terminal(state) else 1)
+        for action in set(range(4)) - set(right):
+            (outcome,) = RULES.outcomes(state, action)
+            assert (outcome.reward, outcome.terminated, outcome.success) == (-5.0, True, False)
+
+
+def test_rewards_in_play_depend_on_the_macrostate_reached_alone():
+    """So that a reward network r(z') can be right."""
+    rewards: dict[tuple[int, ...], set[float]] = {}
+    for state, action in itertools.product(PLAY, range(4)):
+        for outcome in RULES.outcomes(state, action):
+            rewards.setdefault(outcome.macrostate, set()).add(outcome.reward)
+    assert set(rewards) == set(RULES.states)
+    assert all(len(each) == 1 for each in rewards.values())
+    assert set.union(*rewards.values()) == {1.0, 0.0, 5.0, -5.0}
+
+
+def test_a_pick_as_asked_leaves_the_human_three_wishes():
+    outcomes = RULES.outcomes((0, 0, 0, 1), 1)
+    assert [outcome.macrostate for outcome in outcomes] == [(0, 1, 0, 0), (0, 1, 0, 2), (0, 1, 0, OPEN_PALM)]
+    assert all(outcome.probability == pytest.approx(1 / 3) and outcome.reward == 1.0 for outcome in outcomes)
+
+
+def test_the_human_keeps_pointing_while_an_object_is_put_back():
+    (outcome,) = RULES.outcomes((1, 0, 0, 2), 0)
+    assert (outcome.macrostate, outcome.reward, outcome.terminated) == ((0, 0, 0, 2), 0.0, False)
+
+
+def test_a_handover_ends_well_only_into_an_open_palm():
+    (good,) = RULES.outcomes((0, 0, 1, OPEN_PALM), HAND_OVER)
+    assert (good.macrostate, good.reward, good.success) == ((0, 0, HANDED_OVER, OPEN_PALM), 5.0, True)
+    (early,) = RULES.outcomes((0, 0, 1, 0), HAND_OVER)
+    assert (early.macrostate, early.reward, early.success) == ((0, 0, PICKED, WITHDRAWN), -5.0, False)
+
+
+def test_a_fault_counts_as_a_wrong_action():
+    missed = RULES.judge((0, 0, 0, 1), 1, (0, 0, 0, WITHDRAWN))
+    assert (missed.reward, missed.terminated, missed.success) == (-5.0, True, False)
+
+
+def test_facts_are_those_worked_out_by_hand():
+    """Optimal: V = 1 + 5/3 + 2/3 V = 8, in 6 actions. Random: S = 1/4 (1/3 1/4 + 2/3 1/4 S) = 1/46."""
+    found = facts(RULES, HORIZON)
+    assert found.optimum == pytest.approx(1 - (2 / 3) ** (HORIZON // 2), abs=1e-12)
+    assert found.optimum > 0.9999
+    assert found.chance_level == pytest.approx(1 / 46, abs=1e-9)
+    assert found.optimal_return == pytest.approx(8.0, abs=1e-2)
+    assert found.mean_plan_length == pytest.approx(6.0, abs=1e-2)
+    tables = tabulate(RULES)
+    assert optimal_values(tables).max(axis=0)[tables.starts] == pytest.approx([8.0] * 3)
+
+
+def test_the_optimal_policy_does_what_is_asked_for():
+    for state in PLAY:
+        assert RULES.is_asked_for(state, RULES.optimal_action(state))
+
+
+def test_play_agrees_with_the_exact_facts():
+    """20,000 episodes at random; the chance level within four standard errors, and no two objects are ever held."""
+    generator = np.random.default_rng(0)
+    wins, episodes = 0, 20_000
+    for _ in range(episodes):
+        state = RULES.start_states[int(generator.integers(3))]
+        over = False
+        while not over:
+            outcomes = RULES.outcomes(state, int(generator.integers(4)))
+            outcome = outcomes[int(generator.integers(len(outcomes)))]
+            state, over = outcome.macrostate, outcome.terminated
+            assert state[:3].count(PICKED) <= 1
+            wins += outcome.success
+    assert abs(wins / episodes - 1 / 46) < 4 * np.sqrt(1 / 46 / episodes)
+
+
+def test_the_held_object_is_named():
+    assert held_object((0, 1, 0, 2)) == 1
+    assert held_object((0, 0, 0, 2)) is None
+    assert held_object((0, 0, 2, 3)) is None
+
+
+@pytest.mark.parametrize("action", [-1, 4])
+def test_unknown_actions_are_refused(action):
+    with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 3"):
+        RULES.outcomes((0, 0, 0, 0), action)

@@ -1,0 +1,404 @@
+"""Pick-and-place with a human in the simulation: parts, reading, carrying in contact, the human's answers."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
+from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
+from imagine_bench.tasks.pick_place.spec import SPEC
+from imagine_bench.tasks.pick_place.world import PickWorld
+from imagine_bench.tasks.rendering import Renderer, View
+from imagine_bench.tasks.scenes import constants as c
+from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.tools.fidelity import measure_fidelity
+
+FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
+RULES = SPEC.rules
+EVERY_MOTION = [
+    pytest.param((0, 0, 0, 0), 0, (1, 0, 0, 3), id="pick-ball"),
+    pytest.param((0, 0, 0, 1), 1, (0, 1, 0, 0), id="pick-car"),
+    pytest.param((0, 0, 0, 0), 2, (0, 0, 1, 4), id="pick-cup-unasked"),
+    pytest.param((1, 0, 0, 2), 0, (0, 0, 0, 2), id="place-ball"),
+    pytest.param((0, 1, 0, 0), 1, (0, 0, 0, 0), id="place-car"),
+    pytest.param((0, 0, 1, 3), 2, (0, 0, 0, 4), id="place-cup-unasked"),
+    pytest.param((1, 0, 0, 3), 3, (2, 0, 0, 3), id="hand-over-ball"),
+    pytest.param((0, 1, 0, 3), 3, (0, 2, 0, 3), id="hand-over-car"),
+    pytest.param((0, 0, 1, 3), 3, (0, 0, 2, 3), id="hand-over-cup"),
+    pytest.param((0, 1, 0, 2), 3, (0, 1, 0, 4), id="offer-without-palm"),
+    pytest.param((0, 0, 0, 1), 3, (0, 0, 0, 4), id="offer-nothing"),
+    pytest.param((1, 0, 0, 1), 1, (1, 0, 0, 4), id="second-object"),
+    pytest.param((0, 2, 0, 3), 1, (0, 2, 0, 3), id="after-the-end"),
+]
+
+
+@pytest.fixture(scope="module")
+def world():
+    return PickWorld(FIXED)
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_objects_stand_still_on_the_table(world):
+    world.place((0, 0, 0, WITHDRAWN), rng())
+    before = world._poses()
+    assert before[:, :3] == pytest.approx(np.array([standing_m(index) for index in range(3)]))
+    for _ in range(5):  # what sleeps soon touches nothing any more
+        mujoco.mj_step(world.model, world.data)
+    touching = {
+        frozenset(world.model.geom(int(geom)).name.split("_")[0] for geom in contact.geom)
+        for contact in world.data.contact[: world.data.ncon]
+    }
+    assert touching == {frozenset(("table", spec.name)) for spec in OBJECTS}
+    for _ in range(300):
+        mujoco.mj_step(world.model, world.data)
+    assert np.abs(world._poses()[:, :3] - before[:, :3]).max() < 5e-4
+
+
+def test_only_tips_table_objects_and_palm_touch(world):
+    names = {world.model.geom(index).name for index in np.flatnonzero(world.model.geom_contype)}
+    tips = {f"finger_{side}_tip_{end}" for side in ("left", "right") for end in ("front", "back")}
+    assert names == {
+        "table_top", "ball_skin", "car_box", "cup_wall", "palm_plate", *tips, *(f"car_wheel_{i}" for i in range(4)),
+        *(f"cup_foot_{i}" for i in range(4)), *(f"palm_rim_{i}" for i in range(4)),
+    }  # fmt: skip
+    assert world.model.neq == 0  # no weld anywhere
+    assert world.model.opt.timestep == TIMESTEP_S
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_macrostate_is_read_back_at_every_level(level):
+    world, generator = PickWorld(appearance(level)), rng()
+    for state in RULES.states:
+        for _ in range(3):
+            world.place(state, generator)
+            world.vary(generator)
+            reading = world.read()
+            assert (reading.macrostate, reading.problem) == (state, None)
+
+
+@pytest.mark.parametrize(
+    ("index", "yaw_deg", "problem"),
+    [
+        (0, 25, None),
+        (1, 25, "the car is turned by 25 degrees"),
+        (1, -15, None),
+        (2, -25, "the cup is turned by 25 deg"),
+    ],
+)
+def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw_deg, problem):
+    world.place((0, 0, 0, 0), rng())
+    half_rad = math.radians(yaw_deg) / 2
+    world.data.qpos[world._object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
+    found = world.read().problem
+    assert found is None if problem is None else found.startswith(problem)
+
+
+@pytest.mark.parametrize(
+    ("index", "moved_m", "tilt_deg", "problem"),
+    [
+        (0, (0.021, 0, 0), 0, "the ball stands 21 mm off its place"),
+        (0, (0.018, 0, 0), 90, None),  # a ball has no right way up
+        (1, (0, 0, 0), 12, "the car is tipped by 12 degrees"),
+        (2, (0, 0, 0), 8, None),
+        (2, (0, 0, 0.05), 0, "the cup is neither on the table nor held nor in the palm"),
+    ],
+)
+def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, problem):
+    world.place((0, 0, 0, 0), rng())
+    row = world._object_qpos[index]
+    half_rad = math.radians(tilt_deg) / 2
+    world.data.qpos[row[:3]] += moved_m
+    world.data.qpos[row[3:]] = [math.cos(half_rad), math.sin(half_rad), 0, 0]
+    reading = world.read()
+    assert reading.problem == problem
+    assert reading.macrostate == (0, 0, 0, 0)
+
+
+# --- acting ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION)
+def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action, intended):
+    assert intended in [outcome.macrostate for outcome in RULES.outcomes(state, action)]
+    world.place(state, rng())
+    before = world._poses()
+    result = world.execute(action, intended, 1 / TIMESTEP_S)
+    assert result.fault is None
+    assert (world.read().macrostate, world.read().problem) == (intended, None)
+    joints = [int(world.model.joint(f"right_j{index}").qposadr[0]) for index in range(7)]
+    speed_rad_s = np.abs(np.diff(result.qpos[:, joints], axis=0)) / TIMESTEP_S
+    assert (speed_rad_s.max(axis=0) <= ArmModel().speed_limit_rad_s).all()
+    assert np.abs(result.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
+    untouched = [index for index in range(3) if state[index] == intended[index] == 0]
+    assert np.abs(world._poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_gripper_and_object_pass_the_pointing_hand(world, index):
+    state = (0, 0, 0, index)
+    world.place(state, rng())
+    people = world.data.mocap_pos.copy()
+    motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
+    model, hand = world.model, world.model.geom("hand_skin").id
+    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", OBJECTS[index].name))]
+    closest_m, data = 1.0, mujoco.MjData(model)
+    data.mocap_pos[:] = people
+    for qpos in motion:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
+    assert 0.005 < closest_m < 0.05  # near, so the check is not vacuous, and free
+
+
+def ghost_tips(model):
+    tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
+    model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
+
+
+def slippery_tips(model):
+    tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
+    model.geom_friction[tips] = (0.02, 0.001, 0.0001)
+
+
+@pytest.mark.parametrize("spoil", [ghost_tips, slippery_tips])
+@pytest.mark.parametrize("index", range(3))
+def test_only_friction_lifts(spoil, index):
+    """No weld, no teleport: fingers that pass through or slip leave the object there, and the human withdraws."""
+    world = PickWorld(FIXED)
+    spoil(world.model)
+    world.place((0, 0, 0, index), rng())
+    result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate, 0.0)
+    assert result.fault == f"the fingers closed and do not hold the {OBJECTS[index].name}"
+    assert world.read().macrostate[index] == 0
+    assert world.read().macrostate[3] == WITHDRAWN
+
+
+def test_what_is_dropped_is_a_fault_and_ends_the_episode():
+    env = gymnasium.make(SPEC.env_id).unwrapped
+    env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
+    slippery_tips(env._world.model)
+    _, reward, terminated, _, info = env.step(HAND_OVER)
+    env.close()
+    assert info["fault"]
+    assert "car" in info["fault_reason"] or "the scene reads" in info["fault_reason"]
+    assert (reward, terminated, info["success"]) == (-5.0, True, False)
+    assert info["macrostate"][3] == WITHDRAWN
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
+    """Wherever it lies then, the human does not take it for what they asked for."""
+    env = gymnasium.make(SPEC.env_id).unwrapped
+    env.reset(seed=0, options={"macrostate": (*(int(each == index) for each in range(3)), (index + 1) % 3)})
+    slippery_tips(env._world.model)
+    _, reward, terminated, _, info = env.step(index)
+    env.close()
+    assert info["fault"]
+    assert (reward, terminated, info["success"]) == (-5.0, True, False)
+    assert info["macrostate"][3] == WITHDRAWN
+
+
+def test_pushing_another_object_is_a_fault(world, monkeypatch):
+    world.place((0, 0, 0, 0), rng())
+    world.execute(0, (1, 0, 0, 1), 0.0)
+    place = world._executor.place
+
+    def clumsy(data, **arguments):
+        result = place(data, **arguments)
+        data.joint("cup_joint").qpos[0] += 0.007
+        return result
+
+    monkeypatch.setattr(world._executor, "place", clumsy)
+    assert world.execute(0, (0, 0, 0, 1), 0.0).fault == "the cup was pushed 7 mm by the way"
+
+
+def test_what_is_out_of_reach_is_a_fault(world):
+    world.place((0, 0, 0, 0), rng())
+    world.data.qpos[world._object_qpos[0][0]] = 1.4
+    world._update()
+    result = world.execute(0, (1, 0, 0, 1), 10.0)
+    assert "the ball is out of reach: The gripper cannot reach" in result.fault
+    assert result.qpos.shape == (0, world.model.nq)
+
+
+def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
+    """However the arm ended, the object keeps its pose in the gripper, and the arm is at its observation pose."""
+    world.place((0, 0, 0, 1), rng())
+    world.execute(1, (0, 1, 0, 0), 0.0)
+    row, tcp = world._object_qpos[1], world.model.site("tcp").id
+
+    def in_gripper():
+        mujoco.mj_kinematics(world.model, world.data)
+        turn = world.data.site_xmat[tcp].reshape(3, 3)
+        body = world.data.body("car").xmat.reshape(3, 3)
+        return turn.T @ (world.data.qpos[row[:3]] - world.data.site_xpos[tcp]), turn.T @ body
+
+    joint = int(world.model.joint("right_j1").qposadr[0])
+    before = in_gripper()
+    world.data.qpos[joint] += 0.01
+    carried = world.data.site_xpos[tcp].copy()
+    mujoco.mj_kinematics(world.model, world.data)
+    world.data.qpos[row[:3]] += world.data.site_xpos[tcp] - carried
+    tilted = in_gripper()
+    world._executor.rest(world.data, 1)
+    after = in_gripper()
+    np.testing.assert_allclose(after[0], tilted[0], atol=1e-12)
+    np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
+    assert not np.allclose(tilted[1], before[1], atol=1e-3)  # the arm really was elsewhere
+    assert world.data.qpos[joint] == c.OBSERVATION_QPOS_RAD[1]
+
+
+@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:8:2])
+def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
+    """In another world, after other actions and with velocities left over: the same bits, an object held included."""
+    one, other = PickWorld(FIXED), PickWorld(FIXED)
+    one.place(state, rng())
+    held = state.index(PICKED)
+    one.execute((held + 1) % 3, (*state[:3], state[3]), 0.0)  # reaches out in vain, with the object
+    start = one.data.qpos.copy(), one.data.mocap_pos.copy(), one.data.mocap_quat.copy()
+    one.execute(action, intended, 0.0)
+    other.place((0, 0, 0, 2), rng())
+    other.execute(2, (0, 0, 1, 3), 0.0)
+    other.data.qpos[:], other.data.mocap_pos[:], other.data.mocap_quat[:] = start
+    other.data.qvel[:], other.data.qacc_warmstart[:] = 0.3, 7.0
+    other._update()
+    other.execute(action, intended, 0.0)
+    np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
+    np.testing.assert_array_equal(one.data.ctrl, other.data.ctrl)
+
+
+def test_the_handed_over_object_rests_in_the_palm(world):
+    for index, spec in enumerate(OBJECTS):
+        state = tuple(1 if each == index else 0 for each in range(3))
+        world.place((*state, OPEN_PALM), rng())
+        world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM), 0.0)
+        before = world._poses()[index, :3]
+        assert math.dist(before[:2], PALM_M[:2]) < 0.015
+        assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)
+        for _ in range(300):
+            mujoco.mj_step(world.model, world.data)
+        assert np.abs(world._poses()[index, :3] - before).max() < 2e-3
+
+
+@pytest.mark.parametrize("seed", [83393, 3046])
+def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
+    """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
+    env = gymnasium.make("imagine_bench/PickPlace-v0", appearance="strong")
+    env.reset(seed=seed, options={"macrostate": (0, 1, 0, OPEN_PALM)})
+    data = env.unwrapped._world.data
+    before_m = data.mocap_pos.copy()
+    _, reward, terminated, _, info = env.step(HAND_OVER)
+    assert (reward, terminated, info["is_success"], info["fault"]) == (5.0, True, True, False)
+    assert np.array_equal(data.mocap_pos, before_m)
+    lies = data.qpos.copy()
+    *_, info = env.step(0)
+    assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
+    env.close()
+
+
+def test_unasked_render_arguments_are_refused():
+    with pytest.raises(
+        InvalidValueError, match=r"No macrostate \(1, 1, 0, 0\); give one of 19, such as \(0, 0, 0, 0\)"
+    ):
+        SPEC.render_macrostates(np.array([(1, 1, 0, 0)]), "clean", rng())
+
+
+def check_fidelity(actions):
+    found = measure_fidelity(SPEC, SPEC.targets, actions)
+    assert found.actions == actions
+    assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
+    assert found.other_objects_mm < SPEC.targets.other_objects_mm
+    assert np.percentile(found.error_mm, 99) < SPEC.targets.error_mm
+    assert len(found.error_mm) > actions / 10
+
+
+def test_random_macro_actions_end_as_the_rules_say():
+    check_fidelity(60)
+
+
+@pytest.mark.slow
+def test_a_thousand_random_macro_actions_end_as_the_rules_say():
+    check_fidelity(1000)
+
+
+# --- what the camera sees ----------------------------------------------------------------------------------------
+
+
+def pixels(frame, color):
+    """Pixels whose channels differ as those of a color do: ``"red"``, ``"green"`` or ``"blue"``."""
+    channel = ("red", "green", "blue").index(color)
+    others = [each for each in range(3) if each != channel]
+    return frame[..., channel].astype(int) - frame[..., others].max(axis=-1) > 80
+
+
+def test_the_frame_shows_each_object_where_it_is():
+    """In the row, left to right; at the bottom when it is held, then missing in the row; on the palm in the end."""
+    colors = ("blue", "red", "green")
+    frames = dict(zip(RULES.states, SPEC.render_macrostates(np.array(RULES.states), "clean", rng()), strict=True))
+    for state, frame in frames.items():
+        for index, color in enumerate(colors):
+            rows, columns = np.nonzero(pixels(frame, color))
+            if state[index] == 0:
+                assert 28 < rows.mean() < 40
+                assert abs(columns.mean() - (16, 32, 48)[index]) < 4
+            elif state[index] == 1:
+                assert rows.min() > 42
+                assert rows.max() == 63
+            else:
+                assert rows.max() < 20
+
+
+def test_every_macrostate_looks_different():
+    frames = SPEC.render_macrostates(np.array(RULES.states), "clean", rng()).astype(int)
+    for one in range(len(frames)):
+        for other in range(one):
+            assert (np.abs(frames[one] - frames[other]).max(axis=-1) > 40).sum() > 40
+
+
+def test_an_arm_that_holds_something_is_out_of_the_agent_s_frame(world):
+    world.place((0, 1, 0, 0), rng())
+    views = [View(camera=c.AGENT_CAMERA, groups=groups) for groups in ((0,), (0, 2))]
+    cameras = [Renderer(world.model, view) for view in views]
+    hidden, shown = (camera.frame(world.data) for camera in cameras)
+    for camera in cameras:
+        camera.close()
+    assert np.array_equal(hidden[:40], shown[:40])  # only the fingers beside what they hold would be seen
+
+
+# --- recordings --------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_shows_the_human_s_answer_after_the_motion():
+    env = gymnasium.make(SPEC.env_id).unwrapped
+    env.capture_motion_hz = 20.0
+    env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})
+    *_, info = env.step(1)
+    data, standing = env._world.data, env.agent_view()
+    fields = ("qpos", "mocap_pos", "mocap_quat", "xpos", "xquat")
+    before = {name: getattr(data, name).copy() for name in fields}
+    motion, film = env.motion(), env.film(64, 48)
+    assert all(np.array_equal(getattr(data, name), before[name]) for name in fields), "a film changes nothing"
+    assert np.array_equal(env.agent_view(), standing)
+    hand = motion.poses_in_world[:, motion.body_names.index("hand")]
+    car = motion.poses_in_world[:, motion.body_names.index("car")]
+    env.close()
+    assert info["macrostate"][3] != 1
+    assert np.array_equal(hand[:-1], np.repeat(hand[:1], len(hand) - 1, axis=0))
+    assert np.linalg.norm(hand[-1, :3] - hand[0, :3]) > 0.05
+    assert np.linalg.norm(car[-1, :3] - car[-2, :3]) < 0.002
+    assert (np.diff(motion.time_s) > 0).all()
+    assert len(film) == len(motion.time_s) - 1
