@@ -110,14 +110,13 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
         title="imagination",
-        description="DQN that also learns a model of its world and trains on transitions it imagines with it, all of "
-        "them.",
+        description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make_uncertainty",
         title="imagination + uncertainty",
-        description="The same, but an imagined transition is thrown away, with the rest of its rollout, where the "
-        "model is unsure.",
+        description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
+        "the model is uncertain.",
     ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
@@ -125,8 +124,7 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         title="factored",
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
-        "every future within reach, explores what is uncertain while it trains, and plans in its model when it is "
-        "tested.",
+        "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
@@ -142,25 +140,25 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 QR-DQN (pixels)",
-        description="The same library's QR-DQN, which learns the distribution of the return, on pixels.",
+        description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn",
         settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
         external_training_loop=True,
         title="SB3 DQN (latents)",
-        description="The same library's DQN on the latents that the suite's own DQN sees.",
+        description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
     ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         title="imagination only",
-        description="Explores like DQN and learns a model of its world on the side; a fresh controller that never "
-        "meets the world is trained in that model alone, and is what is tested.",
+        description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
+        "world is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
         title="imagination only + uncertainty",
-        description="The same, but an imagined episode ends where the model is unsure.",
+        description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
 }
 

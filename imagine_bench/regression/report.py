@@ -12,17 +12,17 @@ from imagine_bench.judge.calibration import LEVELS
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
-from imagine_bench.report.page import aligned, facts, flat
-from imagine_bench.report.sections import Picture, Section, Table, mean_std, number, picture
-from imagine_bench.report.template import render
+from imagine_bench.report.page import aligned, made, write_page
+from imagine_bench.report.plots import image
+from imagine_bench.report.sections import Image, Page, Section, Table, mean_std, number
 from imagine_bench.store.codec import table_text
-from imagine_bench.store.files import csv_text, make_folder, write_bytes
+from imagine_bench.store.files import csv_text
 
 _SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 
 def write_report(result: RegressionResult) -> Path:
-    """Write ``result.folder / "report"``: index.html, report.md, results.csv, one CSV a table, and the pictures.
+    """Write ``result.folder / "report"``: index.html, report.md, results.csv, one CSV a table, and the figures.
 
     Returns:
         The path of index.html.
@@ -30,35 +30,32 @@ def write_report(result: RegressionResult) -> Path:
     Raises:
         SetupError: The folder cannot be written.
     """
-    folder = make_folder(result.folder / "report")
-    sections = collect(result)
-    context = {
-        "result": result,
-        "spec": registry.regression(result.protocol.task),
-        "protocol": result.protocol,
-        "regressors": {agent: registry.regressor_entry(agent) for agent in result.protocol.agents},
-        "sections": sections,
-        "answers": [answer for section in sections for answer in section.answers],
-        "facts": facts(result),
-        "settings": {agent: flat("", result.of(agent)[0].settings) for agent in result.protocol.agents},
-        "recordings": [str(run.recording.relative_to(result.folder)) for run in result.runs if run.recording],
+    spec, protocol, sections = registry.regression(result.protocol.task), result.protocol, collect(result)
+    tables = {
+        f"{table.name}.csv": csv_text([table.header, *table.rows]) for section in sections for table in section.tables
     }
-    files = {f"{drawn.name}.png": drawn.png for section in sections for drawn in section.pictures}
-    tables = [table for section in sections for table in section.tables]
-    files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]).encode() for table in tables}
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
-    files["results.csv"] = table_text(rows).encode()
-    files["report.md"] = render("regression.md.j2", context).encode()
-    files["index.html"] = render("regression.html.j2", context).encode()
-    for name, content in files.items():
-        write_bytes(folder / name, content)
-    return folder / "index.html"
+    networks = f"{protocol.networks} network{'' if protocol.networks == 1 else 's'} a dataset"
+    page = Page(
+        title=f"{spec.title}: does the model know what it does not know?",
+        subtitle=f"Preset {protocol.preset} · {networks} · protocol {protocol.hash}",
+        question=spec.description,
+        answers=[answer for section in sections for answer in section.answers],
+        sections=[_compared(result), *sections],
+        files={"results.csv": table_text(rows), **tables},
+        **made(result, {agent: _title(agent) for agent in protocol.agents}),
+    )
+    return write_page(result.folder / "report", page)
 
 
 def summary_table(result: RegressionResult) -> str:
     """The task's first table, if there is one, and the short answer, as plain text."""
     own = _own(result)
-    table = [line for first in own[0].tables[:1] for line in aligned([list(first.header), *map(list, first.rows)])]
+    table = [
+        line
+        for first in own[0].tables[:1]
+        for line in aligned([list(first.header), *([str(cell) for cell in row] for row in first.rows)])
+    ]
     answers = [answer for section in own for answer in section.answers]
     return "\n".join([own[0].title, "", *table, *([""] if table else []), *answers])
 
@@ -66,6 +63,30 @@ def summary_table(result: RegressionResult) -> str:
 def collect(result: RegressionResult) -> list[Section]:
     """Every section: the task's own, then what all regression tasks have."""
     return [*_own(result), _calibration(result), _costs(result)]
+
+
+def _title(agent: str) -> str:
+    return registry.regressor_entry(agent).title
+
+
+def _compared(result: RegressionResult) -> Section:
+    """The models, and what their uncertainties mean."""
+    rows = [[_title(agent), registry.regressor_entry(agent).description] for agent in result.protocol.agents]
+    return Section(
+        title="What was compared",
+        words=(
+            "Every model is a Bayesian mixture density network: it predicts a mixture of Gaussians, and its weights "
+            "are uncertain, so that each weight sample predicts another mixture. The spread of their means is "
+            "epistemic uncertainty (too little data), the mean variance of the Gaussians is aleatoric (noise), the "
+            "spread of the Gaussians of one mixture is modal (several outcomes are possible); the three add up to the "
+            "whole predictive variance. Stationarity is a second epistemic measure: how much the predicted "
+            "distribution itself changes from weight sample to weight sample (Jensen-Shannon divergence, in nats). "
+            "Two more are about the one value that was predicted: the variance of the sampled component, the Gaussian "
+            "it was sampled from, noise and weights together; and its negative log-likelihood (nll) under all weight "
+            "samples.",
+        ),
+        tables=(Table(name="models", header=["model", "origin of its weight samples"], rows=rows, prose=True),),
+    )
 
 
 def _own(result: RegressionResult) -> list[Section]:
@@ -77,7 +98,7 @@ def _calibration(result: RegressionResult) -> Section:
     spec, protocol = registry.regression(result.protocol.task), result.protocol
     rows, detectors = [], []
     for agent in protocol.agents:
-        title = registry.regressor_entry(agent).title
+        title = _title(agent)
         for variant in protocol.variants:
             values = {name: result.values(agent, variant, name) for name in _MEASURES}
             for prefix, kind in (("", "predicts with"), ("pooled_", "all weight samples")):
@@ -100,12 +121,12 @@ def _calibration(result: RegressionResult) -> Section:
             "of the outcomes should hold 80 %; the probability integral transform should be uniform (its distance "
             "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better, "
             f"computed at the first {min(CRPS_POINTS, protocol.test_points)} of the points. "
-            "Two distributions are judged: the one predictions are drawn from, and all weight samples side by side.",
+            "Two distributions are judged: the one that predictions are sampled from, and all weight samples pooled.",
             f"A prediction is called wrong where its error, the {spec.error_name}, is above {spec.wrong_above:g}. The "
             "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
             "prediction has the higher uncertainty of two (AUROC; 0.5 is chance, 1 is perfect).",
         ),
-        pictures=(_coverage_picture(result),),
+        images=(_coverage_image(result),),
         tables=(
             Table(name="calibration", header=["", *levels, "PIT distance", "CRPS, mean (std)"], rows=rows),
             Table(
@@ -123,7 +144,7 @@ _MEASURES = tuple(
 )
 
 
-def _coverage_picture(result: RegressionResult) -> Picture:
+def _coverage_image(result: RegressionResult) -> Image:
     """Coverage of every central interval: the diagonal is calibration."""
 
     def draw() -> Figure:
@@ -133,7 +154,7 @@ def _coverage_picture(result: RegressionResult) -> Picture:
         for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
             axes.plot([0, 100], [0, 100], color="#8c8c8c", linewidth=1, linestyle=(0, (4, 3)))
             for shade, agent in zip(_SHADES, agents, strict=False):
-                title = registry.regressor_entry(agent).title
+                title = _title(agent)
                 for name, line, label in (
                     ("transform", "-", "predicts with"),
                     ("pooled_transform", ":", "all samples"),
@@ -148,13 +169,13 @@ def _coverage_picture(result: RegressionResult) -> Picture:
 
     alt = "Share of outcomes inside each central predictive interval, beside the diagonal of perfect calibration."
     caption = "Below the diagonal the network is surer than it may be, above it less sure than it could be."
-    return picture("coverage", draw, alt=alt, caption=caption)
+    return image("coverage", draw, alt=alt, caption=caption)
 
 
 def _costs(result: RegressionResult) -> Section:
     rows = [
         [
-            f"{registry.regressor_entry(agent).title}, {variant}",
+            f"{_title(agent)}, {variant}",
             number(float(result.values(agent, variant, "train_cpu_s").mean())),
             number(float(result.values(agent, variant, "measure_cpu_s").mean())),
         ]

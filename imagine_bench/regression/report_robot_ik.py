@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from imagine_bench import reference, registry, statistics
 from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
-from imagine_bench.report.sections import Picture, Section, Table, mean_std, picture
+from imagine_bench.report.plots import image
+from imagine_bench.report.sections import DASH, Image, Section, Table, mean_std
 from imagine_bench.report.text import few_words
 from imagine_bench.seeding import SeedTree
 
@@ -23,6 +24,7 @@ Pair = tuple[str, str]
 Ratios = dict[str, statistics.Estimate]
 """Error as a ratio to a random choice, by criterion."""
 _JOINTS = ("q1", "q2", "q3")
+_UNPRINTED = "not in the thesis"
 _KINDS = ("epistemic", "modal", "aleatoric")
 
 
@@ -94,7 +96,7 @@ def _decisions(result: RegressionResult) -> Section:
             cells = {name: rows[variant] for name, rows in printed.items() if variant in rows}
             errors.append([f"thesis, {variant}", *(_printed(cells, name) for name in columns)])
             chance = cells["random"][0]
-            shares = [f"{cells[name][0] / chance:.2f}" if name in cells else "" for name in SCORES]
+            shares = [f"{cells[name][0] / chance:.2f}" if name in cells else DASH for name in SCORES]
             ratios.append([f"thesis, {variant}", *shares])
     names = [name.replace("_", " ") for name in columns]
     return Section(
@@ -108,12 +110,13 @@ def _decisions(result: RegressionResult) -> Section:
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
             "is measured. Here no place outside of the workspace is asked for; the maps below show where it ends.",
         ),
-        pictures=(_ratio_picture(result, against),),
+        images=(_ratio_image(result, against),),
         tables=(
-            Table(name="table_4_1", header=["cumulated error (m)", *names], rows=errors),
+            Table(name="table_4_1", header=["cumulated error (m)", *names], rows=errors, why_dash=_UNPRINTED),
             Table(
                 name="ratio_to_random", header=["ratio to random", *(n.replace("_", " ") for n in SCORES)], rows=ratios,
                 caption="In brackets: 95 % interval over networks (bootstrap). Below 1 a criterion beats chance.",
+                why_dash=_UNPRINTED,
             ),
         ),
         answers=answers,
@@ -177,7 +180,7 @@ def _rows(
 
 
 def _printed(cells: dict[str, list[float]], criterion: str) -> str:
-    return f"{cells[criterion][0]:.2f} ({cells[criterion][1]:.2f})" if criterion in cells else ""
+    return f"{cells[criterion][0]:.2f} ({cells[criterion][1]:.2f})" if criterion in cells else DASH
 
 
 def _printed_ratio(printed: dict[str, dict[str, list[float]]], variant: str) -> str:
@@ -191,7 +194,7 @@ def _interval(estimate: statistics.Estimate) -> str:
     return value if np.isnan(estimate.low) else f"{value} [{estimate.low:.2f}, {estimate.high:.2f}]"
 
 
-def _ratio_picture(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Picture:
+def _ratio_image(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Image:
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
 
     def draw() -> Figure:
@@ -223,23 +226,23 @@ def _ratio_picture(result: RegressionResult, against: Mapping[Pair, Ratios]) -> 
         return figure
 
     alt = "Cumulated error of every criterion relative to a random choice, with intervals and the thesis' ratios."
-    return picture("ratio_to_random", draw, alt=alt, caption="Below 1 a criterion beats chance; bars: 95 % intervals.")
+    return image("ratio_to_random", draw, alt=alt, caption="Below 1 a criterion beats chance; bars: 95 % intervals.")
 
 
 def _maps(result: RegressionResult) -> Section:
     agents, variants = result.protocol.agents, result.protocol.variants
-    pictures = []
+    images = []
     for agent in agents:
         title = registry.regressor_entry(agent).title
         for variant in variants:
             name = f"{agent}_{variant}"
-            pictures.append(picture(
+            images.append(image(
                 f"figure_4_2_{name}", partial(figure_4_2, result, agent, variant),
                 alt="Places visited while babbling, error of reaching, and stationarity over the workspace.",
                 caption=f"{title}, {variant} samples (first network), after figure 4.2: where the arm's tip was while "
                 "babbling, how far it misses a place that it reaches for, and the stationarity score.",
             ))  # fmt: skip
-            pictures.append(picture(
+            images.append(image(
                 f"figure_4_3_{name}", partial(figure_4_3, result, agent, variant),
                 alt="Epistemic, modal and aleatoric uncertainty of each joint over the workspace.",
                 caption=f"{title}, {variant} samples (first network), after figure 4.3: standard deviation of each "
@@ -251,7 +254,7 @@ def _maps(result: RegressionResult) -> Section:
         f"{outside.max():.2f} m: nothing is asked of the arm there (white in the error map), and the uncertainties "
         "show what the networks would say of them."
     )
-    return Section(title="Figures 4.2 and 4.3: the workspace", words=(words,), pictures=pictures)
+    return Section(title="Figures 4.2 and 4.3: the workspace", words=(words,), images=images)
 
 
 def figure_4_2(result: RegressionResult, agent: str, variant: str) -> Figure:

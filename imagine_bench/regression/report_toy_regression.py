@@ -12,7 +12,8 @@ from scipy import stats
 
 from imagine_bench import registry
 from imagine_bench.regression.results import RegressionResult
-from imagine_bench.report.sections import Picture, Section, Table, number, picture
+from imagine_bench.report.plots import image
+from imagine_bench.report.sections import Image, Section, Table, number
 
 _REGION, _EDGE = (-10.0, 10.0), 30.0
 _SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00"}
@@ -44,7 +45,7 @@ def sections(result: RegressionResult) -> list[Section]:
         Section(
             title="Figure 4.1: what is uncertain, and why",
             words=("Shaded: yellow or orange where the datasets differ, red where the networks extrapolate.",),
-            pictures=[_figure_4_1(result, agent) for agent in result.protocol.agents],
+            images=[_figure_4_1(result, agent) for agent in result.protocol.agents],
         ),
         Section(
             title="Estimates against the truth",
@@ -158,14 +159,14 @@ def _against_truth(result: RegressionResult, agent: str) -> Table:
     return Table(name=f"truth_{agent}", header=header, rows=rows)
 
 
-def _figure_4_1(result: RegressionResult, agent: str) -> Picture:
+def _figure_4_1(result: RegressionResult, agent: str) -> Image:
     title = registry.regressor_entry(agent).title
     caption = (
         f"{title}, the first network of each dataset, after figure 4.1 of the thesis. Top: training data (gray) and "
         "predictions (blue). Below: standard deviation of each kind of uncertainty (blue) and its true value (black)."
     )
     alt = "Predictions and epistemic, modal and aleatoric uncertainty along x for three datasets, with true values."
-    return picture(f"figure_4_1_{agent}", lambda: figure_4_1(result, agent), alt=alt, caption=caption)
+    return image(f"figure_4_1_{agent}", lambda: figure_4_1(result, agent), alt=alt, caption=caption)
 
 
 def figure_4_1(result: RegressionResult, agent: str) -> Figure:

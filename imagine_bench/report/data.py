@@ -90,10 +90,10 @@ class FuturesSummary:
         pairs: Macrostates of play times macro-actions.
         samples: Futures of each pair.
         total_variation: Distance of imagined and exact distributions of macrostates.
-        by_chance: The same over the pairs after which several macrostates are possible; the others dilute it.
-        survival_probability: The same where the episode goes on until this macro-action, weighted by how likely that is.
-        floor: What as many samples of the exact distribution would show.
-        missing: Possible outcomes that are not imagined, all pairs together.
+        where_random: The same over the pairs after which several macrostates are possible; the others dilute it.
+        while_alive: The same where the episode goes on until this macro-action, weighted by how likely that is.
+        floor: What as many samples of the exact distribution would show (sampling noise).
+        missed: Possible outcomes that are not imagined, all pairs together.
         hallucinated: Imagined outcomes that are impossible, all pairs together.
         reward_error: Absolute error of the expected reward.
         termination_error: Absolute error of the probability that the episode is over.
@@ -103,10 +103,10 @@ class FuturesSummary:
     pairs: int
     samples: int
     total_variation: np.ndarray
-    by_chance: np.ndarray
-    survival_probability: np.ndarray
+    where_random: np.ndarray
+    while_alive: np.ndarray
     floor: np.ndarray
-    missing: np.ndarray
+    missed: np.ndarray
     hallucinated: np.ndarray
     reward_error: np.ndarray
     termination_error: np.ndarray
@@ -117,8 +117,9 @@ class FuturesSummary:
 class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
 
-    ``reached`` holds for each seed the first budget from which on success never falls below the task's ``success_threshold``, or
-    None.
+    ``reached`` holds for each seed the first budget from which on success never falls below the task's
+    ``success_threshold``, or None.
+    ``prices`` holds, for each budget, real macro-actions and CPU seconds of training until then, means over seeds.
     ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
     budget, divided by the budget: the mean success until then, with its interval over seeds.
     """
@@ -134,6 +135,7 @@ class ReportData:
     reached: dict[str, tuple[int | None, ...]]
     areas: dict[str, dict[int, statistics.Estimate]]
     timing: dict[str, Timing]
+    prices: dict[str, dict[int, tuple[float, float]]]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_gains: dict[str, dict[int, float]]
     thesis_source: str
@@ -145,9 +147,14 @@ class ReportData:
         return self.result.protocol.budgets
 
     @property
-    def imagining(self) -> tuple[str, ...]:
-        """Agents with open-loop results, in the protocol's order."""
-        return tuple(self.open_loop)
+    def decisive_budget(self) -> int:
+        """The budget at which the learners' scores lie furthest apart; the last of several such ones."""
+        return max(reversed(self.budgets), key=self.spread)
+
+    def spread(self, budget: int) -> float:
+        """How far the learners' scores lie apart at a budget, as a share."""
+        values = [self.scores[agent][budget].value for agent in self.areas]
+        return max(values, default=0.0) - min(values, default=0.0)
 
 
 def collect(result: BenchResult) -> ReportData:
@@ -170,6 +177,7 @@ def collect(result: BenchResult) -> ReportData:
         reached={agent: _reached(result.of(agent), spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
+        prices={agent: _prices(result.of(agent)) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_gains={agent: gains for agent, gains in thesis_gains.items() if gains},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
@@ -326,10 +334,10 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
         pairs=len(found[0].actions),
         samples=int(found[0].samples),
         total_variation=mean("total_variation"),
-        by_chance=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
-        survival_probability=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
+        where_random=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
+        while_alive=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
         floor=mean("sampling_noise_floor"),
-        missing=total("missed"),
+        missed=total("missed"),
         hallucinated=total("hallucinated"),
         reward_error=mean("reward_error"),
         termination_error=mean("termination_error"),
@@ -338,7 +346,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 
 
 def _nan_mean(table: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is known, boundless doubt included; NaN where nothing is."""
+    """Mean over the first axis of what is known, boundless uncertainty included; NaN where nothing is."""
     known = ~np.isnan(table)
     count = known.sum(axis=0)
     total = np.where(known, table, 0.0).sum(axis=0)
@@ -380,6 +388,12 @@ def _timing(runs: tuple[RunResult, ...], *, learns: bool) -> Timing:
         test_steps=round(sum(checkpoint.mean_length * checkpoint.test_episodes for checkpoint in tests)),
         faults=sum(checkpoint.faults for checkpoint in tests),
     )
+
+
+def _prices(runs: tuple[RunResult, ...]) -> dict[int, tuple[float, float]]:
+    costs = np.array([[(row.env_steps, row.train_cpu_s) for row in run.checkpoints] for run in runs])  # [runs, B, 2]
+    budgets = [row.episodes for row in runs[0].checkpoints]
+    return {budget: (float(steps), float(cpu_s)) for budget, (steps, cpu_s) in zip(budgets, costs.mean(0), strict=True)}
 
 
 def _learner_cpu_s(run: RunResult) -> float:

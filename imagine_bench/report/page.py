@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import base64
-import math
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import jinja2
 
-from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
-from imagine_bench.report import plots
-from imagine_bench.report import text as words
+from imagine_bench.report import plots, text
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
-from imagine_bench.report.encoder import encoder_views
-from imagine_bench.report.sections import Picture
-from imagine_bench.report.template import render
+from imagine_bench.report.sections import Page, Section, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, write_bytes
-from imagine_bench.store.results import BenchResult, ComparedRollout
-
-SHOWN_ROLLOUTS = 3
-"""Rollouts shown of each imagining agent: the first ones of its first seed."""
+from imagine_bench.store.results import BenchResult
 
 
 def write_report(result: BenchResult) -> Path:
-    """Write ``result.folder / "report"``: index.html, report.md, the CSV files and the pictures.
+    """Write ``result.folder / "report"``: index.html, report.md, the CSV files and the images.
 
     Everything comes from ``result`` (and the bundled encoder's card), so writing it again gives the same report.
 
@@ -36,48 +29,82 @@ def write_report(result: BenchResult) -> Path:
     Raises:
         SetupError: The folder cannot be written.
     """
-    folder = make_folder(result.folder / "report")
     data = collect(result)
-    drawn = plots.all_plots(data)
-    strips, sampled_rollouts = _strips(data), _courses(data)
-    seen_through = encoder_views(result)
-    shown = [(each, each.picture.read_bytes()) for each in seen_through if each.picture]
-    context = {
-        **_words(data),
-        "plots": {plot.name: plot for plot in drawn},
-        "strips": strips,
-        "sampled_rollouts": sampled_rollouts,
-        "encoders": seen_through,
-        "encoder_pictures": {each.identity: base64.b64encode(picture).decode() for each, picture in shown},
-    }
-    pictures: list[plots.Plot | Picture] = [*drawn, *strips, *sampled_rollouts]
-    files = {f"{each.name}.png": each.png for each in pictures}
-    files |= {each.file: picture for each, picture in shown}
-    files |= {name: text.encode() for name, text in archive_files(result).items()}
+    files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if data.open_loop:
-        files["open_loop.csv"] = open_loop_csv(result).encode()
-    files["summary.csv"] = summary_csv(data).encode()
+        files["open_loop.csv"] = open_loop_csv(result)
     if data.futures:
-        files["futures.csv"] = futures_csv(data).encode()
-    files["report.md"] = render("report.md.j2", context, **_NAMES).encode()
-    files["index.html"] = render("report.html.j2", context, **_NAMES).encode()
+        files["futures.csv"] = futures_csv(data)
+    protocol, agents = result.protocol, result.protocol.agents
+    page = Page(
+        title=f"{data.spec.title}: does imagination save real experience?",
+        subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.appearance}” · "
+        f"protocol {result.protocol_hash}",
+        question=text.question(data),
+        answers=text.answers(data),
+        sections=_sections(data),
+        files=files,
+        colors={agent_words(agent).title: plots.color(agent) for agent in agents},
+        **made(result, {agent: agent_words(agent).title for agent in agents}),
+    )
+    return write_page(result.folder / "report", page)
+
+
+def _sections(data: ReportData) -> list[Section]:
+    parts = [success.compared(data), success.success(data, _interval_words(data))]
+    if data.areas:
+        parts.append(success.area(data))
+    if data.comparisons:
+        parts.append(success.gain(data))
+    parts += imagination.sections(data)
+    if data.reached:
+        parts.append(success.threshold(data))
+    return [*parts, success.cost(data)]
+
+
+def write_page(folder: Path, page: Page) -> Path:
+    """Write a report: index.html, report.md, the page's CSV files and images.
+
+    Returns:
+        The path of index.html.
+
+    Raises:
+        SetupError: The folder cannot be written.
+    """
+    files = {name: content.encode() for name, content in page.files.items()}
+    files |= {f"{image.name}.png": image.png for section in page.sections for image in section.images}
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("imagine_bench.report"),
+        autoescape=lambda name: str(name).endswith(".html.j2"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["md"] = markdown_text
+    for name, template in (("report.md", "page.md.j2"), ("index.html", "page.html.j2")):
+        files[name] = environment.get_template(template).render(page=page).encode()
+    make_folder(folder)
     for name, content in files.items():
         write_bytes(folder / name, content)
     return folder / "index.html"
+
+
+def markdown_text(value: object) -> str:
+    """A text as Markdown shows it unchanged: in a line, its special characters escaped."""
+    return re.sub(r"([\\`*_<>|]|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
 
 
 def summary_table(result: BenchResult) -> str:
     """Success (%) of every agent at every budget as plain text, chance level, optimum and thesis beside them."""
     data = collect(result)
     protocol = result.protocol
-    header = ["real episodes", "chance", *(agent_words(agent).title for agent in protocol.agents), "optimum"]
-    rows = [header]
+    rows = [["real episodes", "chance", *(agent_words(agent).title for agent in protocol.agents), "optimum"]]
     for budget in data.budgets:
         cells = [score_text(data.scores[agent][budget]) for agent in protocol.agents]
         rows.append([f"{budget:,}", percent(data.facts.chance_level), *cells, percent(data.facts.optimum)])
         if any(budget in printed for printed in data.thesis.values()):
             rows.append(_thesis_row(data, budget, "  thesis"))
-    beyond = [budget for budget in _thesis_only(data) if budget > data.budgets[-1]]
+    beyond = [budget for budget in success.thesis_only(data) if budget > data.budgets[-1]]
     if beyond:
         rows.append(_thesis_row(data, beyond[0], f"thesis at {beyond[0]:,}"))
     title = (
@@ -85,12 +112,12 @@ def summary_table(result: BenchResult) -> str:
         f"{protocol.execution}, {protocol.appearance}, {len(protocol.seeds)} seed(s) x "
         f"{protocol.evaluation_episodes} test episodes"
     )
-    return "\n".join([title, "", *aligned(rows), "", *words.answers(data)])
+    return "\n".join([title, "", *aligned(rows), "", *text.answers(data)])
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
     cells = [
-        _thesis_text(data.thesis[agent][budget]) if budget in data.thesis.get(agent, {}) else ""
+        success.thesis_text(data.thesis[agent][budget]) if budget in data.thesis.get(agent, {}) else ""
         for agent in data.result.protocol.agents
     ]
     return [name, "", *cells, ""]
@@ -106,61 +133,33 @@ def aligned(rows: list[list[str]]) -> list[str]:
     return [lines[0], "-" * max(len(line) for line in lines), *lines[1:]]
 
 
-def _words(data: ReportData) -> dict[str, Any]:
-    """What both templates share."""
-    protocol = data.result.protocol
-    return {
-        "data": data,
-        "protocol": protocol,
-        "question": words.question(data),
-        "answers": words.answers(data),
-        "interval_words": _interval_words(data),
-        "thesis_only": _thesis_only(data),
-        "seed_index": {seed: index for index, seed in enumerate(protocol.seeds)},
-        "facts": facts(data.result),
-        "settings": {agent: rows for agent in protocol.agents if (rows := _settings(data.result, agent))},
-        "recordings": [_relative(run.recording, data.result.folder) for run in data.result.runs if run.recording],
-    }
-
-
 def _interval_words(data: ReportData) -> str:
     if len(data.result.protocol.seeds) == 1:
         return "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     return "95 % interval over seeds (bootstrap), given the test episodes, which are the same for every agent"
 
 
-def _thesis_only(data: ReportData) -> list[int]:
-    """Budgets of the thesis that this run does not have, ascending."""
-    return sorted({budget for printed in data.thesis.values() for budget in printed} - set(data.budgets))
+def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
+    """How a result of any kind was made: the fields ``facts``, ``settings``, ``protocol`` and ``recordings`` of a Page.
 
-
-def _thesis_text(printed: tuple[float, float]) -> str:
-    mean, std = printed
-    return percent(mean) if math.isnan(std) else f"{percent(mean)} ({percent(std)})"
-
-
-def _seconds(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:,.1f}"
-
-
-def facts(result: Any) -> list[tuple[str, str]]:
-    """How a result of any kind was made, name and value, nested values joined by a dot."""
-    protocol = result.protocol
-    rows = [
-        ("protocol", f"{result.protocol_hash}, preset {protocol.preset}"),
-        ("seeds", ", ".join(str(seed) for seed in protocol.seeds)),
-        *flat("", result.environment),
-    ]
-    commit = result.environment.get("commit")
-    command = result.environment.get("command", "")
-    where = f"git checkout {str(commit).split('+')[0]} && " if commit else ""
-    rows.append(("reproduce", f"{where}{command}"))
-    return rows
-
-
-def _settings(result: BenchResult, agent: str) -> list[tuple[str, str]]:
-    """An agent's settings as run, by dotted name; the protocol gives all its seeds the same."""
-    return flat("", result.of(agent)[0].settings)
+    Args:
+        result: What a bench measured.
+        titles: Title of each of its learners. All seeds of one have the same settings.
+    """
+    protocol, environment = result.protocol, result.environment
+    where = f"git checkout {str(environment['commit']).split('+')[0]} && " if environment.get("commit") else ""
+    paths = [run.recording for run in result.runs if run.recording]
+    return {
+        "facts": [
+            ("protocol", f"{result.protocol_hash}, preset {protocol.preset}"),
+            ("seeds", ", ".join(str(seed) for seed in protocol.seeds)),
+            *flat("", environment),
+            ("reproduce", f"{where}{environment.get('command', '')}"),
+        ],
+        "settings": {title: rows for name, title in titles.items() if (rows := flat("", result.of(name)[0].settings))},
+        "protocol": [(name, str(value)) for name, value in protocol.as_dict().items()],
+        "recordings": [str(p.relative_to(result.folder) if p.is_relative_to(result.folder) else p) for p in paths],
+    }
 
 
 def flat(prefix: str, value: Any) -> list[tuple[str, str]]:
@@ -172,65 +171,3 @@ def flat(prefix: str, value: Any) -> list[tuple[str, str]]:
     if isinstance(value, list | tuple):
         return [(prefix, "; ".join(str(item) for item in value))]
     return [(prefix, str(value))]
-
-
-def _strips(data: ReportData) -> list[Picture]:
-    strips = []
-    for agent in data.result.protocol.agents:
-        run = data.result.of(agent)[0]
-        for index, compared in enumerate(run.imagined[:SHOWN_ROLLOUTS]):
-            strips.append(_strip(data, agent, run.seed, index, compared))
-    return strips
-
-
-def _strip(data: ReportData, agent: str, seed: int, index: int, compared: ComparedRollout) -> Picture:
-    title = agent_words(agent).title
-    alive = np.concatenate([[True], ~compared.real_terminated[:-1]])  # imagined after the real end: nothing to match
-    matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1) & alive
-    depth, cut = int(alive.sum()), first_cut(compared)
-    kept = "nothing is cut" if cut is None else f"the filter cuts before macro-action {cut + 1}"
-    caption = (
-        f"{title[:1].upper()}{title[1:]}, seed {seed}, start {index + 1}: {int(matches.sum())} of {depth} imagined "
-        f"macrostates are what the rules say; {kept}."
-    )
-    return Picture(
-        name=f"rollout_{agent}_{index + 1}",
-        png=png(filmstrip(compared, data.spec.action_names)),
-        alt=f"Real frames above, imagined frames below. {caption}",
-        caption=caption,
-    )
-
-
-def _courses(data: ReportData) -> list[Picture]:
-    """One sheet an agent: several imagined sampled_rollouts of one beginning, of its first seed."""
-    sheets = []
-    for agent in data.result.protocol.agents:
-        run = data.result.of(agent)[0]
-        if run.sampled_rollouts:
-            title = agent_words(agent).title
-            caption = (
-                f"{title[:1].upper()}{title[1:]}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
-            )
-            sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
-            alt = f"Only the first picture is real. {caption}"
-            sheets.append(Picture(name=f"courses_{agent}", png=sheet, alt=alt, caption=caption))
-    return sheets
-
-
-def _relative(path: Path, folder: Path) -> str:
-    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-
-
-_NAMES = {
-    "percent": percent,
-    "signed": words.signed_percent,
-    "estimate": words.estimate_text,
-    "score_text": score_text,
-    "thesis_text": _thesis_text,
-    "seconds": _seconds,
-    "lasting": words.lasting,
-    "area_text": words.area_text,
-    "words": agent_words,
-    "color": plots.color,
-}
-"""What the templates call."""

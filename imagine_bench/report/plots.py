@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import matplotlib as mpl
 import numpy as np
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData
+from imagine_bench.report.sections import Image
 from imagine_bench.report.text import agent_words
 
 _INK = "#2b2b2f"  # in the SVG this becomes the page's own text color
@@ -25,6 +25,7 @@ _COLORS = (
     "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
     "#44aa99", "#aa4499", "#117733",
 )  # fmt: skip
+Value = TypeVar("Value")
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",
@@ -58,42 +59,40 @@ _KINDS = (("epistemic", "-"), ("aleatoric", "--"), ("modal", ":"))
 _THESIS_LINE: dict[str, Any] = {
     "marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0,
 }  # fmt: skip
-_LEADER: dict[str, Any] = {"arrowstyle": "-", "linewidth": 0.7, "alpha": 0.45, "linestyle": (0, (1, 2))}
+_LEADER: dict[str, Any] = {
+    "arrowstyle": "-",
+    "linewidth": 0.6,
+    "color": "#8c8c8c",
+    "shrinkA": 2,
+    "shrinkB": 0,
+    "relpos": (0, 0.5),
+}
+_THESIS_REACH = 2.0
+"""The thesis' points are drawn up to so many times the last budget: farther ones would leave the run's own no room."""
 _REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plot:
-    """A finished plot.
+def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg: bool = False, dpi: int = 150) -> Image:
+    """Draw a figure in the style of all reports, once for each format.
 
-    Attributes:
+    Args:
         name: File name without ending.
-        svg: Inline SVG whose text and axes take the page's color.
-        png: The same on white, 2x.
+        draw: Makes the figure.
         alt: What a reader who does not see it should know.
+        caption: The text below it.
+        svg: Whether the page shows it as inline SVG, which takes the page's color; without, as PNG.
+        dpi: Pixels an inch of the PNG.
     """
-
-    name: str
-    svg: str
-    png: bytes
-    alt: str
-
-
-def all_plots(data: ReportData) -> list[Plot]:
-    """Success against real episodes; gain where the thesis has one; acceptance, open-loop error and futures if any."""
-    plots = [_render("success", success_figure, data, "Success of each agent against real training episodes.")]
-    if set(data.thesis_gains) & set(data.comparisons):
-        plots.append(_render("gain", gain_figure, data, "Gain over DQN against real training episodes."))
-    if data.acceptance:
-        alt = "Share of imagined transitions kept, by real training episodes."
-        plots.append(_render("acceptance", acceptance_figure, data, alt))
-    if any(len(loop.correct) > 1 for loop in data.open_loop.values()):  # one depth is a table, not a curve
-        alt = "Open-loop quality of imagination by depth: correct share, errors, uncertainties."
-        plots.append(_render("open_loop", open_loop_figure, data, alt))
-    if data.futures:
-        alt = "Imagined against exact distributions of outcomes: total variation, missing and hallucinated outcomes."
-        plots.append(_render("futures", futures_figure, data, alt))
-    return plots
+    with mpl.rc_context(STYLE):
+        figure = draw()
+        FigureCanvasAgg(figure).draw()
+        figure.set_layout_engine("none")  # laid out once, for both files
+        vector, png = io.StringIO(), io.BytesIO()
+        if svg:
+            figure.savefig(vector, format="svg", metadata={"Date": None})
+        figure.savefig(png, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+    inline = _inline(vector.getvalue(), name, alt) if svg else ""
+    return Image(name=name, png=png.getvalue(), alt=alt, caption=caption, svg=inline)
 
 
 def color(agent: str) -> str:
@@ -113,10 +112,9 @@ def success_figure(data: ReportData) -> Figure:
         values = np.array([[scores[b].value, scores[b].low, scores[b].high] for b in data.budgets]) * 100.0
         axes.plot(budgets, values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
         axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
-    _thesis_points(axes, data)
-    _success_legend(axes, data)
+    _success_legend(axes, data, thesis=_thesis_points(axes, data))
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
-    last = {agent: (budgets[-1], 100.0 * scores[budgets[-1]].value) for agent, scores in data.scores.items()}
+    last = {agent: 100.0 * scores[data.budgets[-1]].value for agent, scores in data.scores.items()}
     _end_labels(axes, last, _episodes_axis(axes, data))
     return figure
 
@@ -129,15 +127,16 @@ def gain_figure(data: ReportData) -> Figure:
     figure = Figure(figsize=(9.2, 3.6), layout="constrained")
     axes = figure.add_subplot()
     axes.axhline(0.0, **_REFERENCE_LINE)
-    last: dict[str, tuple[float, float]] = {}
-    for agent, printed in data.thesis_gains.items():
+    last: dict[str, float] = {}
+    for agent, every in data.thesis_gains.items():
+        printed = near(data, every)
         axes.plot(list(printed), 100.0 * np.array(list(printed.values())), color=color(agent), **_THESIS_LINE)
         gains = {budget: row.gain for budget, row in data.comparisons[agent].items() if np.isfinite(row.gain.value)}
         if gains:
             values = 100.0 * np.array([(gain.value, gain.low, gain.high) for gain in gains.values()])
             axes.plot(list(gains), values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
             axes.fill_between(list(gains), values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
-            last[agent] = (max(gains), values[-1, 0])
+            last[agent] = values[-1, 0]
     axes.set(ylabel="gain over DQN (%)")
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     axes.plot([], [], color=_INK, label="thesis", **_THESIS_LINE)
@@ -155,71 +154,95 @@ def acceptance_figure(data: ReportData) -> Figure:
             list(rates), [100.0 * rate for rate in rates.values()], color=color(agent), marker="o", markersize=4.5
         )
     axes.set(xlabel="real training episodes", ylabel="transitions kept (%)", ylim=(-3, 106))
-    last = {agent: (max(rates), 100.0 * rates[max(rates)]) for agent, rates in data.acceptance.items()}
-    _end_labels(axes, last, max(end for end, _ in last.values()))
+    last = {agent: 100.0 * rates[max(rates)] for agent, rates in data.acceptance.items()}
+    _end_labels(axes, last, max(max(rates) for rates in data.acceptance.values()))
     axes.set_xlim(left=0)
     return figure
 
 
 def open_loop_figure(data: ReportData) -> Figure:
     """Four panels by imagined depth: correct share, reward error, termination error, uncertainties."""
-    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
-    grid = figure.subplots(2, 2)
-    panels: list[Axes] = list(grid.ravel())
+    figure, panels = _four_panels()
+    filtered = False
     for agent, loop in data.open_loop.items():
         depth = np.arange(1, len(loop.correct) + 1)
         style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
-        title = agent_words(agent).title
-        panels[0].plot(depth, 100.0 * loop.correct, label=title, **style)
+        panels[0].plot(depth, 100.0 * loop.correct, label=agent_words(agent).title, **style)
         if np.isfinite(loop.correct_accepted).any() and (loop.accepted < 1.0).any():
-            label = f"{title}, kept by the filter"
-            panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", label=label, **style)
-        panels[1].plot(depth, loop.reward_mae, label=title, **style)
-        panels[2].plot(depth, 100.0 * loop.termination_error, label=title, **style)
+            panels[0].plot(depth, 100.0 * loop.correct_accepted, linestyle="--", **style)
+            filtered = True
+        panels[1].plot(depth, loop.reward_mae, **style)
+        panels[2].plot(depth, 100.0 * loop.termination_error, **style)
         for name, line in _KINDS:
             if getattr(loop, name).any():  # an agent that knows no such kind says 0
                 panels[3].plot(depth, getattr(loop, name), linestyle=line, color=color(agent))
-    for name, line in _KINDS:
-        panels[3].plot([], [], linestyle=line, label=name, color=_INK)
+    _agents_legend(figure, panels[0])
+    _lines_legend(panels[0], {"kept by the filter": "--"} if filtered else {})
+    _lines_legend(panels[3], dict(_KINDS))
     panels[0].set(title="Macrostate as the rules say", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error", ylim=(0, None))
+    panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error")
+    _from_zero(panels[1])
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    measure = "variance of latents" + ("\n(“imagine”: probability)" if "factored" in data.open_loop else "")
+    measure = "variance of latents" + ("\n(“factored”: probability)" if "factored" in data.open_loop else "")
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")
-        axes.legend(fontsize=8, loc="best")
     return figure
 
 
 def futures_figure(data: ReportData) -> Figure:
-    """Four panels: total variation by depth and by real episodes, missing and hallucinated outcomes by depth."""
-    figure = Figure(figsize=(9.2, 6.6), layout="constrained")
-    panels: list[Axes] = list(figure.subplots(2, 2).ravel())
+    """Four panels: total variation by depth and by real episodes, missed and hallucinated outcomes by depth."""
+    figure, panels = _four_panels()
     for agent, found in data.futures.items():
         depth = np.arange(1, len(found.floor) + 1)
         style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
-        title = agent_words(agent).title
-        panels[0].plot(depth, found.total_variation, label=title, **style)
-        panels[0].plot(depth, found.by_chance, linestyle="--", **style)
-        budgets = list(found.by_budget)
-        panels[1].plot(budgets, [first for first, _ in found.by_budget.values()], label=title, **style)
-        deepest = [last for _, last in found.by_budget.values()]
-        panels[1].plot(budgets, deepest, linestyle="--", **style)
-        panels[2].plot(depth, found.missing / found.pairs, label=title, **style)
-        panels[3].plot(depth, found.hallucinated / found.pairs, label=title, **style)
+        panels[0].plot(depth, found.total_variation, label=agent_words(agent).title, **style)
+        panels[0].plot(depth, found.where_random, linestyle="--", **style)
+        budgets, pairs = list(found.by_budget), np.array(list(found.by_budget.values()))  # [B, 2]
+        panels[1].plot(budgets, pairs[:, 0], **style)
+        panels[1].plot(budgets, pairs[:, 1], linestyle="--", **style)
+        panels[2].plot(depth, found.missed / found.pairs, **style)
+        panels[3].plot(depth, found.hallucinated / found.pairs, **style)
     floor = next(iter(data.futures.values())).floor
-    panels[0].plot([], [], linestyle="--", color=_INK, label="where several are possible")
-    panels[0].plot(np.arange(1, len(floor) + 1), floor, label="samples of the truth", **_REFERENCE_LINE)
-    panels[1].plot([], [], linestyle="--", color=_INK, label=f"depth {len(floor)}")
-    panels[0].set(title="Distance from the exact distribution", ylabel="total variation", ylim=(0, None))
-    panels[1].set(title="The same while learning, depth 1", ylabel="total variation", ylim=(0, None))
-    panels[2].set(title="Possible, but not imagined", ylabel="outcomes a beginning", ylim=(0, None))
-    panels[3].set(title="Imagined, but impossible", ylabel="outcomes a beginning", ylim=(0, None))
+    _agents_legend(figure, panels[0])
+    panels[0].plot(np.arange(1, len(floor) + 1), floor, label="sampling noise", **_REFERENCE_LINE)
+    _lines_legend(panels[0], {"where several are possible": "--"})
+    _lines_legend(panels[1], {"depth 1": "-", f"depth {len(floor)}": "--"})
+    panels[0].set(title="Distance from the exact distribution", ylabel="total variation")
+    panels[1].set(title="The same while learning", ylabel="total variation")
+    panels[2].set(title="Missed: possible, not imagined", ylabel="outcomes a start")
+    panels[3].set(title="Hallucinated: imagined, impossible", ylabel="outcomes a start")
     for index, axes in enumerate(panels):
+        _from_zero(axes)
         axes.set_xlabel("real training episodes" if index == 1 else "imagined depth (macro-actions)")
-        axes.legend(fontsize=8, loc="best")
     return figure
+
+
+def _four_panels() -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(9.2, 7.0), layout="constrained")
+    return figure, list(figure.subplots(2, 2).ravel())
+
+
+def _agents_legend(figure: Figure, axes: Axes) -> None:
+    """The agents below all panels, where they hide nothing."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    for line in axes.get_lines():
+        line.set_label("_")  # said
+
+
+def _lines_legend(axes: Axes, styles: Mapping[str, str]) -> None:
+    """The meaning of each kind of line in one panel."""
+    for label, line in styles.items():
+        axes.plot([], [], linestyle=line, color=_INK, label=label)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, loc="best")
+
+
+def _from_zero(axes: Axes) -> None:
+    """Begin just below zero, so that a line of zeros is seen whole."""
+    values = [np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()]
+    highest = max((float(array[np.isfinite(array)].max(initial=0.0)) for array in values), default=0.0) or 1.0
+    axes.set_ylim(-0.04 * highest, 1.08 * highest)
 
 
 def _log_if_positive(data: ReportData) -> str:
@@ -230,7 +253,7 @@ def _log_if_positive(data: ReportData) -> str:
 
 def _episodes_axis(axes: Axes, data: ReportData) -> int:
     """A logarithmic axis of real episodes, which ends at the budget that is returned."""
-    printed = sorted({budget for rows in data.thesis.values() for budget in rows})
+    printed = sorted({budget for rows in data.thesis.values() for budget in near(data, rows)})
     ticks = sorted({*data.budgets, *printed[:1], *printed[-1:]})  # more would overlap
     axes.set_xscale("log")
     axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], rotation=45, ha="right")
@@ -239,51 +262,56 @@ def _episodes_axis(axes: Axes, data: ReportData) -> int:
     return ticks[-1]
 
 
-def _thesis_points(axes: Axes, data: ReportData) -> None:
-    for agent, rows in data.thesis.items():
-        episodes = np.array(list(rows))
+def near(data: ReportData, printed: Mapping[int, Value]) -> dict[int, Value]:
+    """Those of the thesis' values that stand near the budgets of this run."""
+    return {budget: value for budget, value in printed.items() if budget <= _THESIS_REACH * data.budgets[-1]}
+
+
+def _thesis_points(axes: Axes, data: ReportData) -> bool:
+    """Draw them; whether there are any."""
+    shown = {agent: rows for agent, printed in data.thesis.items() if (rows := near(data, printed))}
+    for agent, rows in shown.items():
         means, stds = 100.0 * np.array(list(rows.values())).T
-        axes.errorbar(*(episodes, means, stds), color=color(agent), elinewidth=0.8, capsize=2, zorder=2, **_THESIS_LINE)
+        axes.errorbar(list(rows), means, stds, color=color(agent), elinewidth=0.8, capsize=2, zorder=2, **_THESIS_LINE)
+    return bool(shown)
 
 
-def _success_legend(axes: Axes, data: ReportData) -> None:
-    """What the kinds of line mean; which agent a color is, the right margin says."""
+def _success_legend(axes: Axes, data: ReportData, *, thesis: bool) -> None:
+    """The meaning of each kind of line; which agent a color is, the right margin says."""
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
-    if data.thesis:
+    if thesis:
         axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **_THESIS_LINE)
     levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
     axes.plot([], [], label=levels, **_REFERENCE_LINE)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)
 
 
-def _end_labels(axes: Axes, last: Mapping[str, tuple[float, float]], to_x: float) -> None:
-    """Name each line in the right margin, spread so that no two names overlap, with a thin leader to its last point."""
+def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
+    """Name each line in the right margin, spread so that no two names overlap.
+
+    A gray line joins a name to the value at which its curve ends. It stays in the margin, where no curve is.
+    """
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
-    placed: dict[str, float] = {}
-    floor = -np.inf
-    for agent, (_, value) in sorted(last.items(), key=lambda item: item[1][1]):
-        floor = max(value, floor + step)
-        placed[agent] = floor
-    excess = max(0.0, floor - high)
-    for agent, y in placed.items():
+    names = sorted(last, key=lambda agent: last[agent])
+    places = _spread([last[agent] for agent in names], step, top=high)
+    for agent, y in zip(names, places, strict=True):
         axes.annotate(
-            agent_words(agent).title, xy=last[agent], xycoords="data", xytext=(1.02, y - excess),
+            agent_words(agent).title, xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
             textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
-            arrowprops={**_LEADER, "color": color(agent)},
+            arrowprops=_LEADER,
         )  # fmt: skip
     axes.set_xlim(right=to_x * 1.04)
 
 
-def _render(name: str, draw: Callable[[ReportData], Figure], data: ReportData, alt: str) -> Plot:
-    with mpl.rc_context(STYLE):
-        figure = draw(data)
-        FigureCanvasAgg(figure).draw()
-        figure.set_layout_engine("none")  # laid out once, for both files
-        svg, png = io.StringIO(), io.BytesIO()
-        figure.savefig(svg, format="svg", metadata={"Date": None})
-        figure.savefig(png, format="png", dpi=180, facecolor="white", metadata={"Software": None})
-    return Plot(name=name, svg=_inline(svg.getvalue(), name, alt), png=png.getvalue(), alt=alt)
+def _spread(values: Sequence[float], step: float, *, top: float) -> list[float]:
+    """Ascending values moved as little as it takes to lie ``step`` apart, none above ``top``."""
+    places: list[float] = []
+    for value in values:
+        places.append(max(value, places[-1] + step) if places else value)
+    for index in reversed(range(len(places))):
+        places[index] = min(places[index], top - step * (len(places) - 1 - index))
+    return places
 
 
 def _inline(svg: str, name: str, alt: str) -> str:

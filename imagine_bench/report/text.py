@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from imagine_bench import registry, statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
+from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate
 
 FEW_SEEDS = 5
@@ -18,65 +19,15 @@ _NAMED = 4
 """Missing runs that are named; the others are counted."""
 
 
-@dataclass(frozen=True)
-class AgentWords:
-    """How an agent is introduced.
-
-    Attributes:
-        title: For headings, legends and tables.
-        description: One sentence for a reader who knows none of this.
-    """
+class AgentWords(NamedTuple):
+    """How an agent is introduced."""
 
     title: str
     description: str
 
 
-_AGENTS = {
-    "random": AgentWords("random", "Picks every macro-action by chance: the floor."),
-    "oracle": AgentWords(
-        "oracle", "Is shown the true state and the rules and acts optimally: the ceiling, no learner."
-    ),
-    "dqn": AgentWords(
-        "DQN", "Learns the value of each macro-action from real experience only (deep Q-learning): the baseline."
-    ),
-    "imagination": AgentWords(
-        "imagination",
-        "DQN that also learns a model of its world and practises on transitions it imagines with it, all of them.",
-    ),
-    "imagination_uncertainty": AgentWords(
-        "imagination + uncertainty",
-        "The same, but an imagined transition is thrown away, with the rest of its rollout, where the model is unsure.",
-    ),
-    "factored": AgentWords(
-        "factored",
-        "Sees discrete parts, learns which of them an action changes and what is rewarded, imagines every future "
-        "within reach, goes where it is in doubt while it trains, and plans in its model when it is tested.",
-    ),
-    "sb3_dqn": AgentWords(
-        "SB3 DQN (pixels)", "Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop."
-    ),
-    "sb3_qrdqn": AgentWords(
-        "SB3 QR-DQN (pixels)", "The same library's QR-DQN, which learns the distribution of the return, on pixels."
-    ),
-    "sb3_dqn_latents": AgentWords(
-        "SB3 DQN (latents)", "The same library's DQN on the latents that the suite's own DQN sees."
-    ),
-    "imagination_only": AgentWords(
-        "imagination only",
-        "Explores like DQN and learns a model of its world on the side; a fresh controller that never meets the world "
-        "is trained in that model alone, and is what is tested.",
-    ),
-    "imagination_only_uncertainty": AgentWords(
-        "imagination only + uncertainty",
-        "The same, but an imagined episode ends where the model is unsure.",
-    ),
-}
-
-
 def agent_words(agent: str) -> AgentWords:
-    """Title and description of an agent; one that is not known here has those of its registry line."""
-    if agent in _AGENTS:
-        return _AGENTS[agent]
+    """Title and description of an agent from its registry line; of one that is not registered, its name alone."""
     entry = registry.agents().get(agent)
     spoken = agent.replace("_", " ")
     return AgentWords(spoken, "") if entry is None else AgentWords(entry.title or spoken, entry.description)
@@ -86,7 +37,7 @@ def lasting(budgets: Sequence[int | None]) -> str:
     """Mean number of episodes; where some seeds never got there, how many did."""
     there = [budget for budget in budgets if budget is not None]
     if len(there) < len(budgets):
-        return f"– ({len(there)} of {len(budgets)} seeds)"
+        return f"{DASH} ({len(there)} of {len(budgets)} seeds)"
     return f"{sum(there) / len(there):.0f}"
 
 
@@ -96,19 +47,19 @@ def origin(facts: Mapping[str, object]) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as an en dash."""
-    return "–" if math.isnan(share) else f"{100.0 * share:.1f}"
+    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as a dash."""
+    return DASH if math.isnan(share) else f"{100.0 * share:.1f}"
 
 
 def signed_percent(share: float) -> str:
     """Like :func:`percent` with a sign, the minus a true one."""
-    return "–" if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+    return DASH if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
 
 
 def mean_text(values: Sequence[float], rng: np.random.Generator, words: Callable[[float], str] = percent) -> str:
     """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
     if any(math.isnan(value) for value in values):
-        return "–"
+        return DASH
     mean = words(float(np.mean(values)))
     if len(values) == 1:
         return mean
@@ -116,23 +67,26 @@ def mean_text(values: Sequence[float], rng: np.random.Generator, words: Callable
     return f"{mean} [{words(low)}, {words(high)}]"
 
 
-def score_text(score: Score) -> str:
-    """``61.3 [55.0, 67.2]``."""
-    return f"{percent(score.value)} [{percent(score.low)}, {percent(score.high)}]"
+def interval_text(low: float, high: float, words: Callable[[float], str] = percent) -> str:
+    """``[55.0, 67.2]``; empty where there is no interval: one seed, or a boundless gain."""
+    return "" if math.isnan(low) else f"[{words(low)}, {words(high)}]"
+
+
+def score_text(score: Score | Estimate) -> str:
+    """``61.3 [55.0, 67.2]``, or without the brackets where there is no interval."""
+    return f"{percent(score.value)} {interval_text(score.low, score.high)}".strip()
 
 
 def estimate_text(estimate: Estimate) -> str:
-    """``+6.3 [−2.0, +14.1]``, or without the brackets where there is no interval: one seed, or a boundless gain."""
-    if math.isnan(estimate.low):
-        return signed_percent(estimate.value)
-    return f"{signed_percent(estimate.value)} [{signed_percent(estimate.low)}, {signed_percent(estimate.high)}]"
+    """``+6.3 [−2.0, +14.1]``, or without the brackets where there is no interval."""
+    return f"{signed_percent(estimate.value)} {interval_text(estimate.low, estimate.high, signed_percent)}".strip()
 
 
 def question(data: ReportData) -> str:
     """What was asked."""
     protocol = data.result.protocol
     return (
-        f"Does imagination, practising on the predictions of a learned model of the world, let a robot master "
+        "Does imagination, training on transitions that a learned world model predicts, let a robot solve "
         f"“{data.spec.title}” with less real experience? {_count(len(protocol.agents), 'agent')} "
         f"{'was' if len(protocol.agents) == 1 else 'were'} trained from {_count(len(protocol.seeds), 'seed')} for up "
         f"to {protocol.budgets[-1]:,} real episodes and tested, without exploring, on {protocol.evaluation_episodes:,} "
@@ -142,11 +96,12 @@ def question(data: ReportData) -> str:
 
 def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
-    budget = data.budgets[-1]
+    budget = data.decisive_budget
     sentences = [_unfinished(data)] if data.result.missing else []
     if BASE_AGENT in data.scores:
+        where = ", where the learners differ most," if data.spread(budget) > 0 and len(data.budgets) > 1 else ""
         sentences.append(
-            f"After {budget:,} real episodes DQN, which learns from real experience only, solves "
+            f"After {budget:,} real episodes{where} DQN, which learns from real experience only, solves "
             f"{percent(data.scores[BASE_AGENT][budget].value)}\u00a0% of the test episodes "
             f"(chance {percent(data.facts.chance_level)}\u00a0%, optimum {percent(data.facts.optimum)}\u00a0%)."
         )
@@ -157,8 +112,7 @@ def answers(data: ReportData) -> list[str]:
         sentences.append(
             "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
         )
-    sentences += few_words(len(data.result.protocol.seeds))
-    return sentences
+    return sentences + few_words(len(data.result.protocol.seeds))
 
 
 def few_words(count: int, noun: str = "seeds") -> list[str]:
@@ -171,7 +125,7 @@ def few_words(count: int, noun: str = "seeds") -> list[str]:
 def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
     areas = {agent: data.areas[agent][budget] for agent in data.areas}
-    named = {agent: f"“{agent_words(agent).title}” ({area_text(area)} %)" for agent, area in areas.items()}
+    named = {agent: f"“{agent_words(agent).title}” ({score_text(area)} %)" for agent, area in areas.items()}
     ranked = sorted(areas, key=lambda agent: areas[agent].value, reverse=True)
     first = [named[agent] for agent in ranked if areas[agent].value == areas[ranked[0]].value]
     who = (
@@ -180,12 +134,6 @@ def _largest_area(data: ReportData) -> str:
         else f"{first[0]}; next is {named[ranked[1]]}"
     )
     return f"Over all episodes up to {budget:,} the mean success is highest for {who}."
-
-
-def area_text(area: Estimate) -> str:
-    """``61.3 [55.0, 67.2]``, or without the brackets where one seed allows no interval."""
-    interval = "" if math.isnan(area.low) else f" [{percent(area.low)}, {percent(area.high)}]"
-    return f"{percent(area.value)}{interval}"
 
 
 def _unfinished(data: ReportData) -> str:
@@ -202,12 +150,10 @@ def _unfinished(data: ReportData) -> str:
 
 
 def _verdict(data: ReportData, agent: str) -> str:
-    budgets, comparisons = data.budgets, data.comparisons[agent]
-    last = comparisons[budgets[-1]]
-    title = agent_words(agent).title
-    score = percent(data.scores[agent][budgets[-1]].value)
-    difference = last.difference
-    head = f"“{title}” solves {score}\u00a0%, {_points(difference)}"
+    budget, comparisons = data.decisive_budget, data.comparisons[agent]
+    difference = comparisons[budget].difference
+    score = percent(data.scores[agent][budget].value)
+    head = f"“{agent_words(agent).title}” solves {score}\u00a0%, {_points(difference)}"
     if math.isnan(difference.low):
         return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
@@ -225,13 +171,19 @@ def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
         return ""
     ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
     behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
-    parts, clearly = [], "clearly " if seeds >= FEW_SEEDS else ""
-    for budgets, word in ((ahead, "ahead"), (behind, "behind")):
-        if budgets:
-            parts.append(f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}")
+    clearly = "clearly " if seeds >= FEW_SEEDS else ""
+    parts = [
+        f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}"
+        for budgets, word in ((ahead, "ahead"), (behind, "behind"))
+        if budgets
+    ]
     if not parts:
         return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
-    return f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets)."
+    most = max(comparisons, key=lambda budget: abs(comparisons[budget].difference.value))
+    return (
+        f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets); the largest "
+        f"difference is {estimate_text(comparisons[most].difference)} points at {most:,}."
+    )
 
 
 def _points(difference: Estimate) -> str:

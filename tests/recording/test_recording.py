@@ -13,6 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
 from numpy.typing import NDArray
+from recordings import contents, rerun, times
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
@@ -38,19 +39,6 @@ def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: st
     return record_run("arrow_puzzle", agent, name=name, path=path, **settings)  # type: ignore[arg-type]
 
 
-def contents(path: Path) -> dict[str, set[str]]:
-    """Entity paths and their timelines."""
-    found: dict[str, set[str]] = {}
-    for chunk in RrdReader(path).stream():
-        found.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
-    return found
-
-
-def rerun(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rerun", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
 @pytest.fixture(scope="module")
 def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(FakeImaginer(), tmp_path_factory.mktemp("recordings") / "run" / "recording.rrd")
@@ -74,16 +62,6 @@ def test_entities_and_timelines(imagined: Path) -> None:
         assert found[path] >= {"sim_time", "env_step", "episode"}
     assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
     assert all("imagined_depth" in found[path] for path in BY_DEPTH)
-
-
-def times(path: Path, entity: str, timeline: str) -> set[int]:
-    """When something was logged for an entity."""
-    return {
-        time
-        for chunk in RrdReader(path).stream()
-        if chunk.entity_path == entity and timeline in chunk.timeline_names
-        for time in chunk.to_record_batch().column(timeline).to_pylist()
-    }
 
 
 def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:

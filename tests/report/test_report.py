@@ -17,13 +17,13 @@ from fake_results import bench_result, compared_rollout
 
 from imagine_bench import reference, registry
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.judge import filmstrips as pictures
+from imagine_bench.judge import filmstrips
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
 from imagine_bench.report.data import _nan_mean, collect
-from imagine_bench.report.encoder import encoder_views
+from imagine_bench.report.sections.imagination import encoder_views
 from imagine_bench.report.text import percent, signed_percent
 from imagine_bench.store.results import BenchResult
 
@@ -207,7 +207,7 @@ def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
     assert float(summary["dqn", "2000"]["thesis_mean"]) == pytest.approx(0.4218)
 
 
-def test_an_agent_without_words_of_its_own_has_those_of_its_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert words.agent_words("dqn").title == "DQN"
     monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make"))
     assert words.agent_words("my_agent") == words.AgentWords("my agent", "A registered agent.")
@@ -224,10 +224,10 @@ def test_markdown_agrees_with_the_tables(result: BenchResult, folder: Path) -> N
     for agent, title in titles.items():
         for index, seed in enumerate(result.protocol.seeds):
             assert seeds[title, str(seed)] == [percent(share) for share in result.success_rates(agent)[index]]
-    header = next(row for row in table if row[0] == "real episodes" and "optimum" in row)
+    header = next(row for row in table if row[0] == "solved (%) after")
     scores = {row[0]: dict(zip(header, row, strict=True)) for row in table if len(row) == len(header)}
     for row in rows(folder / "summary.csv"):
-        cell = scores[f"{int(row['episodes']):,}"][titles[row["agent"]]]
+        cell = scores[titles[row["agent"]]][f"{int(row['episodes']):,}"]
         assert cell.startswith(percent(float(row["success_iqm"])))
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", markdown):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
@@ -389,22 +389,20 @@ def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) 
 
 def test_strip_marks_cut_error_and_end() -> None:
     names = tuple(f"turn cube {index}" for index in range(6))
-    cut, whole = (
-        pictures.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None)
-    )
+    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
     assert cut.shape == whole.shape
-    assert (cut == pictures._CUT).all(axis=2).sum() > 500  # the line
-    assert not (whole == pictures._CUT).all(axis=2).any()
-    for color in (pictures.RIGHT, pictures.WRONG):
+    assert (cut == filmstrips._CUT).all(axis=2).sum() > 500  # the line
+    assert not (whole == filmstrips._CUT).all(axis=2).any()
+    for color in (filmstrips.RIGHT, filmstrips.WRONG):
         assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
-    narrow = pictures.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
+    narrow = filmstrips.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
     assert narrow.shape[1] < whole.shape[1]
 
 
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
     compared = compared_rollout(np.random.default_rng(0), cut=None)
-    strip = pictures.filmstrip(compared, tuple("abcdef"))
-    left, top = pictures._left(0), pictures._HEADER
+    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
+    left, top = filmstrips._left(0), filmstrips._HEADER
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
 
@@ -413,7 +411,7 @@ def test_episodes_to_mastery_ask_for_what_the_task_calls_mastered(
     result: BenchResult, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = collect(result).spec
-    assert f"Real episodes to {100 * spec.success_threshold:g}&nbsp;%" in (folder / "index.html").read_text(
+    assert f"Real episodes to {100 * spec.success_threshold:g}\u00a0%" in (folder / "index.html").read_text(
         encoding="utf-8"
     )
     agent = result.protocol.agents[-1]

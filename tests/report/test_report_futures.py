@@ -1,4 +1,4 @@
-"""What the report says of sampled futures and imagined sampled_rollouts: the result's numbers, and only where there are any."""
+"""What the report says of sampled futures and sampled rollouts: the result's numbers, and only where there are any."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def test_the_summary_is_the_mean_over_pairs_and_seeds(result: BenchResult) -> No
     last = [run.checkpoints[-1].futures for run in result.of("imagination_only")]
     tables = np.stack([each.total_variation for each in last if each is not None])  # [seeds, D, P]
     assert summary.total_variation == pytest.approx(tables.mean(axis=(0, 2)))
-    assert summary.by_chance == pytest.approx(tables[:, :, 2].mean(axis=0))
-    assert summary.survival_probability[0] == pytest.approx(summary.total_variation[0])
-    assert summary.survival_probability[1:] == pytest.approx(tables[:, 1:, 1::2].mean(axis=(0, 2)))
-    assert summary.missing.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0]
+    assert summary.where_random == pytest.approx(tables[:, :, 2].mean(axis=0))
+    assert summary.while_alive[0] == pytest.approx(summary.total_variation[0])
+    assert summary.while_alive[1:] == pytest.approx(tables[:, 1:, 1::2].mean(axis=(0, 2)))
+    assert summary.missed.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0]
     assert (summary.pairs, summary.samples) == (PAIRS, 400)
     assert list(summary.by_budget) == [500, 1000]
     assert summary.by_budget[1000] == pytest.approx((summary.total_variation[0], summary.total_variation[-1]))
@@ -101,11 +101,11 @@ def test_page_and_markdown_show_figure_numbers_and_courses(result: BenchResult, 
     first = f"{collect(result).futures['imagination_only'].total_variation[0]:.3g}"
     assert f'data-futures="total_variation">{first}</td>' in page
     assert f"| total variation | {first} |" in markdown
-    for name in ("futures.png", "courses_imagination_only.png"):
+    for name in ("futures.png", "sampled_rollouts_imagination_only.png"):
         with Image.open(folder / name) as picture:
             assert picture.width > 300
         assert name in markdown
-    assert "One beginning, several futures" in page
+    assert "One start, several futures" in page
 
 
 def test_the_thesis_is_quoted_for_chapter_3_without_a_standard_deviation(folder: Path) -> None:

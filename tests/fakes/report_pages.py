@@ -1,0 +1,91 @@
+"""What every report must be, whatever it is about: readable at 1200 pixels, without ``nan``, in sound Markdown."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+PAGE_PX = 1200 - 2 * 24  # the page's own margin
+CHARACTER_PX, PADDING_PX = 8.0, 19.2
+
+
+class Tables(HTMLParser):
+    """The cells of every table: rows of texts, headers included."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tables: list[list[list[str]]] = []
+        self._text: str | None = None
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in {"td", "th"}:
+            self._text = ""
+        elif tag == "br" and self._text is not None:
+            self._text += " "
+
+    def handle_data(self, data: str) -> None:
+        if self._text is not None:
+            self._text += data
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in {"td", "th"}:
+            self.tables[-1][-1].append(str(self._text))
+            self._text = None
+
+
+def check_report(folder: Path) -> None:
+    """Assert it of ``index.html`` and ``report.md``."""
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    tables = read_tables(page)
+    assert tables
+    style = page[page.index("<style>") : page.index("</style>")]
+    assert "nowrap" not in style  # so that a column can become as narrow as its longest word
+    prose = re.findall(r"<table[^>]*prose", page)
+    assert len(prose) < len(tables)
+    for table in tables:
+        if len(table[0]) > 2:
+            assert narrowest_px(table) <= PAGE_PX, table[0]
+    text = re.sub(r"<(style|svg)\b.*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
+    markdown = (folder / "report.md").read_text(encoding="utf-8")
+    for shown in (text, markdown):
+        assert not re.search(r"\bnan\b", shown)
+    check_dashes(page)
+    check_markdown(markdown)
+
+
+def read_tables(page: str) -> list[list[list[str]]]:
+    """All tables of a page."""
+    parser = Tables()
+    parser.feed(page)
+    return parser.tables
+
+
+def narrowest_px(table: list[list[str]]) -> float:
+    """Width of a table whose columns are as narrow as their longest words, in pixels."""
+    longest = [
+        max(len(word) for row in table for word in re.split(r"[\s-]", row[column])) for column in range(len(table[0]))
+    ]
+    return sum(CHARACTER_PX * length + PADDING_PX for length in longest)
+
+
+def check_dashes(page: str) -> None:
+    """A table with a dash says below it what the dash means, or its section does."""
+    for section in page.split("<h2>"):
+        if re.search(r"<td[^>]*>–</td>", section):
+            assert "–: " in section, section[:80]
+
+
+def check_markdown(markdown: str) -> None:
+    """Every table is followed by a blank line and has as many cells in each row."""
+    blocks = re.findall(r"(?:^\|.*\n)+(?:.*)", markdown, flags=re.MULTILINE)
+    assert blocks
+    for block in blocks:
+        *rows, after = block.split("\n")
+        assert after == "", f"a table runs into {after!r}"
+        assert len({len(re.findall(r"(?<!\\)\|", row)) for row in rows}) == 1, rows[0]
+        assert set(rows[1]) <= {"|", "-"}
