@@ -81,7 +81,7 @@ def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = 
         ArtefactError: It does not fit; the message names the first difference.
     """
     _require_same_names(given.values, own.values)
-    for part in sorted({*equal} & {*own.values}):
+    for part in (name for name in equal if name in own.values):
         _require_equal(part, given.values[part], own.values[part])
     _require_same_names(given.arrays, own.arrays)
     for name, ours in own.arrays.items():

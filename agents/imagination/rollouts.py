@@ -29,7 +29,7 @@ from .world_model import ModelLosses, WorldModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
-_BEYOND = 1e6
+LATENT_LIMIT = 1e6
 """A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
 is in the norm of the gradient of a controller that learns from it, which must not overflow."""
 _CALIBRATION = 64
@@ -161,7 +161,7 @@ class Imagination:
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
         predicted = mdn.average(samples, model.members)
         _require_numbers(predicted.log_weights)
-        next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-_BEYOND, _BEYOND)
+        next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-LATENT_LIMIT, LATENT_LIMIT)
         _require_numbers(next_z)
         reward, p_terminated = model.predict_outcome(z, action, next_z)
         reward_std = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
@@ -180,7 +180,7 @@ class Imagination:
 
         A variance that is drawn whole and fed back can grow without bound, within some five imagined steps.
         """
-        keep = step.next_z.abs().amax(dim=-1) < _BEYOND
+        keep = step.next_z.abs().amax(dim=-1) < LATENT_LIMIT
         if not self.filtered:
             return keep
         keep &= self.score(decompose(step.samples).epistemic) <= self.threshold

@@ -22,7 +22,6 @@ from ..imagination.mixture import Mixture
 from ..networks.mlp import MemberMLP, clip_member_gradients
 from ..networks.normed_mlp import NormedMLP
 from ..networks.precision import hidden_dtype
-from ..networks.weight_samples import sample_outputs
 from .settings import MDNSettings
 
 
@@ -48,7 +47,8 @@ class BayesianMDN:
         groups: list[dict[str, Any]] = [{"params": hidden, "weight_decay": settings.weight_decay}, {"params": output}]
         self.optimiser = torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
 
-    def _mixture(self, outputs: Tensor) -> Mixture:
+    def mixture(self, outputs: Tensor) -> Mixture:
+        """Network outputs (..., out) as mixtures."""
         settings = self.settings
         floor, ceiling = math.log(settings.sigma_floor), math.log(settings.sigma_ceiling)
         return mdn.from_outputs(outputs, settings.components, self.n_outputs, floor, ceiling)
@@ -68,7 +68,7 @@ class BayesianMDN:
         """
         masks = self.network.draw_masks(x.shape[1], self._generators)
         outputs = self.network(x.mT.contiguous(), masks).mT  # [E, N, out]
-        losses = -mdn.log_likelihood(self._mixture(outputs), y).mean(dim=1)  # [E]
+        losses = -mdn.log_likelihood(self.mixture(outputs), y).mean(dim=1)  # [E]
         if not bool(losses.isfinite().all()):
             wrong = [index for index, loss in enumerate(losses.tolist()) if not math.isfinite(loss)]
             raise DivergedError(
@@ -86,40 +86,15 @@ class BayesianMDN:
         self.network.update_running_stats()
         return losses.detach()
 
-    def trained(self) -> TrainedMDN:
-        """The networks as they predict now."""
-        return TrainedMDN(self.network.folded(), self)
 
-    def read(self, outputs: Tensor) -> Mixture:
-        """Network outputs (..., out) as mixtures."""
-        return self._mixture(outputs)
-
-
-class TrainedMDN:
-    """What predicts: the networks with their standardisation folded in. It learns nothing any more.
-
-    Args:
-        network: E members.
-        model: Reads its outputs.
-    """
-
-    def __init__(self, network: MemberMLP, model: BayesianMDN) -> None:
-        self.network, self._model = network, model
-
-    def member(self, first: int, count: int = 1) -> MemberMLP:
-        """Networks ``first`` to ``first + count`` by themselves."""
-        whole = self.network
-        blank = torch.Generator(device=whole.weights[0].device)
-        part = MemberMLP(whole.sizes, members=count, dropout=whole.dropout, generator=blank)
-        with torch.no_grad():
-            for theirs, ours in zip(whole.parameters(), part.parameters(), strict=True):
-                ours.copy_(theirs[first : first + count])
-        return part
-
-    @torch.no_grad()
-    def weight_samples(self, network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None) -> Mixture:
-        """Mixtures (T, N) for rows (N, X) under the masks of one network, or of an ensemble's members without."""
-        return self._model.read(sample_outputs(network, x, masks))
+def members(network: MemberMLP, first: int, count: int) -> MemberMLP:
+    """Members ``first`` to ``first + count`` of a network by themselves."""
+    blank = torch.Generator(device=network.weights[0].device)
+    part = MemberMLP(network.sizes, members=count, dropout=network.dropout, generator=blank)
+    with torch.no_grad():
+        for whole, own in zip(network.parameters(), part.parameters(), strict=True):
+            own.copy_(whole[first : first + count])
+    return part
 
 
 def rescaled(mixture: Mixture, shift: Tensor, scale: Tensor) -> Mixture:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,8 +24,9 @@ from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
 from ..imagination.uncertainty import decompose, nll, sampled_component_variance
-from ..networks.mlp import dropout_mask
+from ..networks.mlp import MemberMLP, dropout_mask
 from ..networks.precision import settle
+from ..networks.weight_samples import sample_outputs
 from ..snapshot import (
     below,
     generator_array,
@@ -35,12 +37,13 @@ from ..snapshot import (
     require_fit,
     training_arrays,
 )  # fmt: skip
-from .bayesian_mdn import BayesianMDN, TrainedMDN, rescaled
+from .bayesian_mdn import BayesianMDN, members, rescaled
 from .settings import HYPERPARAMETERS, RegressorSettings
 from .stationarity import jensen_shannon
 
 _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
+_Arrays = TypeVar("_Arrays", Prediction, Mixtures)
 
 
 class MixtureRegressor:
@@ -72,7 +75,7 @@ class MixtureRegressor:
         self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._weights_and_masks)
         self._epoch = 0
         self._losses: list[float] = []
-        self._trained: TrainedMDN | None = None
+        self._folded: MemberMLP | None = None
 
     @property
     def epoch(self) -> int:
@@ -86,7 +89,7 @@ class MixtureRegressor:
 
     def train(self, epochs: int) -> None:
         """Train for so many more epochs: in each, every member sees each of its rows once, in an order of its own."""
-        self._trained = None
+        self._folded = None
         rows = self._x.shape[1]
         batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
         owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
@@ -114,21 +117,17 @@ class MixtureRegressor:
         """Predict, with uncertainties; see :class:`imagine_bench.regression.interfaces.Regressor`."""
         self._require_inputs(inputs)
         generator = self._generator(int(rng.integers(2**62)))
-        return _joined([
-            _joined([self._predict_rows(e, rows, generator) for rows in self._pieces(inputs[e])], axis=0)
+        networks = [
+            _joined([self._predict_rows(e, rows, generator) for rows in self._tensor(inputs[e]).split(_ROWS)])
             for e in range(self.networks)
-        ])  # fmt: skip
+        ]
+        return _joined(networks, np.stack)
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side, equally likely."""
         self._require_inputs(inputs)
-        every = []
-        for e in range(self.networks):
-            samples = self._weight_samples(e, self._tensor(inputs[e]))
-            every.append(_numpy(mdn.average(samples, len(samples.means))))
-        return Mixtures(
-            **{name: np.stack([getattr(m, name) for m in every]) for name in ("weights", "means", "sigmas")}
-        )
+        networks = [self._weight_samples(e, self._tensor(inputs[e])) for e in range(self.networks)]
+        return _joined([_mixtures(mdn.average(samples, len(samples.means))) for samples in networks], np.stack)
 
     def state(self) -> AgentState:
         """Weights, moments, running statistics, generators, epochs."""
@@ -157,7 +156,7 @@ class MixtureRegressor:
             for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
                 load_generator(generator, array)
         self._epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
-        self._losses, self._trained = list(state.values["losses"]), None
+        self._losses, self._folded = list(state.values["losses"]), None
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device)
@@ -165,20 +164,17 @@ class MixtureRegressor:
     def _generator(self, seed: int) -> torch.Generator:
         return torch.Generator(device=self._device).manual_seed(seed)
 
-    def _pieces(self, inputs: Floats) -> list[Tensor]:
-        return [self._tensor(inputs[start : start + _ROWS]) for start in range(0, len(inputs), _ROWS)]
-
     def _weight_samples(self, network: int, x: Tensor) -> Mixture:
         """Mixtures (T, N) in the units of the targets; a network's weight samples are always the same ones."""
-        if self._trained is None:
-            self._trained = self._model.trained()
+        if self._folded is None:
+            self._folded = self._model.network.folded()
         settings = self.settings
-        part, masks = self._trained.member(network * settings.members, settings.members), None
+        part, masks = members(self._folded, network * settings.members, settings.members), None
         if settings.dropout > 0.0:
             generator = self._generator(self._samples[network].integer())
             shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
             masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
-        samples = self._trained.weight_samples(part, x, masks)
+        samples = self._model.mixture(sample_outputs(part, x, masks))
         return rescaled(samples, self._shift[network], self._scale[network])
 
     def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
@@ -188,15 +184,15 @@ class MixtureRegressor:
         prediction = mdn.sample(predictive, 1.0, generator)
         sampled = sampled_component_variance(samples, predictive, prediction, self.settings.members)
         return Prediction(
-            prediction=prediction.double().cpu().numpy(),
-            sampled_variance=sampled.double().cpu().numpy(),
-            nll=nll(samples, prediction).double().cpu().numpy(),
-            mean=mdn.mean(samples).mean(dim=0).double().cpu().numpy(),
-            epistemic=parts.epistemic.double().cpu().numpy(),
-            aleatoric=parts.aleatoric.double().cpu().numpy(),
-            modal=parts.modal.double().cpu().numpy(),
-            stationarity=jensen_shannon(samples, self.settings.divergence_draws, generator).double().cpu().numpy(),
-            predictive=_numpy(predictive),
+            prediction=_array(prediction),
+            sampled_variance=_array(sampled),
+            nll=_array(nll(samples, prediction)),
+            mean=_array(mdn.mean(samples).mean(dim=0)),
+            epistemic=_array(parts.epistemic),
+            aleatoric=_array(parts.aleatoric),
+            modal=_array(parts.modal),
+            stationarity=_array(jensen_shannon(samples, self.settings.divergence_draws, generator)),
+            predictive=_mixtures(predictive),
         )
 
     def _require_inputs(self, inputs: Floats) -> None:
@@ -230,22 +226,24 @@ def _shapes(data: Dataset) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return np.shape(data.inputs), np.shape(data.targets)
 
 
-def _numpy(mixture: Mixture) -> Mixtures:
-    parts = (mixture.log_weights.exp(), mixture.means, mixture.log_sigmas.exp())
-    return Mixtures(**dict(zip(("weights", "means", "sigmas"), (p.double().cpu().numpy() for p in parts), strict=True)))
+def _array(values: Tensor) -> Floats:
+    array: Floats = values.double().cpu().numpy()
+    return array
 
 
-def _joined(parts: list[Prediction], axis: int | None = None) -> Prediction:
-    """Predictions joined along rows, or stacked as networks where no axis is given."""
-    join = np.stack if axis is None else np.concatenate
+def _mixtures(mixture: Mixture) -> Mixtures:
+    weights, sigmas = mixture.log_weights.exp(), mixture.log_sigmas.exp()
+    return Mixtures(weights=_array(weights), means=_array(mixture.means), sigmas=_array(sigmas))
 
-    def field(owner: Sequence[object], name: str) -> Floats:
-        return join([getattr(part, name) for part in owner], axis=axis or 0)
 
-    names = [f.name for f in dataclasses.fields(Prediction) if f.name != "predictive"]
-    mixtures = [part.predictive for part in parts]
-    predictive = Mixtures(**{name: field(mixtures, name) for name in ("weights", "means", "sigmas")})
-    return Prediction(predictive=predictive, **{name: field(parts, name) for name in names})
+def _joined(parts: Sequence[_Arrays], join: Callable[[list[Floats]], Floats] = np.concatenate) -> _Arrays:
+    """Predictions or mixtures joined field by field: along rows, or stacked as networks."""
+
+    def joined(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        return _joined(values, join) if isinstance(values[0], Mixtures) else join(values)
+
+    return type(parts[0])(**{field.name: joined(field.name) for field in dataclasses.fields(parts[0])})
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

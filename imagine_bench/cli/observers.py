@@ -6,12 +6,16 @@ from imagine_bench.bench.run_state import Run
 from imagine_bench.bench.runner import AtBudget, AtEnd
 from imagine_bench.capabilities import FutureSampler, Imaginer
 from imagine_bench.judge.futures import imagined_futures
-from imagine_bench.judge.imagination_quality import OpenLoopStart, ask, examples, imagine_sampled_rollouts, open_loop
+from imagine_bench.judge.imagination_quality import (
+    OPEN_LOOP_DEPTH,
+    OpenLoopStart,
+    examples,
+    imagine_sampled_rollouts,
+    open_loop,
+    open_loop_starts,
+)
 from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
-
-IMAGINED_DEPTH = 10
-"""Steps of the open-loop comparison, the thesis' I_D."""
 
 
 class _Observer:
@@ -30,24 +34,24 @@ class OpenLoopObserver(_Observer):
     """Compares open-loop imagination with the rules at every budget."""
 
     def __init__(self) -> None:
-        self._questions: tuple[OpenLoopStart, ...] | None = None
+        self._starts: tuple[OpenLoopStart, ...] | None = None
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``open_loop`` of an agent that imagines."""
         if not isinstance(run.agent, Imaginer):
             return {}
-        if self._questions is None:  # the same at every budget
-            self._questions = ask(
+        if self._starts is None:  # the same at every budget
+            self._starts = open_loop_starts(
                 run.task,
                 starts=run.protocol.open_loop_starts,
-                depth=IMAGINED_DEPTH,
+                depth=OPEN_LOOP_DEPTH,
                 appearance=run.protocol.appearance,
                 purpose=evaluation_split(run.spec.seed),
             )
-        if not self._questions:
+        if not self._starts:
             return {}
         run.tell("imagining", at_once=True)
-        return {"open_loop": open_loop(run.agent, self._questions, SeedTree(run.spec.seed).child("open_loop", budget))}
+        return {"open_loop": open_loop(run.agent, self._starts, SeedTree(run.spec.seed).child("open_loop", budget))}
 
 
 class FuturesObserver(_Observer):

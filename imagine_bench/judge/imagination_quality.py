@@ -19,6 +19,8 @@ from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
+OPEN_LOOP_DEPTH = 10
+"""Steps of the open-loop comparison, the thesis' I_D."""
 EXAMPLES = 5
 """Greedy imagined rollouts kept with each run, with their real counterparts."""
 SAMPLED_ROLLOUTS, SAMPLED_DEPTH = 4, 5
@@ -44,7 +46,7 @@ class OpenLoopStart:
     rewards: Floats
 
 
-def ask(
+def open_loop_starts(
     spec: TaskSpec, *, starts: int, depth: int, appearance: str, purpose: Purpose = "evaluation"
 ) -> tuple[OpenLoopStart, ...]:
     """The starts of the open-loop comparison: the same for every agent and seed.
@@ -66,9 +68,7 @@ def ask(
         return ()
     states = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
     frames = spec.render_macrostates(np.array(states, dtype=np.int64), appearance, rng)
-    return tuple(
-        _open_loop_start(spec, alive, state, frame, depth, rng) for state, frame in zip(states, frames, strict=True)
-    )
+    return tuple(_start(spec, alive, state, frame, depth, rng) for state, frame in zip(states, frames, strict=True))
 
 
 def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTree) -> OpenLoop:
@@ -271,7 +271,7 @@ def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps:
     return safe
 
 
-def _open_loop_start(
+def _start(
     spec: TaskSpec, alive: Alive, start: State, frame: Frame, depth: int, rng: np.random.Generator
 ) -> OpenLoopStart:
     belief: Belief = {(start, False): 1.0}

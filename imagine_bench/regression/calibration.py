@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
+
 import numpy as np
 
 from imagine_bench.judge.calibration import (
@@ -13,7 +15,7 @@ from imagine_bench.judge.calibration import (
     probability_transform,
     transform_distance,
 )
-from imagine_bench.regression.interfaces import SCORES, Floats, Mixtures, RegressionSpec, Regressor
+from imagine_bench.regression.interfaces import SCORES, Floats, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.codec import Arrays
@@ -58,7 +60,7 @@ def calibrate(
     pooled_transform, pooled_crps = _pooled(regressor, inputs, targets)
     rows: list[Row] = []
     for e in range(len(networks)):
-        own = Mixtures(**{n: getattr(prediction.predictive, n)[e] for n in ("weights", "means", "sigmas")})
+        own = prediction.predictive.map(itemgetter(e))
         wrong = error[e] > task.wrong_above
         row: Row = {"error_mean": error[e].mean(), "error_median": np.median(error[e]), "wrong": wrong.mean()}
         own_crps = crps(own, targets[e])  # [N, D]
@@ -81,6 +83,6 @@ def _pooled(regressor: Regressor, inputs: Floats, targets: Floats) -> tuple[Floa
         mixtures = regressor.pooled(inputs[:, part])
         transforms.append(probability_transform(mixtures, targets[:, part]))
         for point in range(start, min(start + _CHUNK, CRPS_POINTS, inputs.shape[1])):
-            one = Mixtures(**{n: getattr(mixtures, n)[:, point - start] for n in ("weights", "means", "sigmas")})
+            one = mixtures.map(itemgetter((slice(None), point - start)))
             scores.append(crps(one, targets[:, point]))  # [E, D]
     return np.concatenate(transforms, axis=1), np.stack(scores, axis=1)

@@ -48,6 +48,10 @@ class Mixtures:
     means: Floats
     sigmas: Floats
 
+    def map(self, change: Callable[[Floats], Floats]) -> Mixtures:
+        """The mixtures with each array changed alike, in their leading axes."""
+        return Mixtures(weights=change(self.weights), means=change(self.means), sigmas=change(self.sigmas))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:

@@ -95,7 +95,7 @@ def plan(
         SetupError: The device does not exist here.
     """
     if encoder is not None:
-        raise InvalidValueError(f"{task} has no pictures to encode; leave --encoder out.")
+        raise InvalidValueError(f"{task} has no images to encode; leave --encoder out.")
     require_known("preset", preset, PRESETS)
     values = {**PRESETS[preset], **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench

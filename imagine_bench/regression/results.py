@@ -46,8 +46,8 @@ class RegressionRun:
     recording: Path | None
 
     def values(self, variant: str, name: str) -> NDArray[np.float64]:
-        """One measure of every network of a variant, NaN where the version that made the run had it not. Shape (E,)."""
-        return np.array([float(row.get(name, np.nan)) for row in self.rows if row["variant"] == variant])
+        """One measure of every network of a variant. Shape (E,)."""
+        return np.array([float(row[name]) for row in self.rows if row["variant"] == variant])
 
 
 @dataclass(frozen=True, kw_only=True)

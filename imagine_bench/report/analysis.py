@@ -16,9 +16,9 @@ from imagine_bench.machine import describe_environment
 from imagine_bench.protocols.task_types import task_type
 from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
 from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
-from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol, require_either
+from imagine_bench.store.bench_folder import newest_bench, require_either
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json
-from imagine_bench.store.trained import Trained, learners, load_trained, require_control, require_runs
+from imagine_bench.store.trained import Trained, learners, load_trained, protocol_of_agents, require_control
 
 Value = TypeVar("Value")
 
@@ -142,12 +142,9 @@ def analyse(
         SetupError: The bench's folder cannot be written.
     """
     bench = chosen(folder, root, task)
-    require_control(read_protocol(bench).task, str(bench))
-    require_runs(bench)
-    where = bench / analysis.name
+    protocol, where = protocol_of_agents(bench), bench / analysis.name
     with lock(bench / f".{analysis.name}.lock", f"The folder {where}"):
-        protocol, folders = read_control(bench), learners(bench)
-        spec, appearance = registry.task(protocol.task), protocol.appearance
+        spec, appearance, folders = registry.task(protocol.task), protocol.appearance, learners(bench)
         found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         runs = []
         for run in counted(folders, "runs", total=len(folders)):

@@ -20,9 +20,9 @@ from imagine_bench.judge.filmstrips import filmstrip, png
 from imagine_bench.judge.plans import Plan, make_plans, require_threshold
 from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.text import percent
-from imagine_bench.store.bench_folder import load_bench, read_protocol
+from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
-from imagine_bench.store.trained import Trained, best_run, load_trained, require_control, require_runs
+from imagine_bench.store.trained import Trained, best_run, load_trained, protocol_of_agents
 
 _COLUMNS = (
     *("plan", "start", "shortest", "planned", "done", "solved", "optimal", "refused", "as_imagined", "faults"),
@@ -56,7 +56,7 @@ def plan_report(
         root: Folder of all benches.
         task: Whose newest bench; None for that of any task.
         count: Plans.
-        execution: ``"physics"`` or ``"kinematic"``.
+        execution: How macro-actions happen.
         max_epistemic: See :func:`imagine_bench.judge.plans.make_plans`.
         encoder: See :func:`imagine_bench.store.trained.load_trained`.
         recorded: Plans that are recorded.
@@ -75,8 +75,7 @@ def plan_report(
     require_threshold(max_epistemic)
     run = chosen(run, root, task)
     if (run / "protocol.json").exists():  # a bench's folder
-        require_control(read_protocol(run).task, str(run))
-        require_runs(run)
+        protocol_of_agents(run)
         run = best_run(load_bench(run)).folder
     trained = load_trained(run, encoder=encoder)
     name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"

@@ -93,24 +93,18 @@ def require_control(task: str, what: str) -> None:
         raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
 
 
-def require_runs(bench: Path) -> None:
-    """Raise ArtefactError for results that were kept without the agents."""
+def protocol_of_agents(bench: Path) -> Protocol:
+    """The protocol of a bench whose agents can be taken up again.
+
+    Raises:
+        ArtefactError: There is none, or it is of a regression task, or its results were kept without the agents.
+    """
+    protocol = read_control(bench)
     if is_archive(bench):
         raise ArtefactError(
             f"{bench} holds kept results and no agents; give a bench's own folder, runs/<task>/<preset>-<hash>."
         )
-
-
-def imagining(result: Result) -> tuple[RunResult, ...]:
-    """The runs of a bench whose agents imagine.
-
-    Raises:
-        ArtefactError: There are none.
-    """
-    runs = tuple(run for run in result.runs if run.imagined) if isinstance(result, BenchResult) else ()
-    if not runs:
-        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
-    return runs
+    return protocol
 
 
 def learners(bench: Path) -> tuple[Path, ...]:
@@ -145,7 +139,10 @@ def best_run(result: Result) -> RunResult:
     Raises:
         ArtefactError: There is none.
     """
-    return max(imagining(result), key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
+    runs = [run for run in result.runs if run.imagined] if isinstance(result, BenchResult) else []
+    if not runs:
+        raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")
+    return max(runs, key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
 
 
 def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:

@@ -6,11 +6,10 @@ import math
 
 import pytest
 import torch
-from imagine_bench.agents.controller import Controller, bellman_errors, epsilon, td_target
-from imagine_bench.agents.networks import joint
-from imagine_bench.agents.networks.mlp import Parameters
+from imagine_bench.agents.dqn import Controller, epsilon, td_target
+from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.replay import Batch
-from imagine_bench.agents.settings import ControllerSettings
+from imagine_bench.agents.snapshot import load_training, training_arrays
 
 from imagine_bench.errors import DivergedError
 
@@ -40,8 +39,8 @@ def batch(reward: float = 1.0) -> Batch:
     return Batch(z, torch.tensor([0, 1, 1, 0, 1]), torch.full((5,), reward), next_z, terminated)
 
 
-def loss(controller: Controller, rows: Batch) -> torch.Tensor:
-    return bellman_errors([controller], joint.batches([rows]), Parameters(controller.optimiser.parameters))[0, 0]
+def weights(module: torch.nn.Module) -> torch.Tensor:
+    return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 
 
 def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
@@ -51,40 +50,41 @@ def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
     for i in range(5):
         bootstrap = 0.0 if rows.terminated[i] else 0.9 * following[i].max()
         errors.append((1.0 + bootstrap - values[i, rows.action[i]]) ** 2)
-    torch.testing.assert_close(loss(controller, rows).detach(), torch.stack(errors).mean())
+    torch.testing.assert_close(controller.loss(rows).detach(), torch.stack(errors).mean())
 
 
 def test_no_gradient_flows_through_the_target() -> None:
     controller, rows = make(), batch()
     target = td_target(rows.reward, rows.terminated, controller.values(rows.next_z), 0.9)
-    q = controller.network(rows.z.unsqueeze(0))[0].gather(1, rows.action.unsqueeze(1)).squeeze(1)
-    weight = controller.network.weights[0]
+    q = controller.network(rows.z).gather(1, rows.action.unsqueeze(1)).squeeze(1)
+    weight = next(controller.network.parameters())
     (expected,) = torch.autograd.grad((target - q).square().mean(), weight)
-    (given,) = torch.autograd.grad(loss(controller, rows), weight)
+    (given,) = torch.autograd.grad(controller.loss(rows), weight)
     torch.testing.assert_close(given, expected)
     assert expected.abs().max() > 0.0
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_leaves_the_weights() -> None:
     controller = make()
-    before = controller.optimiser.arrays()["value"]
+    before = weights(controller)
     with pytest.raises(DivergedError, match=r"controller's loss is nan. Lower controller.learning_rate"):
         controller.update(batch(reward=float("nan")))
-    assert (controller.optimiser.arrays()["value"] == before).all()
+    assert torch.equal(weights(controller), before)
 
 
 def test_a_target_network_follows_at_its_rate_and_gives_the_targets() -> None:
     settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
     controller = Controller(3, 2, settings, torch.Generator().manual_seed(0))
-    before = controller.arrays()["value"]
-    assert (controller.arrays()["target"] == before).all()
+    before = weights(controller.network)
+    assert torch.equal(weights(controller.target), before)
     controller.update(batch())
-    after = controller.arrays()
-    expected = before + 0.25 * (after["value"] - before)
-    assert after["target"] == pytest.approx(expected, abs=1e-7) and (after["value"] != before).any()
-    plain = make()
-    plain.load({name: array for name, array in after.items() if name != "target"})
-    assert loss(controller, batch()) != loss(plain, batch()), "the loss must use the target network's values"
-    again = Controller(3, 2, settings, torch.Generator().manual_seed(5))
-    again.load(after)
-    assert loss(controller, batch()) == loss(again, batch())
+    after = weights(controller.network)
+    torch.testing.assert_close(weights(controller.target), before + 0.25 * (after - before))
+    assert (after != before).any()
+    plain, again = make(), Controller(3, 2, settings, torch.Generator().manual_seed(5))
+    plain.network.load_state_dict(controller.network.state_dict())
+    assert controller.loss(batch()) != plain.loss(batch()), "the loss must use the target network's values"
+    load_training(again, again.optimiser, training_arrays(controller, controller.optimiser))
+    assert controller.loss(batch()) == again.loss(batch())
+    assert controller.update(batch()) == again.update(batch())
+    assert torch.equal(weights(controller), weights(again)), "moments and steps are part of a snapshot"

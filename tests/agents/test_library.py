@@ -89,14 +89,14 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeyp
 
 def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
     for name, entry in registry.AGENTS.items():
-        if entry.settings == "imagine_bench.agents.library.settings":
+        if entry.settings.startswith("imagine_bench.agents.library.settings:"):
             agent = registry.make_agent(name, spec(name).context())
             assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
         else:
             assert not entry.external_training_loop
 
 
-def test_its_episodes_start_where_every_agent_of_that_seed_starts() -> None:
+def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
     entry = registry.task_entry("arrow_puzzle")
     with_starts = TrainingStarts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
     plain = gymnasium.make(entry.env_id, execution="kinematic")
@@ -170,7 +170,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        registry.load("imagine_bench.agents.library.settings:resolve")("quick", overrides, "chapter_5")
+        registry.load("imagine_bench.agents.library.settings:HYPERPARAMETERS").resolve("fast", overrides, "chapter_5")
 
 
 def spec(agent: str) -> RunSpec:

@@ -1,32 +1,50 @@
-"""Presets and overrides: what is named is set, what is not exists nowhere."""
+"""Settings of all agents: published values, sets, overrides and ranges."""
 
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from imagine_bench.agents.presets import FAMILIES, flatten
-from imagine_bench.agents.presets import resolve as resolve_in
-from imagine_bench.agents.settings import Settings
+from imagine_bench.agents.imagination.settings import Settings
+from imagine_bench.agents.regressors import settings as regressor_settings
+from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten
 
+from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.protocols.control import PRESETS as BENCH_PRESETS
-
-PRESETS = [(family, preset) for family in FAMILIES for preset in FAMILIES[family].presets]
-
-
-def resolve(preset: str, overrides: dict[str, Any]) -> Settings:
-    return resolve_in(preset, overrides, "chapter_5")
+from imagine_bench.protocols.control import PRESETS
+from imagine_bench.regression.protocol import PRESETS as REGRESSION_PRESETS
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_every_preset_of_the_bench_has_settings_in_every_family(family: str) -> None:
-    assert set(FAMILIES[family].presets) == set(BENCH_PRESETS)
+def hyperparameters_module(entry: registry.AgentEntry) -> str:
+    return entry.settings.partition(":")[0]
 
 
-def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None:
-    assert resolve("thesis", {}) == resolve("full", {}) == Settings()
+ALL: dict[str, Hyperparameters[Any]] = {
+    **{name: registry.load(entry.settings) for name, entry in registry.AGENTS.items() if entry.learns},
+    "regressors": regressor_settings.HYPERPARAMETERS,
+}
+SETS_OF_ALL = [(agent, group, name) for agent in ALL for group in ALL[agent].groups for name in SETS]
+
+
+def resolve(name: str, overrides: dict[str, Any], group: str = "chapter_5") -> Settings:
+    found: Settings = ALL["imagination"].resolve(name, overrides, group)
+    return found
+
+
+@pytest.mark.parametrize("agent", ALL)
+def test_every_group_has_every_set_that_a_protocol_names(agent: str) -> None:
+    named = {preset.get("hyperparameters", "fast") for preset in (*PRESETS.values(), *REGRESSION_PRESETS.values())}
+    assert named == set(SETS)
+    assert all(set(group.sets) == named for group in ALL[agent].groups.values())
+    assert agent == "regressors" or set(ALL[agent].groups) == set(CONFIG_GROUPS)
+
+
+def test_the_defaults_are_the_published_numbers_of_chapter_5() -> None:
+    assert resolve("published", {}) == Settings()
     flat = flatten(Settings())
     printed = {
         "model.dynamics_hidden": (256, 256, 256),
@@ -58,13 +76,12 @@ def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None
     of_the_suite = {  # what algorithm 1 has not, at rest
         "model.members": 1,
         "model.shared_hidden": (),
-        "model.assessment_input": "next_state",
+        "model.head_input": "next_state",
         "model.reward_scale": 1.0,
         "model.spread": 1.0,
         "model.balance": 0.0,
         "model.predict_change": False,
         "model.gradient_clip": None,
-        "controller.gradient_clip": None,
         "controller.target_rate": 1.0,
         "imagination.end_episode": None,
         "imagination.start_states": "current",
@@ -77,13 +94,12 @@ def test_thesis_and_full_are_the_defaults_and_those_the_thesis_numbers() -> None
 
 
 def test_chapter_3_has_the_numbers_of_section_3_2_2() -> None:
-    assert resolve_in("thesis", {}, "chapter_3") == FAMILIES["chapter_3"].thesis
-    flat = flatten(resolve_in("thesis", {}, "chapter_3"))
+    flat = flatten(resolve("published", {}, "chapter_3"))
     printed = {
         "model.dynamics_hidden": (256, 256, 256),
         "model.components": 24,
         "model.shared_hidden": (512, 256),
-        "model.assessment_input": "next_state",
+        "model.head_input": "next_state",
         "model.learning_rate": 1e-3,
         "model.updates_per_step": 4,
         "model.batch_size": 64,
@@ -99,33 +115,67 @@ def test_chapter_3_has_the_numbers_of_section_3_2_2() -> None:
     assert {name: flat[name] for name in printed} == printed
 
 
-@pytest.mark.parametrize(("family", "preset"), PRESETS)
-def test_every_deviation_is_applied_and_has_a_reason(family: str, preset: str) -> None:
-    flat, thesis = flatten(resolve_in(preset, {}, family)), flatten(FAMILIES[family].thesis)
-    for name, deviation in FAMILIES[family].presets[preset].items():
-        assert flat[name] == deviation.value != thesis[name]
-        assert len(deviation.reason) > 20
-    assert {name for name in flat if flat[name] != thesis[name]} == set(FAMILIES[family].presets[preset])
+@pytest.mark.parametrize(("agent", "group", "name"), SETS_OF_ALL)
+def test_every_override_is_applied_allowed_and_has_a_reason(agent: str, group: str, name: str) -> None:
+    hyperparameters = ALL[agent]
+    chosen = hyperparameters.groups[group]
+    flat, published = flatten(hyperparameters.resolve(name, {}, group)), flatten(chosen.published)
+    for setting, override in chosen.sets[name].items():
+        assert flat[setting] == override.value != published[setting]
+        assert len(override.reason) > 7
+    assert {setting for setting in flat if flat[setting] != published[setting]} == set(chosen.sets[name])
+    own = {setting: value for setting, value in flat.items() if setting not in chosen.unused}
+    assert hyperparameters.resolve("published", own, group) == hyperparameters.resolve(name, {}, group)
+
+
+@pytest.mark.parametrize("agent", ALL)
+def test_every_setting_has_a_range(agent: str) -> None:
+    def fields_of(settings: Any) -> Iterator[dataclasses.Field[Any]]:
+        for field in dataclasses.fields(settings):
+            value = getattr(settings, field.name)
+            yield from fields_of(value) if dataclasses.is_dataclass(value) else [field]
+
+    published = next(iter(ALL[agent].groups.values())).published
+    assert all("allowed" in field.metadata for field in fields_of(published))
+
+
+def test_settings_load_no_torch() -> None:
+    modules = [hyperparameters_module(entry) for entry in registry.AGENTS.values()]
+    names = ", ".join(sorted({*modules, "imagine_bench.agents.regressors.settings"}))
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {names}, sys; assert 'torch' not in sys.modules"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
 def test_sizes_that_no_network_has_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match=r"model\.reward_hidden \[64\] is not read beside model\.shared_hidden"):
-        resolve_in("quick", {"model.reward_hidden": [64]}, "chapter_3")
-    with pytest.raises(InvalidValueError, match=r"Without model\.shared_hidden .* model\.termination_hidden too"):
-        resolve_in("quick", {"model.shared_hidden": [], "model.reward_hidden": [64]}, "chapter_3")
+    with pytest.raises(InvalidValueError, match=r"model\.reward_hidden \(64,\) .* give either the first"):
+        resolve("fast", {"model.reward_hidden": [64]}, "chapter_3")
+    with pytest.raises(InvalidValueError, match=r"model\.shared_hidden is \(\).* or the other two"):
+        resolve("fast", {"model.shared_hidden": [], "model.reward_hidden": [64]}, "chapter_3")
     apart = {"model.shared_hidden": [], "model.reward_hidden": [64], "model.termination_hidden": [32]}
-    assert resolve_in("quick", apart, "chapter_3").model.reward_hidden == (64,)
-    assert resolve("thesis", {"model.shared_hidden": []}) == resolve("thesis", {})
-    assert resolve("thesis", {"model.shared_hidden": [8]}).model.shared_hidden == (8,)
+    assert resolve("fast", apart, "chapter_3").model.reward_hidden == (64,)
+    shared = {"model.shared_hidden": [8], "model.reward_hidden": [], "model.termination_hidden": []}
+    assert resolve("published", shared).model.shared_hidden == (8,)
 
 
-def test_an_unknown_family_lists_what_exists() -> None:
-    with pytest.raises(UnknownNameError, match=r"No settings family 'chapter_4'.* Known: chapter_3, chapter_5"):
-        resolve_in("quick", {}, "chapter_4")
+def test_an_unknown_config_group_lists_what_exists() -> None:
+    with pytest.raises(UnknownNameError, match=r"No config group 'chapter_4'.* Known: chapter_3, chapter_5"):
+        resolve("fast", {}, "chapter_4")
+
+
+def test_the_dqn_has_the_controller_s_settings_of_those_who_imagine() -> None:
+    for group in CONFIG_GROUPS:
+        for name in SETS:
+            dqn, imagining = ALL["dqn"].resolve(name, {}, group), resolve(name, {}, group)
+            assert dqn.controller == imagining.controller
+            assert dqn.memory.real == imagining.memory.real
+    assert ALL["dqn"].names() < ALL["imagination"].names()
 
 
 def test_an_override_replaces_one_value_of_the_preset() -> None:
-    before, after = flatten(resolve("quick", {})), flatten(resolve("quick", {"controller.discount": 0.5}))
+    before, after = flatten(resolve("fast", {})), flatten(resolve("fast", {"controller.discount": 0.5}))
     assert {name for name in after if after[name] != before[name]} == {"controller.discount"}
 
 
@@ -139,7 +189,7 @@ def test_an_override_replaces_one_value_of_the_preset() -> None:
     ],
 )
 def test_values_are_taken_as_json_gives_them(name: str, given: Any, kept: Any) -> None:
-    value = flatten(resolve("thesis", {name: given}))[name]
+    value = flatten(resolve("published", {name: given}))[name]
     assert value == kept
     assert type(value) is type(kept)
 
@@ -153,15 +203,15 @@ def test_an_unknown_setting_lists_what_exists_and_the_nearest_name() -> None:
     with pytest.raises(
         UnknownNameError, match=r"No setting 'controller.discont'. Did you mean 'controller.discount'"
     ) as e:
-        resolve("quick", {"controller.discont": 0.9})
+        resolve("fast", {"controller.discont": 0.9})
     assert all(name in str(e.value) for name in flatten(Settings()))
 
 
-def test_an_unknown_preset_lists_what_exists() -> None:
+def test_an_unknown_set_lists_what_exists() -> None:
     with pytest.raises(
-        UnknownNameError, match=r"No preset 'quik'. Did you mean 'quick'\? Known: smoke, quick, thesis, f"
+        UnknownNameError, match=r"No set of hyperparameters 'fats'. Did you mean 'fast'\? Known: minimal, fast, p"
     ):
-        resolve("quik", {})
+        resolve("fats", {})
 
 
 @pytest.mark.parametrize(
@@ -170,15 +220,17 @@ def test_an_unknown_preset_lists_what_exists() -> None:
         ("controller.discount", "high", "'controller.discount' was given 'high'; it takes float"),
         ("controller.discount", True, "'controller.discount' was given True; it takes float"),
         ("controller.discount", 1.5, r"controller.discount is 1.5; it must lie in \[0, 1\]"),
-        ("controller.hidden", (8, 0), r"controller.hidden is \(8, 0\); it must be at least 1"),
+        ("controller.hidden", (), r"controller.hidden is \(\); .* of one layer or more"),
+        ("model.dropout", 0.001, r"model.dropout is 0.001; it must be 0 or lie in \[1/256, 255/256\]"),
+        ("controller.hidden", (8, 0), r"controller.hidden is \(8, 0\); it must be numbers of units, each at least 1"),
         ("controller.epsilon_min", -0.1, r"controller.epsilon_min is -0.1; it must lie in \[0, 1\]"),
         ("controller.epsilon_decay", float("inf"), "controller.epsilon_decay is inf; it must be at least 0 and finite"),
         ("controller.epsilon_min", 0.9, r"epsilon_min 0.9 is above controller.epsilon_max 0.8: exploration would rise"),
         ("imagination.start_episode", 1000, r"end_episode 1000 is not above imagination.start_episode 1000: nothing"),
-        ("model.dropout", 1.0, r"model.dropout is 1.0; it must lie in \[0, 1\)"),
+        ("model.dropout", 1.0, r"model.dropout is 1.0; it must be 0 or lie in \[1/256, 255/256\]"),
         ("model.gradient_clip", 0.0, "model.gradient_clip is 0.0; it must be above 0"),
         ("model.components", 2.5, "'model.components' was given 2.5; it takes int"),
-        ("imagination.reduction", "median", "No uncertainty reduction 'median'"),
+        ("imagination.reduction", "median", "No value of setting imagination.reduction: 'median'"),
         ("imagination.depth", 0, "imagination.depth is 0; it must be at least 1"),
         ("imagination.temperature", float("nan"), "imagination.temperature is nan; it must be at least 0"),
         ("imagination.termination_threshold", 0.9, r"is 0.9; it must lie in \[0, 0.5\]: it bounds the less likely"),
@@ -187,13 +239,4 @@ def test_an_unknown_preset_lists_what_exists() -> None:
 )
 def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
     with pytest.raises((InvalidValueError, UnknownNameError), match=message):
-        resolve("quick", {name: value})
-
-
-@pytest.mark.parametrize("network", ["model.dynamics_hidden", "model.reward_hidden"])
-def test_dropout_without_a_hidden_layer_is_refused(network: str) -> None:
-    with pytest.raises(
-        InvalidValueError, match=r"model\.dropout acts on hidden layers: give model\.dynamics_hidden and"
-    ):
-        resolve("thesis", {network: ()})
-    resolve("thesis", {network: (), "model.dropout": 0.0})
+        resolve("fast", {name: value})

@@ -66,22 +66,22 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
 
 
 @pytest.mark.parametrize("carried", [0.0, 0.5])
-def test_causes_are_hints_that_one_test_refutes(carried: float) -> None:
+def test_earlier_causes_are_priors_that_one_test_refutes(carried: float) -> None:
     learner = agent(outcomes__transfer_weight=carried)
     live(learner, range(40), np.random.default_rng(0))
     learner.reset_for_new_task()
     lamp = Observation(frame=frame((0, 2, 1)))
-    watch(learner, (0, 2, 0), 1)  # (2, 2, 0), the bad end: both kinds of end are met again, one by hint alone
+    watch(learner, (0, 2, 0), 1)  # (2, 2, 0), the bad end: both kinds of end are met again, one by prior alone
     watch(learner, (0, 1, 1), 3)  # back to (0, 0, 1)
     before = float(learner.imagine(lamp.frame, actions=np.array([3]), depth=1, rng=np.random.default_rng(0)).rewards[0])
     goal = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
-    assert (goal.rewards[0] > 2.0) == (carried > 0.0), "an earlier goal is expected where hints are taken"
+    assert (goal.rewards[0] > 2.0) == (carried > 0.0), "an earlier goal is expected where causes are transferred"
     for _ in range(2):
         won = fake_codes.transition((2, 0, 1), 2)
         learner.observe(dataclasses.replace(won, reward=-1.0, terminated=False), episode=1)
     after = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
     assert after.rewards[0] < 1.0
-    assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by hint alone, too"
+    assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by the prior alone, too"
 
 
 def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
@@ -108,7 +108,7 @@ def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPa
     assert sum(scores[0]) > sum(scores[1]) + 0.3
 
 
-def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_bit(other_task: None) -> None:
+def test_resumed_on_a_second_task_equals_uninterrupted(other_task: None) -> None:
     learner, resumed = agent(), agent(99)
     first, second = np.random.default_rng(0), np.random.default_rng(0)
     live(learner, range(10), first)
@@ -128,13 +128,13 @@ def test_an_agent_resumed_on_its_second_task_equals_an_uninterrupted_one_to_the_
     assert same(learner.state(), resumed.state())
 
 
-# --- questions ---------------------------------------------------------------------------------------------------
+# --- queries -----------------------------------------------------------------------------------------------------
 
 
-def ask(learner: FactoredAgent, questions: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
-    """Let it ask and answer truly; the plans asked about."""
+def ask(learner: FactoredAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+    """Let it query, and label truly; the macro-actions asked about."""
     asked = []
-    for _ in range(questions):
+    for _ in range(queries):
         actions = learner.query(Observation(frame=frame(code)))
         if actions is None:
             break
@@ -146,14 +146,14 @@ def ask(learner: FactoredAgent, questions: int, code: tuple[int, ...] = (0, 1, 1
     return asked
 
 
-def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics() -> None:
+def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     learner = agent()
     assert isinstance(learner, QueryingAgent)
     assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
-    learner.learn()  # what was no surprise too
+    learner.learn()  # what was expected too
     known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.replay.count_real()
-    doubt = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
+    before = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     asked = ask(learner, 200)
     assert 0 < len(asked) < 200
     assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
@@ -161,25 +161,25 @@ def test_it_asks_what_it_doubts_until_it_doubts_nothing_and_learns_no_dynamics()
     assert (learner.replay.count_real(), learner.replay.count_labels()) == (real, len(asked))
     assert learner.diagnostics()["oracle/labels"] == len(asked)
     after = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
-    assert after <= doubt
+    assert after <= before
 
 
-def test_answers_save_episodes() -> None:
-    def curve(questions: int) -> float:
+def test_labels_save_episodes() -> None:
+    def curve(queries: int) -> float:
         total = 0.0
         for seed in range(3):
             learner, rng = agent(seed), np.random.default_rng(seed)
             for first in range(0, 20, 5):
                 live(learner, range(first, first + 5), rng)
-                ask(learner, questions, (0, 1, 1))
-                ask(learner, questions, (0, 1, 0))
+                ask(learner, queries, (0, 1, 1))
+                ask(learner, queries, (0, 1, 0))
                 total += success(learner) / 12
         return total
 
     assert curve(4) > curve(0) + 0.05
 
 
-def test_what_has_no_answer_is_not_asked_again() -> None:
+def test_what_has_no_label_is_not_asked_again() -> None:
     learner = agent()
     live(learner, range(12), np.random.default_rng(0))
     seen, asked = Observation(frame=frame((0, 1, 1))), []
@@ -194,7 +194,7 @@ def test_what_has_no_answer_is_not_asked_again() -> None:
     assert learner.replay.without_label == set(asked)
 
 
-def test_questions_lead_where_the_dynamics_do() -> None:
+def test_queries_lead_where_the_dynamics_do() -> None:
     learner = agent()
     live(learner, range(40), np.random.default_rng(0))
     learner.learn()
@@ -212,7 +212,7 @@ def test_questions_lead_where_the_dynamics_do() -> None:
 
 
 def test_a_prior_for_staying_is_no_knowledge() -> None:
-    """Of one part that holds all, it alone would call more than half sure."""
+    """Of one factor that holds all, it alone would call more than half sure."""
     learner = agent(dynamics__factored=False)
     codes = np.array([learner.perception.code(frame(code)) for code in starts()])
     assert not likeliest(learner.model, codes)[1].any()
@@ -239,13 +239,13 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch
     live_on_latents(learner, range(8), np.random.default_rng(0))
     model = learner.imagination.model
     kept = [weight.clone() for weight in model.dynamics.parameters()]
-    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.assessment, learner.controller)]
+    forgotten = [[weight.clone() for weight in part.parameters()] for part in (model.head, learner.controller)]
     resumed.restore(learner.state())
     learner.reset_for_new_task()
     resumed.reset_for_new_task()
     model = learner.imagination.model
     assert all(bool((a == b).all()) for a, b in zip(kept, model.dynamics.parameters(), strict=True))
-    for before, part in zip(forgotten, (model.assessment, learner.controller), strict=True):
+    for before, part in zip(forgotten, (model.head, learner.controller), strict=True):
         assert any(bool((a != b).any()) for a, b in zip(before, part.parameters(), strict=True))
     assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
     assert same(learner.state(), resumed.state())

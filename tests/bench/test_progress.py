@@ -83,7 +83,7 @@ def after_ten_hours(monkeypatch: pytest.MonkeyPatch, *told: Progress, done: dict
         show(told[-1])
 
 
-def test_time_left_is_of_what_no_sitting_has_done(
+def test_time_left_is_of_what_no_session_has_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Three runs of 19 parts have done 9 each before, three of 5 nothing; 10 more take ten hours, 35 are left."""

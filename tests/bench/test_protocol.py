@@ -42,8 +42,9 @@ def test_seeds_in_any_order_are_one_bench():
 def test_any_change_changes_the_hash():
     base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
     changes = {
-        "task": "arrow_puzzle_hard", "preset": "smoke", "settings": "chapter_3", "hyperparameters": "thesis",
-        "agents": ("dqn",), "seeds": (5,), "budgets": (7,),
+        "task": "arrow_puzzle_hard", "preset": "smoke", "hyperparameters": "minimal", "settings": "chapter_3",
+        "agents": ("dqn",),
+        "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
@@ -63,13 +64,15 @@ def test_any_change_changes_the_hash():
 def test_a_preset_that_changes_is_another_bench(
     monkeypatch: pytest.MonkeyPatch, agents: tuple[str, ...], moved: bool
 ) -> None:
-    from imagine_bench.agents.config_groups import Deviation
-    from imagine_bench.agents.imagination import chapter_5
+    from imagine_bench.agents.dqn_settings import HYPERPARAMETERS as DQN
+    from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
+    from imagine_bench.agents.settings import Override
 
     before, _ = plan_control("arrow_puzzle", "quick", agents=agents)
     again, _ = plan_control("arrow_puzzle", "quick", agents=agents)
     assert before == again and len(before.settings_digest) == 12
-    monkeypatch.setitem(chapter_5.CHAPTER_5.presets["quick"], "controller.discount", Deviation(0.9, "a test"))
+    for one in (DQN, HYPERPARAMETERS):
+        monkeypatch.setitem(one.groups["chapter_5"].sets["fast"], "controller.discount", Override(0.9, "a test"))
     after, _ = plan_control("arrow_puzzle", "quick", agents=agents)
     assert (after.hash != before.hash) is moved
     asked, _ = plan_control("arrow_puzzle", "quick", agents=agents, budgets=(5,))

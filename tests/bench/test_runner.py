@@ -37,13 +37,13 @@ def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
 ) -> None:
     asked = []
-    for name in ("examples", "imagine_sampled_rollouts", "ask"):
+    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
         real = getattr(observers, name)
         monkeypatch.setattr(
             observers, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
         )
     do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
-    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("ask", purpose)}
+    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("open_loop_starts", purpose)}
 
 
 def test_a_run_counts_what_happens(tmp_path: Path) -> None:

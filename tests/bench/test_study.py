@@ -11,10 +11,11 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers its agents
 import numpy as np
 import pytest
-from imagine_bench.agents.imagination.chapter_5 import CHAPTER_5
-from imagine_bench.agents.presets import flatten
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
+from imagine_bench.agents.settings import flatten
 from small_runs import do
 
+from imagine_bench import registry
 from imagine_bench.bench import run_state
 from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.launchers import Failure, Job
@@ -133,10 +134,8 @@ def test_chosen_variants_bring_what_they_are_compared_with() -> None:
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_settings_of_every_study_exist(name: str) -> None:
-    from imagine_bench.agents.presets import resolve
-
     for variant in STUDIES[name].variants:
-        resolve("quick", variant.settings, "chapter_5")
+        registry.load(registry.agent_entry(variant.agent).settings).resolve("fast", variant.settings, "chapter_5")
 
 
 def test_the_table_says_what_helps() -> None:
@@ -164,12 +163,13 @@ UNSTUDIED = {
 
 def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
     varied = {name for study in STUDIES.values() for variant in study.variants for name in variant.settings}
-    deviations = set(CHAPTER_5.presets["quick"])
+    chapter_5 = HYPERPARAMETERS.groups["chapter_5"]
+    deviations = set(chapter_5.sets["fast"])
     assert deviations - varied == UNSTUDIED.keys()
     for variant in STUDIES["deviations"].variants:
         for name, value in variant.settings.items():
             if name != "model.precision":  # the thesis' is that of the machine
-                assert value == flatten(CHAPTER_5.thesis)[name] != CHAPTER_5.presets["quick"][name].value
+                assert value == flatten(chapter_5.published)[name] != chapter_5.sets["fast"][name].value
 
 
 def test_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

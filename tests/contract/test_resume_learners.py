@@ -30,7 +30,7 @@ class KilledError(Exception):
 
 
 def do(folder: Path, agent: str, every_s: float) -> RunResult:
-    overrides = {"imagination.rehearsal_episodes": 5, "imagination.start_episode": 3}
+    overrides = {"imagination.model_only_episodes": 5, "imagination.start_episode": 3}
     own = tuple(registry.own_settings(agent, overrides).items())
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=own)
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.AGENTS[agent].encoder_kind)

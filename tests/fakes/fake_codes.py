@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from imagine_bench.agents.factored.agent import FactoredAgent
-from imagine_bench.agents.factored.settings import resolve
+from imagine_bench.agents.factored.settings import HYPERPARAMETERS
 from torch.nn import functional
 
 from imagine_bench.interfaces import Frame, Observation, Transition
@@ -36,9 +36,9 @@ class FakeCodes:
 
 
 def frame(code: tuple[int, ...]) -> Frame:
-    picture = np.zeros((64, 64, 3), dtype=np.uint8)
-    picture[0, : len(code), 0] = code
-    return picture
+    image = np.zeros((64, 64, 3), dtype=np.uint8)
+    image[0, : len(code), 0] = code
+    return image
 
 
 def step(code: tuple[int, ...], action: int) -> tuple[tuple[int, ...], float, bool]:
@@ -75,7 +75,9 @@ def starts() -> list[tuple[int, ...]]:
 
 
 def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
-    settings = resolve("quick", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5")
+    settings = HYPERPARAMETERS.resolve(
+        "fast", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5"
+    )
     return FactoredAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
 
 

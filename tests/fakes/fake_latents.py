@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,8 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from imagine_bench.agents import dqn
+from imagine_bench.agents.dqn import DQN
 from imagine_bench.agents.encoders import perception
 
+from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
@@ -80,6 +84,11 @@ def context(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any] | None = 
     values = {"n_actions": ACTIONS, "preprocessing": "gray_strips", "encoder": Path("fake.safetensors")}
     values |= {"seeds": SeedTree(0), "hyperparameters": "published", "overrides": {**SMALL, **(overrides or {})}}
     return AgentContext(**(values | changes))
+
+
+def make_dqn(context: AgentContext) -> DQN:
+    """The DQN, given those of the overrides that it has, as in a bench."""
+    return dqn.make(replace(context, overrides=registry.own_settings("dqn", context.overrides)))
 
 
 def live(agent: Any, episodes: range, rng: np.random.Generator, states: int = 6) -> list[int]:

@@ -12,8 +12,8 @@ from fake_latents import CODES, LATENTS, FakeEncoder, frame
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination.futures import sample_futures
 from imagine_bench.agents.imagination.rollouts import Imagination
+from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
 from imagine_bench.agents.replay import RealMemory
-from imagine_bench.agents.settings import ImaginationSettings, Settings, WorldModelSettings
 from numpy.typing import NDArray
 
 from imagine_bench import registry
@@ -177,6 +177,8 @@ def learned(components: int) -> Imagination:
         dynamics_hidden=(64, 64),
         components=components,
         shared_hidden=(32,),
+        reward_hidden=(),
+        termination_hidden=(),
         dropout=0.0,
         learning_rate=5e-3,
         sigma_floor=0.05,

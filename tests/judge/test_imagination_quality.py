@@ -7,14 +7,13 @@ import dataclasses
 import bench_fakes
 import numpy as np
 import pytest
+from small_runs import context
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
-from imagine_bench.interfaces import AgentContext, Outcome, TaskSpec
-from imagine_bench.judge.imagination_quality import EXAMPLES, OpenLoopStart, ask, examples, open_loop
+from imagine_bench.interfaces import Outcome, TaskSpec
+from imagine_bench.judge.imagination_quality import EXAMPLES, OpenLoopStart, examples, open_loop, open_loop_starts
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
-
-AGENT = AgentContext(n_actions=6, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0).child("agent"))
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +23,7 @@ def spec() -> TaskSpec:
 
 @pytest.fixture(scope="module")
 def starts(spec: TaskSpec) -> tuple[OpenLoopStart, ...]:
-    return ask(spec, starts=40, depth=10, appearance="clean")
+    return open_loop_starts(spec, starts=40, depth=10, appearance="clean")
 
 
 def only(belief: dict[tuple[int, ...], float]) -> tuple[int, ...]:
@@ -61,7 +60,7 @@ def test_blind_random_actions_would_not_stay_alive(spec: TaskSpec) -> None:
 
 
 def test_actions_vary_and_starts_repeat(spec: TaskSpec, starts: tuple[OpenLoopStart, ...]) -> None:
-    again = ask(spec, starts=40, depth=10, appearance="clean")
+    again = open_loop_starts(spec, starts=40, depth=10, appearance="clean")
     assert all(np.array_equal(a.frame, b.frame) for a, b in zip(starts, again, strict=True))
     assert all(np.array_equal(a.actions, b.actions) for a, b in zip(starts, again, strict=True))
     assert len({tuple(start.actions) for start in starts}) > 30
@@ -71,7 +70,7 @@ class KnowsTheTruth(bench_fakes.RulesImaginer):
     """Right until ``wrong_from``, then wrong in one coordinate; finds its start by its frame and actions."""
 
     def __init__(self, starts: tuple[OpenLoopStart, ...]) -> None:
-        super().__init__(AGENT)
+        super().__init__(context())
         self.starts = starts
 
     def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
@@ -97,7 +96,7 @@ class Unsure(bench_fakes.RulesImaginer):
     """Wrong at depth 3 in every other rollout, where its epistemic uncertainty is high; modal is high where right."""
 
     def __init__(self, starts: tuple[OpenLoopStart, ...]) -> None:
-        super().__init__(AGENT)
+        super().__init__(context())
         self.starts = starts
 
     def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
@@ -120,7 +119,7 @@ def test_uncertainty_is_held_to_the_errors_it_should_find(starts: tuple[OpenLoop
 
 
 def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
-    agent = bench_fakes.RulesImaginer(AGENT)
+    agent = bench_fakes.RulesImaginer(context())
     first = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
     again = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
     assert len(first) == EXAMPLES
@@ -132,7 +131,7 @@ def test_examples_stand_beside_the_truth(spec: TaskSpec) -> None:
 
 
 def test_examples_of_a_run_that_tunes_begin_elsewhere(spec: TaskSpec) -> None:
-    agent = bench_fakes.RulesImaginer(AGENT)
+    agent = bench_fakes.RulesImaginer(context())
     reported, tuning = (
         examples(agent, spec, appearance="clean", seeds=SeedTree(0), purpose=evaluation_split(seed))
         for seed in (0, TUNING_SEEDS)
@@ -161,6 +160,6 @@ def test_random_rules_give_only_starts_that_surely_stay_alive(spec: TaskSpec) ->
         action_names=("stay", "jump"),
         render_macrostates=lambda states, appearance, rng: np.zeros((len(states), 64, 64, 3), np.uint8),
     )
-    asked = ask(coin, starts=8, depth=3, appearance="clean")
-    assert len(asked) == 8
-    assert all(start.actions.tolist() == [0, 0, 0] for start in asked)  # from (0,) alone, staying
+    found = open_loop_starts(coin, starts=8, depth=3, appearance="clean")
+    assert len(found) == 8
+    assert all(start.actions.tolist() == [0, 0, 0] for start in found)  # from (0,) alone, staying

@@ -8,15 +8,17 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
 from fake_agents import FakeAgent
-from inline_bench import Inline, bench
 from numpy.typing import NDArray
+from small_runs import Inline, small
 
 from imagine_bench import registry
+from imagine_bench.bench import bench as benches
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, State, TaskSpec
@@ -36,10 +38,17 @@ from imagine_bench.report.policy import PolicyAnalysis
 from imagine_bench.rules import fewest_actions, greedy
 from imagine_bench.store import encoders
 from imagine_bench.store.files import lock
+from imagine_bench.store.results import BenchResult
 from imagine_bench.store.trained import learners, load_trained
 
 HARD = registry.task("arrow_puzzle_hard")
 PICK = registry.task("pick_place")
+
+
+def bench(root: Path, launcher: Inline, **changes: Any) -> BenchResult:
+    wanted = small(**{"budgets": (2, 9), "agents": ("table", "imaginer"), "seeds": (0, 1), **changes})
+    result: BenchResult = benches.bench(wanted, None, root=root, launcher=launcher)
+    return result
 
 
 @pytest.fixture(scope="module")

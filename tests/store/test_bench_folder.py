@@ -95,7 +95,7 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     assert "color" in path.read_text()
 
 
-def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
+def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     opened(tmp_path).begin_session(_ENVIRONMENT)
     changed = opened(tmp_path).begin_session({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
     assert changed == ["versions"]
@@ -105,7 +105,7 @@ def test_a_sitting_elsewhere_is_noticed(tmp_path: Path) -> None:
     assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]
 
 
-def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
+def test_a_session_that_was_killed_at_any_write_can_be_begun_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for survived in (0, 1):
@@ -127,7 +127,7 @@ def test_a_sitting_that_was_killed_at_any_write_can_be_begun_again(
 
 
 @pytest.mark.parametrize("content", ["[{}]", "[1]", '[{"wall_s": null}]'])
-def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
+def test_sessions_that_say_nothing_are_named(tmp_path: Path, content: str) -> None:
     store = opened(tmp_path)
     store.begin_session(_ENVIRONMENT)
     (store.folder / "sessions.json").write_text(content)
@@ -136,7 +136,7 @@ def test_sittings_that_say_nothing_are_named(tmp_path: Path, content: str) -> No
 
 
 @pytest.mark.parametrize(("name", "content"), [("sessions.json", "null"), ("environment.json", "[]")])
-def test_a_damaged_sitting_is_named(tmp_path: Path, name: str, content: str) -> None:
+def test_a_damaged_session_is_named(tmp_path: Path, name: str, content: str) -> None:
     store = opened(tmp_path)
     store.begin_session(_ENVIRONMENT)
     (store.folder / name).write_text(content)

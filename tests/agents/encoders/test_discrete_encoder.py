@@ -72,7 +72,7 @@ def test_dependence_sees_what_correlation_does_not() -> None:
 
 
 @pytest.mark.parametrize("flushed", [False, True])
-def test_clouds_are_counted_whatever_their_shape_and_equal_points_hang_together(flushed: bool) -> None:
+def test_clouds_of_any_shape_are_counted_and_equal_points_joined(flushed: bool) -> None:
     torch.set_flush_denormal(flushed)  # as every learner of the suite runs; the tree of neighbours must not mind
     rng = np.random.default_rng(0)
     angle = rng.uniform(0, 2 * np.pi, size=2000)

@@ -222,7 +222,7 @@ def test_probe_reads_separable_latents_and_not_noise() -> None:
 # --- training --------------------------------------------------------------------------------------------------------
 
 
-def test_training_repeats_bit_for_bit_and_leaves_global_randomness_alone(tiny: Encoder) -> None:
+def test_training_repeats_bit_for_bit_without_global_randomness(tiny: Encoder) -> None:
     before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     again = train_encoder(arrow_spec(), recipe=TINY, appearance="mild", seed=3)
     other = train_encoder(arrow_spec(), recipe=TINY, appearance="mild", seed=4)
@@ -370,6 +370,21 @@ def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:
     assert (tmp_path / "e.json").read_text() == "mine" and not (tmp_path / "e.safetensors").exists()
 
 
+def test_saving_that_fails_half_way_leaves_no_artefact(
+    tiny: Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*paths: Path) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        tiny.save(tmp_path / "e.safetensors")
+    assert not (tmp_path / "e.safetensors").exists() and not (tmp_path / "e.json").exists()
+    monkeypatch.undo()
+    tiny.save(tmp_path / "e.safetensors")
+    assert Encoder.load(tmp_path / "e.safetensors").card == tiny.card
+
+
 def test_view_joins_strips_and_keeps_colors() -> None:
     frames, _ = draw_frames(arrow_spec(), "mild", 2, np.random.default_rng(0))
     assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
@@ -380,7 +395,7 @@ def test_view_joins_strips_and_keeps_colors() -> None:
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_retrain_leaves_artefact_card_and_picture_and_never_overwrites(tmp_path: Path) -> None:
+def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path) -> None:
     text = retrain(arrow_spec(), recipe=TINY, appearance="mild", seed=1, out=tmp_path / "new")
     path = tmp_path / "new" / "drawn_arrows-mild.safetensors"
     card = Encoder.load(path).card

@@ -16,7 +16,7 @@ from imagine_bench.agents.factored.factors import CodeTransition
 from imagine_bench.agents.factored.model import FactoredModel
 from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.planner import Planner
-from imagine_bench.agents.factored.settings import DynamicsSettings, FactoredSettings, OutcomeSettings, resolve
+from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import Imaginer, Label, ReplayReader, ValueReader
@@ -24,7 +24,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameEr
 from imagine_bench.interfaces import AgentState, Observation
 
 
-def test_an_action_s_parents_are_found_and_what_it_leaves_alone_is_known_to_stay() -> None:
+def test_parents_are_found_and_factors_left_alone_stay() -> None:
     dynamics, rng = Dynamics((3, 3, 2), 1, DynamicsSettings()), np.random.default_rng(0)
     for _ in range(60):
         code = np.array([rng.integers(3), rng.integers(3), rng.integers(2)])
@@ -39,7 +39,7 @@ def test_an_action_s_parents_are_found_and_what_it_leaves_alone_is_known_to_stay
     assert all(np.allclose(part.expected.sum(axis=2), 1.0) for part in predictions)
 
 
-def test_what_was_never_seen_is_unknown_and_chance_is_learned_as_chance() -> None:
+def test_the_unseen_is_unknown_and_noise_is_learned_as_noise() -> None:
     dynamics, rng = Dynamics((2, 3), 2, DynamicsSettings()), np.random.default_rng(0)
     assert dynamics.predict(np.array([[0, 0]]))[0].unknown.max() == pytest.approx(0.5), "half a chance that it stays"
     for _ in range(300):
@@ -93,7 +93,7 @@ def test_causes_generalise_to_transitions_that_were_never_seen() -> None:
     assert np.allclose(chance.sum(axis=1), 1.0)
 
 
-def test_an_untested_conjunction_is_doubted_until_it_is_tested() -> None:
+def test_an_untested_conjunction_is_uncertain_until_tested() -> None:
     few = rows([(0, 1, 0)])
     before = outcomes_of(few).predict(np.array([[0, 2, 0]]), np.array([0]), np.array([[1, 2, 0]]))[1]
     tested = CodeTransition((0, 2, 0), 0, (1, 2, 0), -1.0, False)
@@ -140,7 +140,7 @@ class _Chain:
 
 
 @pytest.mark.parametrize("depth", [1, 4, 5, 20])
-def test_values_are_discounted_once_a_macro_action_and_end_at_the_depth(depth: int) -> None:
+def test_values_are_discounted_by_the_step_and_end_at_the_depth(depth: int) -> None:
     settings = dataclasses.replace(FactoredSettings().planning, depth=depth, discount=0.9, novelty_discount=0.8)
     planner = Planner(_Chain(5, settings.branches), settings)  # type: ignore[arg-type]
     for place in range(5):
@@ -173,7 +173,7 @@ def test_a_bounded_plan_does_not_depend_on_what_was_asked_before(states: int) ->
     assert states >= len(starts()) or used.expanded < len(starts()), "the bound must bind"
 
 
-def test_learns_the_tiny_task_far_above_chance_in_thirty_episodes() -> None:
+def test_thirty_episodes_solve_the_tiny_task_far_above_chance() -> None:
     """Chance: a random agent solves 14.5 % of the starts (exactly, by enumeration below)."""
     assert _chance_level() == pytest.approx(0.145, abs=0.001)
     scores = []
@@ -244,7 +244,7 @@ def test_a_snapshot_of_other_parts_or_actions_is_refused(name: str, value: objec
     assert same(before, learner.state())
 
 
-def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothing() -> None:
+def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     learner = agent()
     assert isinstance(learner, Imaginer)
     assert isinstance(learner, ValueReader)
@@ -272,7 +272,7 @@ def test_imagined_rollouts_have_their_shapes_end_where_expected_and_change_nothi
 
 
 @pytest.mark.parametrize("factored", [True, False])
-def test_what_it_did_is_remembered_in_order_and_what_it_was_told_is_not(factored: bool) -> None:
+def test_replayed_gives_its_own_actions_in_order_and_no_labels(factored: bool) -> None:
     learner = agent(dynamics__factored=factored)
     assert isinstance(learner, ReplayReader)
     assert [len(part) for part in learner.replayed()] == [0, 0]
@@ -299,7 +299,7 @@ def test_curiosity_outlearns_random_exploration() -> None:
 @pytest.mark.parametrize(
     ("override", "error", "words"),
     [
-        ({"planning.exploration": "bold"}, UnknownNameError, "No exploration 'bold'"),
+        ({"planning.exploration": "bold"}, UnknownNameError, "No value of setting planning.exploration: 'bold'"),
         ({"planning.depht": 3}, UnknownNameError, "Did you mean 'planning.depth'"),
         ({"planning.depth": 0}, InvalidValueError, "planning.depth is 0; it must be at least 1"),
         ({"dynamics.persistence": 1.0}, InvalidValueError, "must lie between 0 and 1"),
@@ -309,4 +309,4 @@ def test_curiosity_outlearns_random_exploration() -> None:
 )
 def test_wrong_settings_are_refused(override: dict[str, object], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        resolve("quick", override, "chapter_5")
+        HYPERPARAMETERS.resolve("fast", override, "chapter_5")

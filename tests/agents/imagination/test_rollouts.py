@@ -7,62 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from imagine_bench.agents.controller import Controller
+from counting_model import CPU, CountingModel, T, make, remembering
+from imagine_bench.agents.dqn import Controller
+from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.rollouts import _BEYOND, Imagination
+from imagine_bench.agents.imagination.rollouts import LATENT_LIMIT, Imagination
+from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import WorldModel
 from imagine_bench.agents.replay import Batch, RealMemory
-from imagine_bench.agents.settings import ControllerSettings, ImaginationSettings, Settings, WorldModelSettings
+from imagine_bench.agents.snapshot import load_training, training_arrays
 
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
-CPU = torch.device("cpu")
 NOTHING_REAL = RealMemory(1, 2, CPU)
-T = 4
-
-
-class CountingModel:
-    """An identifiable world model: latent (i, c) goes to (i, c + 1), and doubt and end come at chosen counts.
-
-    The first latent dimension tells the rollouts apart by the action taken first.
-    """
-
-    members, latent_size = 1, 2
-
-    def __init__(self, *, doubt_at: int = -1, end_at: int = -1, spurious_at: int = -1, torn_at: int = -1) -> None:
-        self.doubt_at, self.end_at, self.spurious_at, self.torn_at = doubt_at, end_at, spurious_at, torn_at
-
-    def draw_weights(self, count: int, dropout: torch.Generator) -> None:
-        return None
-
-    def draw_reward_weights(self, count: int, dropout: torch.Generator) -> tuple[torch.Tensor, ...]:
-        return ()
-
-    def reward_std(
-        self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor, weights: tuple[torch.Tensor, ...]
-    ) -> torch.Tensor:
-        return 2.0 * (next_z[:, 1] == self.spurious_at)
-
-    def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
-        following = z + torch.tensor([0.0, 1.0])
-        doubtful = (following[:, 1] == self.doubt_at).float()  # [N]
-        spread = torch.linspace(-1.0, 1.0, T)[:, None] * doubtful * 3.0  # [T, N]; zero mean over weight samples
-        means = following.expand(T, *following.shape).clone()
-        means[..., 0] += spread
-        return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
-
-    def assess(self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        ends = (next_z[:, 1] == self.end_at).float() + 0.3 * (next_z[:, 1] == self.torn_at)
-        return 10.0 * next_z[:, 1], ends
-
-
-def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Imagination, Controller]:
-    values = {"breadth": 3, "depth": 10, "temperature": 0.0, "threshold": 0.3, "weight_samples": T}
-    settings = Settings(imagination=ImaginationSettings(**(values | changes)))
-    imagination = Imagination(2, 2, settings, filtered=filtered, seeds=SeedTree(0), device=CPU)
-    imagination.model = model  # type: ignore[assignment]
-    return imagination, Controller(2, 2, settings.controller, torch.Generator().manual_seed(0))
 
 
 def stored_counts(imagination: Imagination) -> list[float]:
@@ -88,8 +46,8 @@ def test_a_predicted_end_is_stored_and_ends_the_rollout() -> None:
     assert (rows["terminated"] == (rows["next_z"][:, 1] == 4.0)).all()
 
 
-def test_the_filter_discards_the_doubtful_transition_and_the_rest_of_its_rollout() -> None:
-    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5))
+def test_the_filter_ends_a_rollout_at_an_uncertain_transition() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(uncertain_at=5))
     counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert stored_counts(imagination) == sorted(3 * [1.0, 2.0, 3.0, 4.0])
     assert dataclasses.astuple(counts) == (3, 15, 12)
@@ -109,7 +67,7 @@ def test_imagination_that_is_not_a_number_is_named_and_not_stored(part: str) -> 
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_a_rollout_whose_variance_overflows_ends_before_it_with_the_filter_or_without(filtered: bool) -> None:
+def test_a_rollout_ends_before_its_variance_overflows(filtered: bool) -> None:
     class Exploding(CountingModel):
         def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
             sound = super().predict(z, action, weights)
@@ -139,7 +97,7 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
     assert kept[0].all() and not kept[-1].any(), "it began as latents are and did run away"
 
 
-def test_what_is_kept_of_a_rollout_that_runs_away_can_still_be_learned_from() -> None:
+def test_what_is_kept_of_a_diverging_rollout_can_be_learned_from() -> None:
     """A whole batch just below the limit leaves a controller finite that has learned; far beyond it would end the run.
 
     With rewards as a reward network gives them there, which has learned too and grows with the latents as well.
@@ -154,60 +112,56 @@ def test_what_is_kept_of_a_rollout_that_runs_away_can_still_be_learned_from() ->
     for _ in range(150):
         model.update(memory.sample(64, draws), draws)
         controller.update(memory.sample(64, draws))
-    learned = controller.arrays()
+    learned = training_arrays(controller, controller.optimiser)
 
     def learn(size: float) -> float:
-        controller.load(learned)
+        load_training(controller, controller.optimiser, learned)
         z, next_z = (size * torch.randn(64, 24, generator=draws).sign() for _ in range(2))
         action = torch.randint(6, (64,), generator=draws)
-        reward, _ = model.assess(z, action, next_z)
+        reward, _ = model.predict_outcome(z, action, next_z)
         loss = controller.update(Batch(z, action, reward, next_z, torch.zeros(64)))
-        assert np.isfinite(controller.arrays()["value"]).all()
+        assert all(bool(weight.isfinite().all()) for weight in controller.parameters())
         return loss
 
-    assert np.isfinite(learn(0.99 * _BEYOND))
+    assert np.isfinite(learn(0.99 * LATENT_LIMIT))
     with pytest.raises(DivergedError):
         learn(1e9)
 
 
-def test_a_variance_that_overflowed_is_doubt_without_bound() -> None:
+def test_a_variance_that_overflowed_counts_as_infinite() -> None:
     imagination, _ = make(filtered=True, model=CountingModel())
     variances = torch.tensor([[0.1, 0.2], [0.1, torch.inf], [torch.nan, 0.2]])
     assert imagination.score(variances).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
 
 
-def test_without_the_filter_doubt_is_kept() -> None:
-    imagination, controller = make(filtered=False, model=CountingModel(doubt_at=5))
+def test_without_the_filter_uncertain_transitions_are_kept() -> None:
+    imagination, controller = make(filtered=False, model=CountingModel(uncertain_at=5))
     counts = imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5)
     assert counts.accepted == counts.predicted == 30
 
 
 @pytest.mark.parametrize(("limit", "kept"), [(1.9, 4), (2.1, 10), (None, 10)])
-def test_a_reward_that_its_network_doubts_is_refused_with_the_rest_of_its_rollout(
-    limit: float | None, kept: int
-) -> None:
-    imagination, controller = make(filtered=True, model=CountingModel(spurious_at=5), reward_threshold=limit)
+def test_an_uncertain_reward_ends_a_rollout(limit: float | None, kept: int) -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(reward_uncertain_at=5), reward_threshold=limit)
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 3 * kept
     assert stored_counts(imagination) == sorted(3 * [float(count) for count in range(1, kept + 1)])
 
 
 @pytest.mark.parametrize(("limit", "kept"), [(0.2, 4), (0.31, 10), (None, 10)])
-def test_an_end_that_its_network_half_expects_is_refused_with_the_rest_of_its_rollout(
-    limit: float | None, kept: int
-) -> None:
+def test_an_uncertain_termination_ends_a_rollout(limit: float | None, kept: int) -> None:
     imagination, controller = make(filtered=True, model=CountingModel(torn_at=5), termination_threshold=limit)
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 3 * kept
     unfiltered, controller = make(filtered=False, model=CountingModel(torn_at=5), termination_threshold=limit)
     assert unfiltered.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 30
 
 
-def test_a_sure_end_passes_the_filter() -> None:
+def test_a_certain_termination_passes_the_filter() -> None:
     imagination, controller = make(filtered=True, model=CountingModel(end_at=4), termination_threshold=0.0)
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 12
 
 
-def test_without_the_filter_a_doubtful_reward_is_kept() -> None:
-    imagination, controller = make(filtered=False, model=CountingModel(spurious_at=5), reward_threshold=0.1)
+def test_without_the_filter_an_uncertain_reward_is_kept() -> None:
+    imagination, controller = make(filtered=False, model=CountingModel(reward_uncertain_at=5), reward_threshold=0.1)
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 30
 
 
@@ -219,7 +173,7 @@ def test_a_reward_threshold_without_dropout_is_refused() -> None:
         Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
 
 
-@pytest.mark.parametrize(("dropout", "samples"), [(0.5, 1), (0.001, 10)], ids=["one", "dropout_rounds_to_0"])
+@pytest.mark.parametrize(("dropout", "samples"), [(0.5, 1), (0.0, 10)])
 def test_a_filter_with_a_single_weight_sample_is_refused(dropout: float, samples: int) -> None:
     model, imagination = WorldModelSettings(dropout=dropout), ImaginationSettings(weight_samples=samples)
     settings = Settings(model=model, imagination=imagination)
@@ -230,13 +184,15 @@ def test_a_filter_with_a_single_weight_sample_is_refused(dropout: float, samples
 
 @pytest.mark.parametrize(("reduction", "accepted"), [("max", 12), ("mean", 30)])
 def test_the_threshold_is_compared_with_the_named_reduction(reduction: str, accepted: int) -> None:
-    # The epistemic variance at the doubtful step is (5, 0): 5 at most, 2.5 on average.
-    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=5), reduction=reduction, threshold=4.0)
+    # The epistemic variance at the uncertain step is (5, 0): 5 at most, 2.5 on average.
+    imagination, controller = make(
+        filtered=True, model=CountingModel(uncertain_at=5), reduction=reduction, threshold=4.0
+    )
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == accepted
 
 
-def test_everything_doubtful_stores_nothing() -> None:
-    imagination, controller = make(filtered=True, model=CountingModel(doubt_at=1))
+def test_nothing_is_stored_where_all_is_uncertain() -> None:
+    imagination, controller = make(filtered=True, model=CountingModel(uncertain_at=1))
     assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 0
     assert len(imagination.memory) == 0
 
@@ -271,15 +227,6 @@ def test_the_components_of_different_networks_are_not_averaged() -> None:
     assert set(imagination.memory.arrays()["next_z"].ravel().tolist()) <= {-1.0, 1.0}
 
 
-def remembering(count: int) -> RealMemory:
-    """Real states (i, 5) for i below ``count``, known exactly."""
-    real = RealMemory(count, 2, CPU)
-    for index in range(count):
-        z, sigma = torch.tensor([float(index), 5.0]), torch.zeros(2)
-        real.add((z, sigma), 0, 0.0, (z, sigma), False)
-    return real
-
-
 def test_rollouts_start_from_the_current_state_or_from_remembered_ones() -> None:
     for start, seen in (("current", {(0.0, 0.0)}), ("replayed", {(float(index), 5.0) for index in range(4)})):
         imagination, controller = make(filtered=False, model=CountingModel(), breadth=60, depth=1, start_states=start)
@@ -288,11 +235,11 @@ def test_rollouts_start_from_the_current_state_or_from_remembered_ones() -> None
 
 
 @pytest.mark.parametrize(("quantile", "threshold", "kept"), [(1.0, 49.0, [3, 0]), (0.0, 0.0, [0, 0])])
-def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happened(
+def test_a_moving_threshold_is_a_quantile_of_real_transitions(
     quantile: float, threshold: float, kept: list[int]
 ) -> None:
     class Graded(CountingModel):
-        """Doubts a transition out of (i, c) the more, the larger i: its variance is i squared."""
+        """Is less certain of a transition out of (i, c), the larger i: its variance is i squared."""
 
         def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
             spread = torch.tensor([-1.0, 1.0])[:, None] * z[:, 0]  # [2, N]
@@ -303,8 +250,8 @@ def test_a_moving_threshold_is_the_quantile_of_the_doubt_about_what_really_happe
         filtered=True, model=Graded(), depth=1, reduction="max", threshold_quantile=quantile, threshold=99.0
     )
     accepted = [
-        imagination.rollouts(controller, torch.tensor([doubt, 0.0]), remembering(8), 0.5).accepted
-        for doubt in (6.9, 7.1)
+        imagination.rollouts(controller, torch.tensor([first, 0.0]), remembering(8), 0.5).accepted
+        for first in (6.9, 7.1)
     ]
     assert imagination.threshold == threshold
     assert accepted == kept

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.settings import WorldModelSettings
 from imagine_bench.agents.imagination.uncertainty import decompose
-from imagine_bench.agents.imagination.world_model import Update, WorldModel, log_cosh
-from imagine_bench.agents.networks.mlp import Parameters
+from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
 from imagine_bench.agents.replay import Batch
-from imagine_bench.agents.settings import WorldModelSettings
-from imagine_bench.agents.speed.plain_model import PlainWorldModel
-from torch import nn
+from imagine_bench.agents.speed import PlainWorldModel
 
 from imagine_bench.errors import DivergedError
 
@@ -27,6 +25,8 @@ SETTINGS = WorldModelSettings(
 
 
 def make(**changes: object) -> WorldModel:
+    if changes.get("shared_hidden"):
+        changes |= {"reward_hidden": (), "termination_hidden": ()}
     return WorldModel(Z, A, dataclasses.replace(SETTINGS, **changes), torch.Generator().manual_seed(0))
 
 
@@ -41,7 +41,7 @@ def chain_batch(count: int, generator: torch.Generator) -> Batch:
 
 def losses(model: WorldModel, batch: Batch, dropout: torch.Generator) -> torch.Tensor:
     """Of dynamics, reward and termination. Shape (3,)."""
-    return model.losses([Update(model, batch, dropout)], Parameters(model.optimiser.parameters))[:, 0]
+    return torch.stack(model.losses(batch, dropout))
 
 
 def test_log_cosh_is_itself_and_does_not_overflow() -> None:
@@ -58,7 +58,7 @@ def test_it_learns_a_small_deterministic_chain(predict_change: bool) -> None:
         model.update(chain_batch(64, draws), dropout)
     test = chain_batch(100, torch.Generator().manual_seed(3))
     predicted = mdn.mean(mdn.average(model.predict(test.z, test.action, None)))
-    reward, p_terminated = model.assess(test.z, test.action, test.next_z)
+    reward, p_terminated = model.predict_outcome(test.z, test.action, test.next_z)
     assert (predicted - test.next_z).abs().max() < 0.25  # states are 0.67 apart and more
     assert (reward - test.reward).abs().max() < 0.15
     assert ((p_terminated > 0.5).float() == test.terminated).all()
@@ -96,12 +96,12 @@ def aliased_batch(count: int, generator: torch.Generator) -> Batch:
 @pytest.mark.parametrize(("shared", "told_apart"), [((), True), ((32,), True), ((32,), False)])
 def test_only_a_transition_tells_apart_what_one_next_state_hides(shared: tuple[int, ...], told_apart: bool) -> None:
     read = "transition" if told_apart else "next_state"
-    model = make(dropout=0.0, shared_hidden=shared, assessment_input=read, learning_rate=5e-3)
+    model = make(dropout=0.0, shared_hidden=shared, head_input=read, learning_rate=5e-3)
     draws, dropout = torch.Generator().manual_seed(1), torch.Generator().manual_seed(2)
     for _ in range(200):
         model.update(aliased_batch(64, draws), dropout)
     test = aliased_batch(100, torch.Generator().manual_seed(3))
-    reward, p_terminated = model.assess(test.z, test.action, test.next_z)
+    reward, p_terminated = model.predict_outcome(test.z, test.action, test.next_z)
     right = (p_terminated > 0.5).float() == test.terminated
     assert bool(right.all()) is told_apart
     assert bool(((reward - test.reward).abs() < 0.1).all()) is told_apart
@@ -122,8 +122,8 @@ def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
     assert torch.equal(repeated.means, together.means)
 
 
-@pytest.mark.parametrize("changes", [{}, {"shared_hidden": (16, 8)}, {"assessment_input": "transition"}])
-def test_the_doubt_about_a_reward_is_the_spread_of_a_loop_over_weight_samples(changes: dict[str, object]) -> None:
+@pytest.mark.parametrize("changes", [{}, {"shared_hidden": (16, 8)}, {"head_input": "transition"}])
+def test_reward_std_is_the_spread_of_a_loop_over_weight_samples(changes: dict[str, object]) -> None:
     model = make(reward_scale=10.0, **changes)
     weights = model.draw_reward_weights(7, torch.Generator().manual_seed(1))
     assert weights is not None
@@ -131,16 +131,16 @@ def test_the_doubt_about_a_reward_is_the_spread_of_a_loop_over_weight_samples(ch
     rewards = []
     for sample in range(7):  # one dropped-out network after the other
         one = tuple(mask[:, sample : sample + 1].expand(-1, 4, -1) for mask in weights)
-        rest = [None] * (len(model.assessment.networks) - 1)
+        rest = [None] * (len(model.head.networks) - 1)
         with torch.no_grad():  # gradients would be computed in bfloat16
-            reward, _ = model.assessment(z[None], action[None], next_z[None], [one, *rest])
-            rewards.append(10.0 * reward[0])
+            reward, _ = model.head(z, action, next_z, [one, *rest])
+            rewards.append(10.0 * reward)
     expected = torch.stack(rewards).std(dim=0, correction=0)  # [4]
     assert expected.min() > 0.0, "weight samples must disagree"
     torch.testing.assert_close(model.reward_std(z, action, next_z, weights), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_rewards_are_doubted_where_none_was_seen() -> None:
+def test_rewards_are_uncertain_where_none_was_seen() -> None:
     """Between two known states whose rewards differ the samples disagree; at the known ones they hardly do."""
     model = make(dropout=0.25, learning_rate=5e-3)
     draws, dropout = torch.Generator().manual_seed(1), torch.Generator().manual_seed(2)
@@ -150,15 +150,15 @@ def test_rewards_are_doubted_where_none_was_seen() -> None:
     assert weights is not None
     known, action = CODES[:3], torch.zeros(3, dtype=torch.int64)
     elsewhere = 3.0 * CODES[4] - 2.0 * CODES[:3]  # past the rewarded state, where nothing was seen
-    doubts = [model.reward_std(known, action, places, weights) for places in (known, elsewhere)]
-    assert doubts[1].min() > 2.0 * doubts[0].max()
+    stds = [model.reward_std(known, action, places, weights) for places in (known, elsewhere)]
+    assert stds[1].min() > 2.0 * stds[0].max()
 
 
 def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
     model = make()
     z, action = CODES[:4], torch.zeros(4, dtype=torch.int64)
     assert torch.equal(model.predict(z, action, None).means, model.predict(z, action, None).means)
-    assert torch.equal(model.assess(z, action, z)[0], model.assess(z, action, z)[0])
+    assert torch.equal(model.predict_outcome(z, action, z)[0], model.predict_outcome(z, action, z)[0])
     batch, generator = chain_batch(16, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2)
     first, second = losses(model, batch, generator), losses(model, batch, generator)
     assert all(not torch.equal(a, b) for a, b in zip(first, second, strict=True))
@@ -206,17 +206,17 @@ def test_members_disagree_where_they_were_not_taught() -> None:
     for _ in range(300):
         model.update(chain_batch(64, draws), torch.Generator())
     known = chain_batch(50, torch.Generator().manual_seed(3))
-    doubt = [
+    epistemic = [
         decompose(model.predict(z, known.action, None)).epistemic.sum(dim=-1).mean() for z in (known.z, 4.0 + known.z)
     ]
-    assert doubt[1] > 20.0 * doubt[0]
+    assert epistemic[1] > 20.0 * epistemic[0]
 
 
 def test_the_reward_may_depend_on_where_the_action_began() -> None:
     """A reward for having come from state 0, which z' alone does not tell."""
     errors = []
     for inputs in ("next_state", "transition"):
-        model = make(dropout=0.0, assessment_input=inputs, learning_rate=5e-3)
+        model = make(dropout=0.0, head_input=inputs, learning_rate=5e-3)
         draws = torch.Generator().manual_seed(1)
 
         def batch(generator: torch.Generator) -> Batch:
@@ -227,23 +227,50 @@ def test_the_reward_may_depend_on_where_the_action_began() -> None:
         for _ in range(300):
             model.update(batch(draws), torch.Generator())
         test = batch(torch.Generator().manual_seed(3))
-        errors.append((model.assess(test.z, test.action, test.next_z)[0] - test.reward).abs().max().item())
+        errors.append((model.predict_outcome(test.z, test.action, test.next_z)[0] - test.reward).abs().max().item())
     assert errors[0] > 0.4 and errors[1] < 0.1
+
+
+def test_a_member_s_update_does_not_depend_on_another_member() -> None:
+    """Gradients, Adam and the max-norm constraint: to the bit."""
+    one, other = make(members=3, max_norm=0.5), make(members=3, max_norm=0.5)
+    with torch.no_grad():
+        for weight in other.dynamics.parameters():
+            weight[1:] *= -3.0
+    draws = torch.Generator().manual_seed(1)
+    dropout = [torch.Generator().manual_seed(2) for _ in range(2)]
+    for batch in (chain_batch(32, draws) for _ in range(3)):
+        one.update(batch, dropout[0])
+        other.update(batch, dropout[1])
+    for first, second in zip(one.dynamics.parameters(), other.dynamics.parameters(), strict=True):
+        assert torch.equal(first[0], second[0])
+        assert not torch.equal(first[1:], second[1:])
+
+
+def test_each_network_s_gradient_is_clipped_by_itself() -> None:
+    """A huge reward loss, clipped, leaves the steps of the other networks as they were."""
+    one, other = make(gradient_clip=1e-3), make(gradient_clip=1e-3)
+    batch = chain_batch(16, torch.Generator().manual_seed(1))
+    one.update(batch, torch.Generator().manual_seed(2))
+    other.update(dataclasses.replace(batch, reward=1e4 + batch.reward), torch.Generator().manual_seed(2))
+    for index, same in enumerate((True, False, True)):
+        first, second = (model.networks[index].weights[0] for model in (one, other))
+        assert torch.equal(first, second) is same
+        norm = torch.stack([weight.grad.norm() for weight in other.networks[index].parameters()]).norm()
+        assert norm <= 1.001e-3
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-3), ("bfloat16", 0.05)])
 def test_it_trains_as_the_plain_model_does(precision: str, tolerance: float) -> None:
     """Without dropout nothing is random: the same weights and batches must go the same way."""
-    settings = dataclasses.replace(SETTINGS, dropout=0.0, max_norm=0.8, precision=precision)
+    settings = dataclasses.replace(SETTINGS, dropout=0.0, members=2, max_norm=0.8, precision=precision)
     ours, plain = make(**dataclasses.asdict(settings)), PlainWorldModel(Z, A, settings, torch.Generator())
     for mine, other in zip(ours.networks, plain.networks, strict=True):
-        linear = [layer for layer in other if isinstance(layer, nn.Linear)]
-        for weight, bias, layer in zip(mine.weights, mine.biases, linear, strict=True):
-            layer.weight.data, layer.bias.data = weight.detach()[0].t().clone(), bias.detach()[0, 0].clone()
+        other.load_state_dict(mine.state_dict())
     draws, dropout = torch.Generator().manual_seed(1), torch.Generator()
     test = chain_batch(256, torch.Generator().manual_seed(9))
     first = [loss.item() for loss in plain.losses(test)]
-    for _ in range(25):
+    for _ in range(50):
         batch = chain_batch(64, draws)
         ours.update(batch, dropout)
         plain.update(batch)
