@@ -46,6 +46,12 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(there), f"{page} links to {target}#{anchor}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_paths_in_the_checkout_exist(page: Path) -> None:
+    named = re.findall(r"`((?:agents|tasks|imagine_bench|assets|tests|docs)/[\w./-]*)`", page.read_text())
+    assert not [path for path in named if path != "imagine_bench/" and not (ROOT / path).exists()]
+
+
 def test_every_page_is_in_the_site() -> None:
     index = (ROOT / "docs" / "index.md").read_text().split()
     pages = [page.relative_to(ROOT / "docs").with_suffix("").as_posix() for page in PAGES[1:]]
@@ -77,18 +83,15 @@ def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch
 
 
 def test_the_twelve_lines_bench_an_agent(tmp_path: Path) -> None:
-    assert len(SCRIPTS) == 2
-    for page, code in SCRIPTS:
-        script = tmp_path / page.stem / "my_agent.py"
-        script.parent.mkdir()
-        short = "--preset smoke --execution kinematic --budgets 2 --evaluation-episodes 3"
-        script.write_text(code.replace("--preset smoke", short))
-        done = subprocess.run(
-            [sys.executable, script.name], cwd=script.parent, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        assert "my agent" in done.stdout and "DQN" in done.stdout
-        assert list(script.parent.glob("runs/arrow_puzzle/*/my_agent/seed_0/DONE"))
+    (page, code), (_, again) = SCRIPTS
+    assert page.name == "README.md" and again == code
+    script = tmp_path / "my_agent.py"
+    short = "--preset smoke --execution kinematic --budgets 2 --evaluation-episodes 3 --seeds 1"
+    script.write_text(code.replace("--preset smoke", short))
+    done = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "my agent" in done.stdout and "DQN" in done.stdout
+    assert list(tmp_path.glob("runs/arrow_puzzle/*/my_agent/seed_1/DONE"))
 
 
 def test_pages_are_short() -> None:
