@@ -12,6 +12,7 @@ myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 4
 exclude_patterns = ["results/**/report"]
 
+autodoc_mock_imports = ["mujoco", "mink"]  # so that the site builds where there is no OpenGL
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
