@@ -26,7 +26,8 @@ from imagine_bench import reference, registry, rules, statistics
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "report")]
+"""All but the reports that somebody has written of kept results, which git ignores."""
 _MARKED = re.compile(r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+)", re.DOTALL)
 
 Runs = dict[int, list[dict[str, str]]]

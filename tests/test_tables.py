@@ -14,7 +14,7 @@ from imagine_bench.store.archive import load_archive
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.results import BenchResult
 
-KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json"))
+KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
 
 
 def name(path: Path) -> str:
@@ -59,5 +59,6 @@ def test_kept_benches_are_read(folder: Path) -> None:
 
 def test_every_kept_folder_is_cited() -> None:
     words = "".join(page.read_text() for page in [*PAGES, ROOT / "docs" / "img" / "draw.py"])
-    folders = {path.parent.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("*.csv")}
+    folders = {path.parent.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("results.csv")}
+    folders = {folder for folder in folders if not folder.endswith("/report")}
     assert not [folder for folder in sorted(folders) if folder not in words]
