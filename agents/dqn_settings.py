@@ -30,7 +30,7 @@ class ControllerSettings:
         learning_rate: Of Adam.
         batch_size: Transitions an update, real or imagined.
         updates_per_step: Updates on real transitions a real step, N_R.
-        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/deviations.md.
+        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/explanation/deviations.md.
         target_rate: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no
             target network (thesis).
         epsilon_min: Exploration probability in the limit.

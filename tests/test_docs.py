@@ -1,22 +1,30 @@
-"""Documents: links lead somewhere, and the commands that pages name could be carried out."""
+"""Documents: links lead somewhere, commands could be carried out, Python runs, pages are short."""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import tyro
+from doc_tables import PAGES, ROOT
 
 from imagine_bench.cli import Bench, Command
 from imagine_bench.registry import REGRESSIONS, TASKS
 
-ROOT = Path(__file__).parents[1]
-WRITTEN = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-KEPT = sorted((ROOT / "docs" / "results").rglob("*.md"))
+WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
 COMMAND = re.compile(r"(?:^|`)imagine-bench ([a-z]+ [^`\n#]+)", re.MULTILINE)
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCKS = [(page, code) for page in PAGES for code in PYTHON.findall(page.read_text())]
+SCRIPTS = [(page, code) for page, code in BLOCKS if "__main__" in code]
+
+
+def name(value: object) -> str:
+    return str(value.relative_to(ROOT)) if isinstance(value, Path) else ""
 
 
 def anchors(page: Path) -> set[str]:
@@ -25,7 +33,12 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", [*WRITTEN, *KEPT], ids=lambda page: str(page.relative_to(ROOT)))
+def words(page: Path) -> int:
+    """Words of a page, what its comments say to machines apart."""
+    return len(re.sub(r"<!--.*?-->", "", page.read_text(), flags=re.DOTALL).split())
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)", page.read_text()):
         there = page.parent / target if target else page
@@ -33,24 +46,63 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(there), f"{page} links to {target}#{anchor}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_paths_in_the_checkout_exist(page: Path) -> None:
+    named = re.findall(r"`((?:agents|tasks|imagine_bench|assets|tests|docs)/[\w./-]*)`", page.read_text())
+    assert not [path for path in named if path != "imagine_bench/" and not (ROOT / path).exists()]
+
+
+def test_every_page_is_in_the_site() -> None:
+    index = (ROOT / "docs" / "index.md").read_text().split()
+    pages = [page.relative_to(ROOT / "docs").with_suffix("").as_posix() for page in PAGES[1:]]
+    assert not [page for page in pages if page not in (*index, "index")]
+
+
 def test_commands_could_be_carried_out() -> None:
     """Options, tasks, agents and settings that pages name exist, and every bench could be begun."""
-    named = [(page.name, words) for page in WRITTEN for words in COMMAND.findall(page.read_text())]
+    named = [(page.name, said) for page in WRITTEN for said in COMMAND.findall(page.read_text())]
     benches = 0
-    for page, words in named:
+    for page, said in named:
         try:
-            command = tyro.cli(Command, args=shlex.split(words), config=(tyro.conf.OmitArgPrefixes,))
+            command = tyro.cli(Command, args=shlex.split(said), config=(tyro.conf.OmitArgPrefixes,))
         except SystemExit:
-            pytest.fail(f"{page} names a command that is not understood: imagine-bench {words}")
-        assert getattr(command, "task", None) in (None, "my_task", *TASKS, *REGRESSIONS), f"{page}: {words}"
+            pytest.fail(f"{page} names a command that is not understood: imagine-bench {said}")
+        assert getattr(command, "task", None) in (None, "my_task", *TASKS, *REGRESSIONS), f"{page}: {said}"
         if isinstance(command, Bench) and not str(command.encoder).endswith(".safetensors"):
             command.planned()
             benches += 1
     assert benches > 20
 
 
+@pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
+def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    variables: dict[str, object] = {}
+    exec(compile(code, str(page), "exec"), variables)
+    variables["env"].close()  # type: ignore[attr-defined]
+
+
+def test_the_twelve_lines_bench_an_agent(tmp_path: Path) -> None:
+    (page, code), (_, again) = SCRIPTS
+    assert page.name == "README.md" and again == code
+    script = tmp_path / "my_agent.py"
+    short = "--preset smoke --execution kinematic --budgets 2 --evaluation-episodes 3 --seeds 1"
+    script.write_text(code.replace("--preset smoke", short))
+    done = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "my agent" in done.stdout and "DQN" in done.stdout
+    assert list(tmp_path.glob("runs/arrow_puzzle/*/my_agent/seed_1/DONE"))
+
+
+def test_pages_are_short() -> None:
+    assert words(ROOT / "README.md") <= 900
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
+    assert not [page for page in PAGES if words(page) > 1200]
+    assert sum(words(page) for page in PAGES[1:]) <= 13_000
+
+
 def test_kept_numbers_are_what_every_json_reader_can_read() -> None:
     files = sorted((ROOT / "docs" / "results").rglob("*.json"))
-    assert len(files) > 100
+    assert len(files) > 40
     for file in files:
         json.loads(file.read_text(), parse_constant=lambda word, file=file: pytest.fail(f"{file} holds {word}"))

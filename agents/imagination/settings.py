@@ -4,7 +4,7 @@ Chapter 3 is pick-and-place with a human who changes their mind (thesis 3.2.2). 
 discount and no size of the memories. Its second controller is "trained in exactly the same manner, but on imaginary
 data", so both memories are alike; imagined episodes end where the model says. ``(factors)`` and ``(deviations)`` name
 the study that changed the value alone: points of success after 500 episodes at ``mild``, on three tuning seeds
-(docs/when_imagination_helps.md). Most values were chosen before there were studies.
+(docs/explanation/imagination.md). Most values were chosen before there were studies.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class ImaginationSettings:
         exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
         weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
         reduction: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation
-            4.25) and one threshold; see docs/deviations.md for why that is read as max.
+            4.25) and one threshold; see docs/explanation/deviations.md for why that is read as max.
         threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
         threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
             epistemic variance of transitions that really happened, a batch of them a real step.

@@ -105,7 +105,7 @@ class RegressorSettings(MDNSettings):
 
 _BATCH = Override(1000, "where there are more data: few epochs, more steps (all at once was not tried here)")
 _FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
-_FORMAT = Override("auto", "CPU time; see docs/uncertainty.md for what it changes")
+_FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for what it changes")
 
 _SETS: dict[str, dict[str, Override]] = {
     "minimal": {

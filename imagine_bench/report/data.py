@@ -185,22 +185,6 @@ def collect(result: BenchResult) -> ReportData:
     )
 
 
-def results_csv(result: BenchResult) -> str:
-    """One row an agent, seed and budget; every diagnostic the agents report has its column."""
-    names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
-    fields = ("episodes", "env_steps", "test_episodes", "successes", "success_rate", "mean_return", "mean_length")
-    costs = ("faults", "train_cpu_s", "eval_cpu_s")
-    rows: list[list[object]] = [["agent", "seed", *fields, "wilson_low", "wilson_high", *costs, *names]]
-    for agent in result.protocol.agents:
-        for run in result.of(agent):
-            for checkpoint in run.checkpoints:
-                low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
-                row = [agent, run.seed, *(getattr(checkpoint, field) for field in fields), low, high]
-                row += [getattr(checkpoint, cost) for cost in costs]
-                rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
-    return csv_text(rows)
-
-
 def open_loop_csv(result: BenchResult) -> str:
     """One row an imagining agent, seed, budget and imagined depth, with and without the filter."""
     names = list(OpenLoop.__dataclass_fields__)
@@ -424,4 +408,4 @@ def _learner_cpu_s(run: RunResult) -> float:
 
 
 def _rng(result: BenchResult, *names: str | int) -> np.random.Generator:
-    return SeedTree(int(result.protocol.hash, 16)).child("report", *names).generator()
+    return SeedTree(int(result.protocol_hash, 16)).child("report", *names).generator()

@@ -10,9 +10,10 @@ from typing import Any
 import jinja2
 
 from imagine_bench.report import plots, text
-from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, results_csv, summary_csv
+from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
 from imagine_bench.report.sections import Page, Section, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
+from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, write_bytes
 from imagine_bench.store.results import BenchResult
 
@@ -29,7 +30,7 @@ def write_report(result: BenchResult) -> Path:
         SetupError: The folder cannot be written.
     """
     data = collect(result)
-    files = {"results.csv": results_csv(result), "summary.csv": summary_csv(data)}
+    files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if data.open_loop:
         files["open_loop.csv"] = open_loop_csv(result)
     if data.futures:

@@ -1,6 +1,7 @@
-"""A bench as it is kept for good: ``protocol.json``, ``environment.json``, ``sessions.json`` and the report's
-``results.csv``, without run folders. Every success rate, length and cost is in it; pictures and imaginations are not.
-What was not finished when it was kept is read like any unfinished bench.
+"""A bench as it is kept for good, in two files: ``bench.json`` and ``results.csv`` (docs/reference/formats.md).
+
+Every success rate, length and cost is in them; images, imaginations and checkpoints are not. A report writes both, so
+a bench is kept by copying them. What was not finished when it was kept is read like any unfinished bench.
 """
 
 from __future__ import annotations
@@ -13,21 +14,53 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.store.bench_folder import read_protocol
+from imagine_bench.store.bench_folder import KEPT, read_protocol
+from imagine_bench.store.files import csv_text, json_text, read_json
 from imagine_bench.store.merge import largest_part
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 _RESULTS = "results.csv"
-_COUNTS = ("episodes", "env_steps", "test_episodes", "successes", "faults")
-_NUMBERS = ("mean_return", "mean_length", "train_cpu_s", "eval_cpu_s")
-_COMPUTED = ("agent", "seed", "success_rate", "wilson_low", "wilson_high")
+_COUNTS = ("episodes", "env_steps", "test_episodes", "successes")
+_MEANS = ("mean_return", "mean_length")
+_COSTS = ("faults", "train_cpu_s", "eval_cpu_s")
+_DERIVED = ("success_rate", "wilson_low", "wilson_high")
+"""Columns for a reader's comfort; what is read back is computed anew from the counts."""
 
 
 def is_archive(folder: Path) -> bool:
     """Whether a folder holds a bench in this form."""
-    return (folder / _RESULTS).is_file()
+    return (folder / KEPT).is_file()
+
+
+def archive_files(result: BenchResult) -> dict[str, str]:
+    """The two files of a bench of agents, by name."""
+    environment = dict(result.environment)
+    sessions = environment.pop("sessions", [])
+    facts = {
+        "protocol": (result.whole or result.protocol).as_dict(),
+        "protocol_hash": result.protocol_hash,
+        "environment": environment,
+        "sessions": sessions,
+    }
+    return {KEPT: json_text(facts), _RESULTS: results_csv(result)}
+
+
+def results_csv(result: BenchResult) -> str:
+    """One row an agent, seed and budget; every diagnostic the agents report has its column."""
+    names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
+    rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, *names]]
+    for agent in result.protocol.agents:
+        for run in result.of(agent):
+            for checkpoint in run.checkpoints:
+                low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
+                row = [agent, run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
+                row += [checkpoint.success_rate, low, high]
+                row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)]
+                rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
+    return csv_text(rows)
 
 
 def load_archive(folder: Path) -> BenchResult:
@@ -41,7 +74,7 @@ def load_archive(folder: Path) -> BenchResult:
     if not isinstance(whole, Protocol):
         raise InvalidValueError(
             f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
-            "that act have a report. The command in its environment.json makes the bench anew, with one."
+            f"that act have a report. The command in its {KEPT} makes the bench anew, with one."
         )
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     try:
@@ -53,13 +86,16 @@ def load_archive(folder: Path) -> BenchResult:
         ) from error
     wanted = [(agent, seed) for agent in whole.agents for seed in whole.seeds]
     reached = {pair: rows[pair][-1].episodes if pair in rows else 0 for pair in wanted}
-    return largest_part(whole, reached, lambda agent, seed: _run(folder, agent, seed, tuple(rows[agent, seed])), folder)
+    made_with = str(read_json(folder / KEPT, "a kept bench").get("protocol_hash", ""))
+    return largest_part(
+        whole, reached, lambda agent, seed: _run(folder, agent, seed, tuple(rows[agent, seed])), folder, made_with
+    )
 
 
 def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
-    known = (*_COUNTS, *_NUMBERS, *_COMPUTED)
-    numbers: dict[str, Any] = {name: float(row[name]) for name in _NUMBERS}
-    numbers |= {name: int(row[name]) for name in _COUNTS}
+    numbers: dict[str, Any] = {name: float(row[name]) for name in (*_MEANS, *_COSTS[1:])}
+    numbers |= {name: int(row[name]) for name in (*_COUNTS, _COSTS[0])}
+    known = ("agent", "seed", *numbers, *_DERIVED)
     return Checkpoint(
         **numbers,
         diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},

@@ -20,6 +20,8 @@ from imagine_bench.protocols.task_types import Result, task_type
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder, read_json, reading, write_json
 
+KEPT = "bench.json"
+"""Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
 _PROTOCOL, _ENVIRONMENT, _SESSIONS = "protocol.json", "environment.json", "sessions.json"
 _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
@@ -133,8 +135,14 @@ def bench_facts(folder: Path) -> dict[str, Any]:
     Raises:
         ArtefactError: A file is missing or damaged; the message names it.
     """
-    sessions = _read_sessions(folder)
-    environment = {**read_json(folder / _ENVIRONMENT, "a bench's environment"), "sessions": sessions}
+    if (folder / KEPT).exists():
+        kept = read_json(folder / KEPT, "a kept bench")
+        with reading(folder / KEPT, "a kept bench"):
+            facts, sessions = kept["environment"], kept["sessions"]
+            sessions = [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
+    else:
+        facts, sessions = read_json(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
+    environment = {**facts, "sessions": sessions}
     return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
 
 
@@ -199,8 +207,11 @@ def read_protocol(folder: Path) -> ProtocolData:
     Raises:
         ArtefactError: It is missing or damaged; the message names it.
     """
-    data = read_json(folder / _PROTOCOL, "a bench's protocol")
-    with reading(folder / _PROTOCOL, "a bench's protocol"):
+    kept = (folder / KEPT).exists()
+    path, what = folder / (KEPT if kept else _PROTOCOL), "a bench's protocol"
+    data = read_json(path, what)
+    with reading(path, what):
+        data = data["protocol"] if kept else data
         return task_type(data["task"]).protocol.from_dict(data)
 
 

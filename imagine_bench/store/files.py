@@ -107,13 +107,18 @@ def with_null(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
+def json_text(value: Any) -> str:
+    """``value`` as JSON, as every file here has it."""
+    return json.dumps(value, indent=1) + "\n"
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as JSON, atomically.
 
     Raises:
         SetupError: It cannot be written.
     """
-    write_bytes(path, (json.dumps(value, indent=1) + "\n").encode())
+    write_bytes(path, json_text(value).encode())
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

@@ -47,7 +47,11 @@ def load_so_far(folder: Path) -> BenchResult:
 
 
 def largest_part(
-    whole: Protocol, reached: Mapping[tuple[str, int], int], load: Callable[[str, int], RunResult], folder: Path
+    whole: Protocol,
+    reached: Mapping[tuple[str, int], int],
+    load: Callable[[str, int], RunResult],
+    folder: Path,
+    made_with: str = "",
 ) -> BenchResult:
     """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
 
@@ -56,6 +60,7 @@ def largest_part(
         reached: The last budget with results of every agent and seed; 0 where there are none.
         load: Reads the run of an agent and seed.
         folder: Where the bench's files lie.
+        made_with: See :class:`BenchResult`.
 
     Raises:
         ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
@@ -72,6 +77,7 @@ def largest_part(
         **bench_facts(folder),
         whole=whole if missing else None,
         missing=missing,
+        made_with=made_with,
     )
 
 

@@ -203,6 +203,7 @@ class BenchResult:
         wall_s: Wall seconds of the bench, over all its sessions.
         whole: The protocol of which this is a part; None if it is all of it.
         missing: What a part lacks, one sentence a run.
+        made_with: Of kept results, the hash that their protocol had then; names may have changed since.
 
     Raises:
         ArtefactError: A run of the protocol is missing, doubled or has other budgets, or other settings than another.
@@ -215,6 +216,7 @@ class BenchResult:
     wall_s: float
     whole: Protocol | None = None
     missing: tuple[str, ...] = ()
+    made_with: str = ""
 
     def __post_init__(self) -> None:
         wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
@@ -235,7 +237,7 @@ class BenchResult:
     @property
     def protocol_hash(self) -> str:
         """The hash of the whole protocol, which names the bench's folder."""
-        return (self.whole or self.protocol).hash
+        return self.made_with or (self.whole or self.protocol).hash
 
     def of(self, agent: str) -> tuple[RunResult, ...]:
         """The runs of one agent, in the order of the protocol's seeds."""

@@ -98,7 +98,7 @@ def make_env(**options: Any) -> MacroEnv:
     as far as that is possible, asked for or not; what is not possible it reaches out for in vain. The human answers
     after having seen the result.
 
-    How the rules are read where the thesis is silent stands in ``docs/environments.md``.
+    How the rules are read where the thesis is silent stands in ``docs/reference/environments.md``.
     """
     from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
     from .world import PickWorld  # noqa: PLC0415

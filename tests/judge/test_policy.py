@@ -259,7 +259,7 @@ def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None
     ("folder", "complaint"),
     [
         ("docs/results/arrow_puzzle_hard-thesis", "holds kept results and no agents; give a bench's own folder"),
-        ("docs/results/toy_regression-quick", "is of a regression task, in which no agent acts"),
+        ("docs/results/toy_regression-thesis", "is of a regression task, in which no agent acts"),
         ("docs", "There is no docs/protocol.json"),
     ],
 )

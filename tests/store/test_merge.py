@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,8 @@ def kept_from(folder: Path, kept: Path) -> Path:
     """What is kept of a bench for good."""
     assert main(["report", str(folder)]) == 0
     kept.mkdir()
-    for name in ("protocol.json", "environment.json", "sessions.json", "report/results.csv"):
-        (kept / Path(name).name).write_bytes((folder / name).read_bytes())
+    for name in ("bench.json", "results.csv"):
+        (kept / name).write_bytes((folder / "report" / name).read_bytes())
     return kept
 
 
@@ -169,23 +170,36 @@ def test_kept_results_have_a_report_of_their_own(tmp_path: Path, capsys: pytest.
 
 def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Path) -> None:
     folder = do(tmp_path, "oracle", "random", seeds=(0, 1), budgets=(4, 9))
-    assert main(["report", str(folder)]) == 0
-    rows = (folder / "report/results.csv").read_text().splitlines(keepends=True)
-    (folder / "results.csv").write_text("".join(row for row in rows if not row.startswith("random,1,9,")))
-    part = load_archive(folder)
+    kept = kept_from(folder, tmp_path / "kept")
+    rows = (kept / "results.csv").read_text().splitlines(keepends=True)
+    (kept / "results.csv").write_text("".join(row for row in rows if not row.startswith("random,1,9,")))
+    part = load_archive(kept)
     assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (4, 9))
     assert part.whole == load_bench(folder).protocol
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
 
 
 def test_kept_results_of_a_regression_bench_are_said_to_have_no_report(capsys: pytest.CaptureFixture[str]) -> None:
-    kept = Path(__file__).parents[2] / "docs/results/toy_regression-quick"
+    kept = Path(__file__).parents[2] / "docs/results/toy_regression-thesis"
     assert main(["report", str(kept)]) == 2
     assert "keeps a bench of toy_regression, whose tables are its .csv files" in capsys.readouterr().err
 
 
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     first, second = do(tmp_path, "oracle"), do(tmp_path, "random")
-    (second / "results.csv").write_text("agent,seed,episodes\nrandom,0,many\n")
+    kept = kept_from(second, tmp_path / "kept")
+    (kept / "results.csv").write_text("agent,seed,episodes\nrandom,0,many\n")
     with pytest.raises(ArtefactError, match=r"results\.csv is not the table of a bench of agents"):
-        load_merged([first, second], tmp_path)
+        load_merged([first, kept], tmp_path)
+
+
+def test_kept_results_are_read_back_and_keep_their_hash(tmp_path: Path) -> None:
+    folder = do(tmp_path, "oracle", "random", seeds=(0, 1))
+    kept, whole = load_archive(kept_from(folder, tmp_path / "kept")), load_bench(folder)
+    assert (kept.protocol, kept.protocol_hash) == (whole.protocol, whole.protocol_hash)
+    for agent in whole.protocol.agents:
+        assert kept.success_rates(agent).tolist() == whole.success_rates(agent).tolist()
+    facts = json.loads((tmp_path / "kept" / "bench.json").read_text())
+    facts["protocol_hash"] = "0123456789ab"
+    (tmp_path / "kept" / "bench.json").write_text(json.dumps(facts))
+    assert load_archive(tmp_path / "kept").protocol_hash == "0123456789ab"

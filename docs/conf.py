@@ -1,0 +1,29 @@
+"""The site: Sphinx with MyST and furo. ``make docs`` builds it into build/docs; warnings are errors."""
+
+from importlib import metadata
+
+project = "imagine_bench"
+author = "The imagine_bench developers"
+copyright = "2026, the imagine_bench developers"
+release = metadata.version("imagine-bench")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["deflist"]
+myst_heading_anchors = 4
+exclude_patterns = ["results/**/report"]
+
+autodoc_mock_imports = ["mujoco", "mink"]  # so that the site builds where there is no OpenGL
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+highlight_language = "none"
+html_theme = "furo"
+html_title = "imagine_bench"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False

@@ -1,0 +1,107 @@
+"""Draws the plots of the pages from docs/results: ``python docs/img/draw.py``."""
+
+import csv
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from imagine_bench import reference, statistics
+
+mpl.use("agg")
+from matplotlib import pyplot as plt
+
+HERE = Path(__file__).parent
+RESULTS = HERE.parent / "results"
+COLORS = {
+    "factored": "#882255",
+    "imagination_uncertainty": "#009e73",
+    "imagination": "#d55e00",
+    "dqn": "#0072b2",
+    "imagination_only": "#cc79a7",
+    "sb3_dqn": "#b07d00",
+    "sb3_dqn_latents": "#332288",
+}
+LEARNING = {
+    "arrow_puzzle-factored-2000-episodes": ("factored",),
+    "arrow_puzzle-2000-episodes": ("imagination_uncertainty", "imagination", "dqn", "imagination_only"),
+    "arrow_puzzle-sb3_dqn": ("sb3_dqn",),
+    "arrow_puzzle-sb3_dqn_latents": ("sb3_dqn_latents",),
+}
+
+
+def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
+    """Success of every seed, in %, by budget."""
+    found: dict[int, list[float]] = {}
+    with (RESULTS / folder / "results.csv").open() as file:
+        for row in csv.DictReader(file):
+            if row["agent"] == agent:
+                share = 100 * int(row["successes"]) / int(row["test_episodes"])
+                found.setdefault(int(row["episodes"]), []).append(share)
+    return {budget: np.array(values) for budget, values in sorted(found.items())}
+
+
+def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> None:
+    """Interquartile mean over seeds with its 95 % interval."""
+    table = rates(folder, agent)
+    budgets = list(table)
+    means = [statistics.iqm(values) for values in table.values()]
+    ends = [statistics.bootstrap_interval(values, np.random.default_rng(0)) for values in table.values()]
+    axes.plot(budgets, means, "o-", color=COLORS[agent], label=label or agent, markersize=4, linewidth=2)
+    axes.fill_between(budgets, *zip(*ends, strict=True), color=COLORS[agent], alpha=0.15, linewidth=0)
+
+
+def finish(axes: plt.Axes, budgets: list[int]) -> None:
+    """Axes that all plots share."""
+    axes.set_xscale("log")
+    axes.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
+    axes.minorticks_off()
+    axes.set_ylim(-2, 104)
+    axes.set_xlabel("real training episodes (logarithmic)")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def learning_curves() -> None:
+    """All agents on the arrow puzzle, to 2,000 episodes."""
+    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
+    for folder, agents in LEARNING.items():
+        for agent in agents:
+            curve(axes, folder, agent)
+    axes.set_ylabel("test episodes solved (%)")
+    finish(axes, [100, 250, 500, 1000, 2000])
+    figure.legend(loc="outside right upper", frameon=False)
+    figure.savefig(HERE / "learning_curves.png", dpi=150)
+
+
+def thesis_settings() -> None:
+    """Tables 5.1 and 5.3: ours and the thesis'."""
+    figure, both = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
+    for axes, task in zip(both, ("arrow_puzzle", "arrow_puzzle_hard"), strict=True):
+        for agent in ("dqn", "imagination", "imagination_uncertainty"):
+            curve(axes, f"{task}-thesis", agent)
+            points = reference.success(task, agent)
+            means = [100 * mean for mean, _ in points.values()]
+            axes.plot(list(points), means, "D:", color=COLORS[agent], label=f"{agent}, thesis", fillstyle="none")
+        axes.set_title(task)
+        finish(axes, [250, 500, 1000, 2000, 6000])
+    both[0].set_ylabel("test episodes solved (%)")
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(HERE / "thesis_settings.png", dpi=150)
+
+
+def mild() -> None:
+    """The ten reported seeds."""
+    figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    curve(axes, "arrow_puzzle-mild-ten_seeds", "imagination_uncertainty")
+    curve(axes, "arrow_puzzle-mild-ten_seeds", "dqn")
+    axes.set_ylabel("test episodes solved (%)")
+    finish(axes, [500, 1000, 2000])
+    figure.legend(loc="outside right upper", frameon=False)
+    figure.savefig(HERE / "mild.png", dpi=150)
+
+
+if __name__ == "__main__":
+    learning_curves()
+    thesis_settings()
+    mild()

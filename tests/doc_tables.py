@@ -1,0 +1,409 @@
+"""Tables of the pages, recomputed from docs/results.
+
+A comment before a table names its folders and says what its cells are, in the words of :data:`CELLS`, a call a column:
+
+    <!-- table: A=arrow_puzzle-quick; iqm(@,A/dqn)|average(@,A/random) -->
+
+``@`` is the number in the row's first cell or, where the comment has ``rows: ...|...;``, the row's own arguments.
+``text`` is a column of words. ``python tests/doc_tables.py`` writes all cells anew.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench import reference, registry, rules, statistics
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results"
+PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "report")]
+"""All but the reports that somebody has written of kept results, which git ignores."""
+_MARKED = re.compile(r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+)", re.DOTALL)
+
+Runs = dict[int, list[dict[str, str]]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A marked table: where its text lies in the page, its lines, and what it should say."""
+
+    start: int
+    end: int
+    lines: tuple[str, ...]
+    spec: str
+
+    def expected(self) -> list[str]:
+        """The lines as they should be."""
+        *before, columns = self.spec.split("; ")
+        folders = dict(pair.split("=") for part in before if not part.startswith("rows:") for pair in part.split())
+        named = [part.removeprefix("rows: ").split("|") for part in before if part.startswith("rows:")]
+        entries, specs = (named[0] if named else []), columns.split("|")
+        if entries and len(entries) != len(self.lines) - 2:
+            raise ValueError(f"{len(entries)} rows are named and {len(self.lines) - 2} are there: {self.lines[0]}")
+        rows = [_cells(line) for line in self.lines[2:]]
+        for index, row in enumerate(rows):
+            key = entries[index] if entries else re.sub(r"[^\d]", "", row[0])
+            if len(row) != len(specs) + 1:
+                raise ValueError(f"{len(specs)} columns are named and {len(row) - 1} are there: {row}")
+            values = [_cell(spec.replace("@", key), folders) for spec in specs]
+            rows[index] = [row[0], *(old if new is None else new for old, new in zip(row[1:], values, strict=True))]
+        return [*self.lines[:2], *("| " + " | ".join(row) + " |" for row in rows)]
+
+
+def tables(text: str) -> Iterator[Table]:
+    """The marked tables of a page."""
+    for found in _MARKED.finditer(text):
+        lines = found["table"].rstrip("\n").split("\n")
+        yield Table(found.start("table"), found.end("table"), tuple(lines), " ".join(found["spec"].split()))
+
+
+def unmarked(text: str) -> list[str]:
+    """Heads of the tables that no comment describes and that hold a measured number: a decimal, or a share."""
+    blocks = re.findall(r"(?:^[^|\n][^\n]*\n)?(?:^\|[^\n]*\n)+", text, re.MULTILINE)
+    plain = [re.sub(r"`[^`]*`|\]\([^)]*\)", "", block) for block in blocks if not block.startswith("<!--")]
+    return [block.split("\n")[0] for block in plain if re.search(r"\d\.\d|\d ?%", block)]
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+def _cell(spec: str, folders: Mapping[str, str]) -> str | None:
+    if spec == "text":
+        return None
+    name, _, arguments = spec.removesuffix(")").partition("(")
+    (values,) = csv.reader([arguments]) if arguments else ([],)
+    return CELLS[name](*(re.sub(r"^[A-Z]\b(?=/|$)", lambda found: folders[found[0]], value) for value in values))
+
+
+# Benches of agents -----------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def runs(where: str) -> Runs:
+    """Rows of one agent in a folder, ``FOLDER/AGENT``, by budget, each in the order of seeds."""
+    folder, _, agent = where.rpartition("/")
+    found: Runs = {}
+    with (RESULTS / folder / "results.csv").open() as file:
+        for row in csv.DictReader(file):
+            if row["agent"] == agent:
+                found.setdefault(int(row["episodes"]), []).append(row)
+    if not found:
+        raise ValueError(f"{where}: no such runs")
+    return {budget: sorted(rows, key=lambda row: int(row["seed"])) for budget, rows in found.items()}
+
+
+def scores(budget: str, where: str, column: str = "success_rate") -> np.ndarray:
+    """One number a seed. Shape (seeds,)."""
+    rows = runs(where)[int(budget)]
+    if column == "success_rate":
+        return np.array([int(row["successes"]) / int(row["test_episodes"]) for row in rows])
+    return np.array([float(row[column]) for row in rows])
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def points(share: float) -> str:
+    """With its sign, a real minus."""
+    return f"{100 * share + 0.0:+.1f}".replace("-", "−").replace("+0.0", "0.0").replace("−0.0", "0.0")
+
+
+def iqm(budget: str, where: str) -> str:
+    """Interquartile mean of the success rate, % [95 % interval over seeds]."""
+    values = scores(budget, where)
+    return interval(statistics.iqm(values), *statistics.bootstrap_interval(values, _rng()))
+
+
+def ahead(budget: str, treated: str, base: str) -> str:
+    """The same; bold where the interval of the difference to the base lies above zero."""
+    text = iqm(budget, treated)
+    better = statistics.difference(scores(budget, treated), scores(budget, base), _rng()).low > 0
+    return f"**{text}**" if better else text
+
+
+def interval(value: float, low: float, high: float) -> str:
+    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
+
+
+def signed(estimate: statistics.Estimate) -> str:
+    text = f"{points(estimate.value)} [{points(estimate.low)}, {points(estimate.high)}]"
+    return f"**{text}**" if estimate.low > 0 or estimate.high < 0 else text
+
+
+def mean_std(budget: str, where: str) -> str:
+    """Mean (standard deviation), %."""
+    values = scores(budget, where)
+    return f"{percent(values.mean())} ({percent(values.std(ddof=1))})"
+
+
+def average(budget: str, where: str) -> str:
+    """Mean over seeds, %."""
+    return percent(scores(budget, where).mean())
+
+
+def worst_best(budget: str, where: str) -> str:
+    """Mean [worst, best seed], %."""
+    values = scores(budget, where)
+    return f"{percent(values.mean())} [{100 * values.min():.0f}, {100 * values.max():.0f}]"
+
+
+def seeds(budget: str, where: str) -> str:
+    """Every seed, %."""
+    return ", ".join(percent(value) for value in scores(budget, where))
+
+
+def difference(budget: str, treated: str, base: str) -> str:
+    """Difference of interquartile means, points [95 %]; bold if clear of zero."""
+    return signed(statistics.difference(scores(budget, treated), scores(budget, base), _rng()))
+
+
+def gain(budget: str, treated: str, base: str) -> str:
+    """Gain of the means relative to the base, % [95 %]; bold if clear of zero."""
+    return signed(statistics.gain(scores(budget, treated), scores(budget, base), _rng()))
+
+
+def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
+    """Mean success over all episodes to a budget, %: interquartile mean [95 %]."""
+    budgets = sorted(runs(where))
+    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    means = statistics.running_means(budgets, table, _facts(task).chance_level)[:, budgets.index(int(budget))]
+    return interval(statistics.iqm(means), *statistics.bootstrap_interval(means, _rng()))
+
+
+def reached(where: str, level: str) -> np.ndarray:
+    """First test of every seed from which on all reach a level; NaN where there is none. Shape (seeds,)."""
+    budgets = sorted(runs(where))
+    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
+    return np.array([np.nan if each is None else each for each in found])
+
+
+def episodes_to(where: str, level: str) -> str:
+    """Real episodes to a level, by seed."""
+    return ", ".join("never" if np.isnan(each) else f"{each:.0f}" for each in reached(where, level))
+
+
+def mean_episodes_to(where: str, level: str) -> str:
+    """Their mean."""
+    mean = reached(where, level).mean()
+    return "–" if np.isnan(mean) else f"{mean:.0f}"
+
+
+def first_of(name: str, *arguments: str) -> str:
+    """A cell of all arguments but the last: of a row that names two things, the first."""
+    return CELLS[name](*arguments[:-1])
+
+
+def last_of(name: str, *arguments: str) -> str:
+    """A cell of all arguments but the last but one: of a row that names two things, the second."""
+    return CELLS[name](*arguments[:-2], arguments[-1])
+
+
+@functools.cache
+def _facts(task: str) -> Any:
+    return rules.facts(registry.task(task).rules, registry.task(task).horizon)
+
+
+def thesis(budget: str, task: str, agent: str) -> str:
+    """The thesis' mean (standard deviation), %."""
+    mean, std = reference.success(task, agent)[int(budget)]
+    return f"*{percent(mean)}*" if np.isnan(std) else f"*{percent(mean)} ({percent(std)})*"
+
+
+def thesis_mean(budget: str, task: str, agent: str) -> str:
+    return f"*{percent(reference.success(task, agent)[int(budget)][0])}*"
+
+
+def thesis_gain(budget: str, task: str, agent: str) -> str:
+    return f"*{points(reference.gain(task, agent)[int(budget)])}*"
+
+
+# Studies, models, policies, plans --------------------------------------------------------------------------------
+
+
+@functools.cache
+def _study(folder: str) -> dict[tuple[str, int], list[dict[str, str]]]:
+    found: dict[tuple[str, int], list[dict[str, str]]] = {}
+    with (RESULTS / folder / "results.csv").open() as file:
+        for row in csv.DictReader(file):
+            found.setdefault((row["variant"], int(row["episodes"])), []).append(row)
+    return found
+
+
+def study(budget: str, folder: str, *variants: str) -> str:
+    """Success of variants of a study, %: interquartile means."""
+    return "; ".join(percent(statistics.iqm(_success(folder, variant, budget))) for variant in variants)
+
+
+def study_difference(budget: str, folder: str, *variants: str) -> str:
+    """Against what each is compared with, points [95 %]; bold if clear of zero."""
+    texts = []
+    for variant in variants:
+        against = _study(folder)[variant, int(budget)][0]["against"]
+        pair = _success(folder, variant, budget), _success(folder, against, budget)
+        texts.append(signed(statistics.difference(*pair, _rng())))
+    return "; ".join(texts)
+
+
+def _success(folder: str, variant: str, budget: str) -> list[float]:
+    return [float(row["success"]) for row in _study(folder)[variant, int(budget)]]
+
+
+@functools.cache
+def _json(path: str) -> Any:
+    return json.loads((RESULTS / path).read_text())
+
+
+def _answers(folder: str, agent: str, path: str) -> np.ndarray:
+    values: list[Any] = [run for run in _json(f"{folder}/generalisation.json")["runs"] if run["agent"] == agent]
+    for name in path.split("/"):
+        values = [value[name] for value in values]
+    return np.array(values, dtype=float)
+
+
+def answers(folder: str, agent: str, path: str) -> str:
+    """What the models of a bench answered, %: mean [95 % over seeds]."""
+    values = _answers(folder, agent, path)
+    low, high = statistics.bootstrap_interval(values, _rng(), statistic="mean")
+    return interval(values.mean(), low, high)
+
+
+def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
+    """One of two answers of which a row speaks."""
+    return answers(folder, agent, paths[int(which)])
+
+
+def policy(agent: str, episodes: str, length: str) -> str:
+    """Starts so many turns from a goal that a greedy policy solves, %: mean over seeds and starts."""
+    with (RESULTS / "arrow_puzzle_hard-policy" / "by_length.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["agent"], row["episodes"]) == (agent, episodes)]
+    return percent(float(np.mean([float(row["success"]) for row in rows if row["optimal_length"] == length])))
+
+
+def policy_failure(agent: str, episodes: str) -> str:
+    """Starts from which it breaks a rule, %: mean [95 % over seeds]."""
+    groups = _json("arrow_puzzle_hard-policy/policy.json")
+    chosen = [run for group in groups for run in group["runs"]]
+    values = np.array([run["failure"] for run in chosen if (run["agent"], str(run["episodes"])) == (agent, episodes)])
+    return interval(values.mean(), *statistics.bootstrap_interval(values, _rng(), statistic="mean"))
+
+
+def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
+    """A count over the plans of an agent; ``solved`` with Wilson's interval where they are of one run."""
+    found = [each for each in _json(f"{folder}/plans.json") if each["agent"] == agent]
+    found = [each for each in found if episodes in ("", str(each["episodes"]))]
+    if key == "as_imagined":
+        return f"{sum(each['steps_as_imagined'] for each in found):,} of {sum(each['steps'] for each in found):,}"
+    total = sum(each[key] for each in found)
+    if key != "solved":
+        return f"{total}"
+    attempted = sum(each["attempted"] for each in found)
+    if len(found) > 1:
+        return f"{total} of {attempted}"
+    low, high = statistics.wilson(total, attempted)
+    return f"{total} of {attempted} [{percent(low)}, {percent(high)}]"
+
+
+def thesis_plans(key: str) -> str:
+    """The same of the thesis; an en dash for what it does not say."""
+    found = reference.load("arrow_puzzle")["plans"]
+    if key == "solved":
+        return f"*{found['solved']} of {found['attempted']}*"
+    return f"*{found['optimal_among_solved']}*" if key == "optimal" else "–"
+
+
+def futures(folder: str, agent: str, measure: str, depth: str) -> str:
+    """Imagined against exact distributions at a depth, mean over runs."""
+    with (RESULTS / folder / "futures.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["agent"], row["depth"]) == (agent, depth)]
+    value = float(np.mean([float(row[measure]) for row in rows]))
+    return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
+
+
+# Regression, speed, rules ----------------------------------------------------------------------------------------
+
+
+def choice(folder: str, network: str, measure: str, criterion: str) -> str:
+    """A cell of choices.csv: mean (standard deviation), or ratio [95 %]."""
+    with (RESULTS / folder / "choices.csv").open() as file:
+        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["measure"]) == (network, measure)]
+    return row[criterion]
+
+
+def thesis_error(criterion: str, samples: str) -> str:
+    mean, std = reference.load("robot_ik")["cumulative_error"]["criteria"][criterion][samples]
+    return f"*{mean:.2f} ({std:.2f})*"
+
+
+def claim(folder: str, network: str, text: str, column: str) -> str:
+    """A cell of claims.csv."""
+    with (RESULTS / folder / "claims.csv").open() as file:
+        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["claim"]) == (network, text)]
+    return row[column]
+
+
+def speed(machine: str, what: str) -> str:
+    """A measured figure of ``make speed``; an en dash where that machine has none."""
+    found = [each for each in _json(f"speed/{machine}.json")["figures"] if each["what"].removeprefix(_TASK) == what]
+    return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
+
+
+_TASK = "arrow_puzzle: "
+
+
+def goals_and_starts(task: str) -> str:
+    spec = registry.task(task)
+    goals = [state for state in spec.rules.states if spec.rules.is_terminal(state) and spec.rules.is_legal(state)]
+    return f"{len(goals)} / {len(spec.rules.start_states)}"
+
+
+def chance_exact(task: str) -> str:
+    return f"{100 * _facts(task).chance_level:.3f}"
+
+
+def shortest(task: str) -> str:
+    return f"{_facts(task).mean_plan_length:.3f}"
+
+
+CELLS: dict[str, Callable[..., str]] = {
+    function.__name__: function
+    for function in (
+        iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
+        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
+        last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
+        claim, speed, goals_and_starts, chance_exact, shortest,
+    )
+}  # fmt: skip
+
+
+def rewritten(text: str) -> str:
+    """A page with every marked table as it should be."""
+    for table in reversed(list(tables(text))):
+        text = text[: table.start] + "\n".join(table.expected()) + "\n" + text[table.end :]
+    return text
+
+
+def main(pages: Sequence[str]) -> None:
+    """Write the tables of some pages, or of all, anew."""
+    for page in [Path(name) for name in pages] or PAGES:
+        page.write_text(rewritten(page.read_text()))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,64 @@
+"""Every table of README and docs says what docs/results and the thesis' data say."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from doc_tables import PAGES, RESULTS, ROOT, rewritten, tables, unmarked
+
+from imagine_bench.registry import TASKS
+from imagine_bench.store.archive import load_archive
+from imagine_bench.store.bench_folder import read_protocol
+from imagine_bench.store.results import BenchResult
+
+KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "<!-- table:" in page.read_text()], ids=name)
+def test_tables_say_what_was_kept(page: Path) -> None:
+    text = page.read_text()
+    assert text.count("<!-- table:") == len(list(tables(text))), "a comment stands before no table"
+    for table in tables(text):
+        assert list(table.lines) == table.expected()
+
+
+def test_a_changed_number_is_found() -> None:
+    text = (ROOT / "README.md").read_text()
+    table = next(tables(text))
+    wrong = re.sub(r"\d\.\d \[", "x.x [", text[table.start : table.end])
+    assert wrong != text[table.start : table.end]
+    assert rewritten(text[: table.start] + wrong + text[table.end :]) == text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_no_measured_number_stands_in_an_unmarked_table(page: Path) -> None:
+    assert not unmarked(page.read_text())
+
+
+def test_an_unmarked_number_would_be_found() -> None:
+    assert unmarked("| agent | success |\n|---|---|\n| dqn | 96.7 |\n") == ["| agent | success |"]
+
+
+@pytest.mark.parametrize("folder", KEPT, ids=name)
+def test_kept_benches_are_read(folder: Path) -> None:
+    facts = json.loads((folder / "bench.json").read_text())
+    assert list(facts) == ["protocol", "protocol_hash", "environment", "sessions"]
+    read = read_protocol(folder).as_dict()
+    assert {field: read[field] for field in facts["protocol"]} == facts["protocol"]
+    if facts["protocol"]["task"] in TASKS:
+        result = load_archive(folder)
+        assert isinstance(result, BenchResult) and result.protocol_hash == facts["protocol_hash"]
+
+
+def test_every_kept_folder_is_cited() -> None:
+    words = "".join(page.read_text() for page in [*PAGES, ROOT / "docs" / "img" / "draw.py"])
+    folders = {path.parent.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("results.csv")}
+    folders = {folder for folder in folders if not folder.endswith("/report")}
+    assert not [folder for folder in sorted(folders) if folder not in words]
