@@ -48,7 +48,7 @@ class Protocol(ProtocolData):
     hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
-    budgets: tuple[int, ...] = (100, 250, 500, 1000)
+    budgets: tuple[int, ...] = (100, 250, 500)
     evaluation_episodes: int = 200
     execution: str = "physics"
     appearance: str = "clean"
