@@ -63,7 +63,7 @@ class ArrowWorld(World):
             x_m + self._level.object_offset_m * right,
             y_m + self._level.object_offset_m * up,
             c.CUBE_REST_Z_M,
-            *orientation.about_vertical(-_QUARTER_RAD * value + self._level.object_yaw_rad * turn),
+            *orientation.about_vertical(-(_QUARTER_RAD * value - self._level.object_yaw_rad * turn)),
         )
 
     def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
