@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Rules
 from imagine_bench.rules import require_macrostates
 
-from .macro_env import FRAME_PX, World, agent_camera
+from .macro_env import FRAME_PX, agent_camera
 from .rendering import Renderer
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
+from .world import World
 
 MakeWorld = Callable[[Appearance], World]
 
@@ -29,17 +30,7 @@ def _frame_renderer(make_world: MakeWorld, level: Appearance, thread: int) -> tu
 def frames_of(
     make_world: MakeWorld, rules: Rules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator
 ) -> Frame:
-    """Frames of macrostates in the kinematic mode, each placed and varied anew.
-
-    Args:
-        make_world: The task's world, at an appearance level.
-        rules: Which macrostates there are.
-        macrostates: Any of them. Shape (N, M).
-        appearance: A level's name.
-        rng: Draws the variation.
-
-    Returns:
-        Shape (N, 64, 64, 3), uint8.
+    """Frames (N, 64, 64, 3), uint8, of macrostates (N, M) in the kinematic mode, each placed and varied anew.
 
     Raises:
         UnknownNameError: No such appearance.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -15,63 +14,24 @@ from numpy.typing import NDArray
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Shape3D, TaskSpec
 
+from .motion.executor import MacroResult
 from .rendering import Renderer, View
-from .scene_reader import body_names, poses_of, shapes_of
+from .scene_reader import DRAWN_GROUPS, body_names, poses_of, shapes_of
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.constants import AGENT_CAMERA, ARM_GROUP, HUMAN_CAMERA, SCENE_GROUP, SETTING_GROUP
-
-if TYPE_CHECKING:
-    from .motion.executor import MacroResult
+from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
+from .world import World
 
 FRAME_PX = 64
 MAX_IMAGE_PX = 4096
-_ANSWER_S = 0.05
-"""People answer a macro-action so long after it, in a recording."""
+_ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
 
 def human_camera_view(camera: str, width: int, height: int) -> View:
     """A view for people: everything in it, soft edges, shadows and sky."""
-    groups = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
-    return View(
-        camera=camera, width=width, height=height, groups=groups, shadow_px=2048, samples=4, slices=28, sky=True
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """What a world shows.
-
-    Attributes:
-        macrostate: The nearest macrostate.
-        problem: What keeps the scene from being a proper macrostate, in words, or None.
-    """
-
-    macrostate: tuple[int, ...]
-    problem: str | None
-
-
-class World(Protocol):
-    """A scene at run time. From the start and after each method all derived positions of ``data`` are up to date."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData
-
-    def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
-        """Start anew from ``macrostate``; nothing of the time before remains."""
-
-    def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's appearance."""
-
-    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
-        """Kinematic execution: put the scene where a perfect ``action`` leads."""
-
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
-        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves."""
-
-    def read(self) -> Reading:
-        """Read the macrostate back."""
+    quality = {"shadow_px": 2048, "samples": 4, "slices": 28}
+    return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS, sky=True, **quality)
 
 
 class MacroEnv(gymnasium.Env[Frame, np.int64]):
@@ -121,7 +81,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         height: int = 480,
         camera: str = HUMAN_CAMERA,
     ) -> None:
-        self.render_mode = None if render_mode is None else _known_render_mode(render_mode)
+        modes = self.metadata["render_modes"]
+        self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
@@ -129,7 +90,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._world = make_world(appearance_level(appearance))
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
-        self._agent_camera = Renderer(self._world.model, _AGENT_VIEW)
+        self._agent_camera = agent_camera(self._world.model)
         self._render_camera = Renderer(self._world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
         self.capture_motion_hz = 0.0
@@ -152,8 +113,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         """
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun = True
-        self._latest = None
+        self._begun, self._latest = True, None
         self._world.place(start, self.np_random)
         self._world.vary(self.np_random)
         reading = self._world.read()
@@ -173,20 +133,18 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         chosen = self._checked(action)
         self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
-        intended = self._intended(start, chosen)
+        outcome = intended = self._intended(start, chosen)
+        fault = None
         if self._execution == "physics":
             self._people = self._mocap()
             self._latest = self._world.execute(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
             self._world.set_outcome(chosen, intended.macrostate)
-            fault = None
         self._world.vary(self.np_random)
         reading = self._world.read()
-        self._macrostate = reading.macrostate
-        self._begun = True
+        self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
-        outcome = intended
         if reading.macrostate != intended.macrostate:
             outcome = self._rules.judge(start, chosen, reading.macrostate)
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
@@ -200,9 +158,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again. Only the thread that drew can: in another they stay."""
-        for renderer in (self._agent_camera, self._render_camera, self._human_camera):
-            if renderer is not None:
-                renderer.close()
+        for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
+            renderer.close()
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
@@ -301,7 +258,6 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return start
 
     def _allowed(self) -> str:
-        """The macrostates in words; where not every combination of values is one, only their list says which."""
         top = tuple(max(state[index] for state in self._known) for index in range(len(self._starts[0])))
         if len(self._known) == math.prod(value + 1 for value in top):
             return f"{len(top)} integers from 0 to at most {top}"
@@ -318,7 +274,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return chosen
 
     def _intended(self, start: tuple[int, ...], action: int) -> Outcome:
-        """The rules' outcome of a perfect execution, drawn where they leave a choice."""
+        """The rules' outcome, drawn where they leave a choice."""
         outcomes = self._rules.outcomes(start, action)
         if len(outcomes) == 1:
             return outcomes[0]
@@ -327,22 +283,16 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def _info(self, *, success: bool, legal: bool, fault: str | None) -> dict[str, Any]:
         latest = self._latest
-        info: dict[str, Any] = {
+        return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
             "is_success": success,
             "success": success,
             "legal": legal,
             "fault": fault is not None,
+            **({} if fault is None else {"fault_reason": fault}),
             "sim_time_s": 0.0 if latest is None else float(latest.sim_time_s),
             "ik_error_m": 0.0 if latest is None else float(latest.ik_error_m),
         }
-        if fault is not None:
-            info["fault_reason"] = fault
-        return info
-
-
-def _known_render_mode(name: str) -> str:
-    return require_known("render mode", name, MacroEnv.metadata["render_modes"])
 
 
 def _image_size(width: int, height: int) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import copy
 import ctypes
 import os
 import sys
@@ -26,7 +27,6 @@ from imagine_bench.errors import SetupError, UnknownNameError
 
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
-_N_GROUPS = 6
 _EXTRA_GEOMS = 32
 _MISSING_GL = (
     "No OpenGL for headless rendering ({reason}): on Debian or Ubuntu install it with "
@@ -38,35 +38,20 @@ _CHOICES = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", "PYOPENGL_PLATFORM")
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What an image shows and how well.
-
-    Attributes:
-        camera: Name of a camera of the model.
-        width: Pixels.
-        height: Pixels.
-        groups: Geom groups to draw.
-        shadow_px: Edge of the shadow map; 0 draws no shadows.
-        samples: Multisampling; 0 draws hard edges.
-        slices: Corners of a drawn cylinder.
-        sky: Whether to draw the skybox.
-    """
+    """What an image shows and how well: a camera of the model, the size in pixels, and the geom groups to draw."""
 
     camera: str
     width: int = 64
     height: int = 64
     groups: tuple[int, ...] = (0,)
-    shadow_px: int = 0
-    samples: int = 0
-    slices: int = 12
-    sky: bool = False
+    shadow_px: int = 0  # edge of the shadow map; 0 draws no shadows
+    samples: int = 0  # multisampling; 0 draws hard edges
+    slices: int = 12  # corners of a drawn cylinder
+    sky: bool = False  # whether to draw the skybox
 
 
 def _new_gl_context(width: int, height: int) -> Any:
-    """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one.
-
-    Raises:
-        SetupError: The machine offers none.
-    """
+    """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one."""
     try:
         if sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl":
             from mujoco.egl import GLContext  # noqa: PLC0415  (also where MuJoCo was imported before we chose)
@@ -127,11 +112,7 @@ class _Canvas:
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
 
     def make_current(self) -> None:
-        """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything.
-
-        Raises:
-            SetupError: Another thread has drawn with it.
-        """
+        """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
         if self.thread != threading.get_ident():
             raise SetupError(
                 "This environment drew its first frame in another thread, whose OpenGL context no other may use. Make "
@@ -158,16 +139,14 @@ class _Canvas:
 def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
     """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
     quality, size = model.vis.quality, model.vis.global_
-    before = (quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks)
-    size_before = (size.offwidth, size.offheight)
+    before, size_before = copy.copy(quality), copy.copy(size)
     quality.shadowsize, quality.offsamples = view.shadow_px, view.samples
     quality.numslices, quality.numstacks = view.slices, max(view.slices // 2, 3)
     size.offwidth, size.offheight = view.width, view.height
     try:
         yield
     finally:
-        quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks = before
-        size.offwidth, size.offheight = size_before
+        model.vis.quality, model.vis.global_ = before, size_before
 
 
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
@@ -190,11 +169,7 @@ def _close_all_at_exit() -> None:
 
 
 class Renderer:
-    """Images of one model from one view.
-
-    Args:
-        model: The scene. Changes of its colors, lights and cameras show in the next image.
-        view: What to show.
+    """Images of one model from one view; changes of the model's colors, lights and cameras show in the next image.
 
     Raises:
         UnknownNameError: The model has no such camera.
@@ -205,34 +180,21 @@ class Renderer:
         cameras = [model.camera(index).name for index in range(model.ncam)]
         if view.camera not in cameras:
             raise UnknownNameError("camera", view.camera, cameras)
-        self.view = view
-        self._model = model
-        self._prepare()
-
-    def _prepare(self) -> None:
-        """What does not need OpenGL."""
-        self._rect = mujoco.MjrRect(0, 0, self.view.width, self.view.height)
-        self._bottom_up = np.empty((self.view.height, self.view.width, 3), dtype=np.uint8)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + _EXTRA_GEOMS)
-        for flag, on in (
-            (mujoco.mjtRndFlag.mjRND_SHADOW, self.view.shadow_px > 0),
-            (mujoco.mjtRndFlag.mjRND_REFLECTION, False),
-            (mujoco.mjtRndFlag.mjRND_HAZE, False),
-            (mujoco.mjtRndFlag.mjRND_SKYBOX, self.view.sky),
-        ):
-            self._scene.flags[flag.value] = on
+        self.view, self._model = view, model
+        self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
+        self._bottom_up = np.empty((view.height, view.width, 3), dtype=np.uint8)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
+        flags, drawn = mujoco.mjtRndFlag, self._scene.flags
+        drawn[flags.mjRND_SHADOW.value], drawn[flags.mjRND_SKYBOX.value] = view.shadow_px > 0, view.sky
+        drawn[flags.mjRND_REFLECTION.value] = drawn[flags.mjRND_HAZE.value] = False
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in self.view.groups for group in range(_N_GROUPS)]
+        self._option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
         self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = self._model.camera(self.view.camera).id
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(view.camera).id
 
     def frame(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Draw ``data``, whose positions of geoms, cameras and lights are up to date.
-
-        Returns:
-            A new array, upright, RGB. Shape (height, width, 3).
+        """Draw ``data``, whose derived positions are up to date: a new upright RGB array. Shape (height, width, 3).
 
         Raises:
             SetupError: The machine has no OpenGL.
@@ -265,10 +227,5 @@ class Renderer:
             self._finalizer.detach()
             canvas.close()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"view": self.view, "_model": self._model}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.view, self._model = state["view"], state["_model"]
-        self._canvas = None
-        self._prepare()
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._model, self.view)

@@ -10,15 +10,15 @@ from imagine_bench.interfaces import Shape3D
 
 from .scenes.constants import ARM_GROUP, SCENE_GROUP, SETTING_GROUP
 
-_DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
+DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
 _PLANE_HALF_THICKNESS_M = 0.005
 _KINDS = {
-    mujoco.mjtGeom.mjGEOM_BOX.value: ("box", 3),
-    mujoco.mjtGeom.mjGEOM_SPHERE.value: ("sphere", 1),
-    mujoco.mjtGeom.mjGEOM_CAPSULE.value: ("capsule", 2),
-    mujoco.mjtGeom.mjGEOM_CYLINDER.value: ("cylinder", 2),
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID.value: ("ellipsoid", 3),
-    mujoco.mjtGeom.mjGEOM_MESH.value: ("mesh", 0),
+    mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
+    mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
+    mujoco.mjtGeom.mjGEOM_CAPSULE: ("capsule", 2),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: ("cylinder", 2),
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: ("ellipsoid", 3),
+    mujoco.mjtGeom.mjGEOM_MESH: ("mesh", 0),
 }
 
 
@@ -29,19 +29,22 @@ def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
 
 def shapes_of(model: mujoco.MjModel) -> tuple[Shape3D, ...]:
     """Every geom that some view draws; a plane becomes a thin box under its surface."""
-    return tuple(_shape(model, index) for index in range(model.ngeom) if model.geom_group[index] in _DRAWN_GROUPS)
+    return tuple(_shape(model, index) for index in range(model.ngeom) if model.geom_group[index] in DRAWN_GROUPS)
 
 
 def _shape(model: mujoco.MjModel, index: int) -> Shape3D:
     geom = model.geom(index)
-    kind_id, pose = int(model.geom_type[index]), np.concatenate([model.geom_pos[index], model.geom_quat[index]])
+    geom_type, pose = (
+        mujoco.mjtGeom(model.geom_type[index]),
+        np.concatenate([model.geom_pos[index], model.geom_quat[index]]),
+    )
     size, vertices, faces = np.zeros(3), None, None
-    if kind_id == mujoco.mjtGeom.mjGEOM_PLANE.value:
+    if geom_type == mujoco.mjtGeom.mjGEOM_PLANE:
         kind = "box"
         size[:] = (*model.geom_size[index, :2], _PLANE_HALF_THICKNESS_M)
         pose[2] -= _PLANE_HALF_THICKNESS_M
     else:
-        kind, n_sizes = _KINDS[kind_id]
+        kind, n_sizes = _KINDS[geom_type]
         size[:n_sizes] = model.geom_size[index, :n_sizes]
     if kind == "mesh":
         vertices, faces = _mesh(model, int(model.geom_dataid[index]))
@@ -61,21 +64,11 @@ def _mesh(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArra
 
 
 def poses_of(
-    model: mujoco.MjModel,
-    qpos: NDArray[np.float64],
-    mocap_pos: NDArray[np.float64],
-    mocap_quat: NDArray[np.float64],
+    model: mujoco.MjModel, qpos: NDArray[np.float64], mocap_pos: NDArray[np.float64], mocap_quat: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Body poses by forward kinematics.
+    """Body poses in the world by forward kinematics: positions (m) and quaternions (w, x, y, z). Shape (K, nbody, 7).
 
-    Args:
-        model: The scene.
-        qpos: Positions at each time. Shape (K, nq).
-        mocap_pos: Of the mocap bodies, which stand still. Shape (nmocap, 3).
-        mocap_quat: The same. Shape (nmocap, 4).
-
-    Returns:
-        Position (m) and quaternion (w, x, y, z) in the world. Shape (K, nbody, 7).
+    ``qpos`` (K, nq) are positions at each time; mocap bodies, (nmocap, 3) and (nmocap, 4), stand still.
     """
     data = mujoco.MjData(model)
     data.mocap_pos[:], data.mocap_quat[:] = mocap_pos, mocap_quat

@@ -8,24 +8,20 @@ import functools
 import mujoco
 
 from ..scenes.arm import arm_spec
-from ..scenes.hand import add_hand
+from ..scenes.constants import SLOTS_XY_M
+from ..scenes.hand import add_pointing_hand, fingertip_m
 from ..scenes.tabletop import add_tabletop
 from .cubes import add_cubes
 
 
-def arrow_spec() -> mujoco.MjSpec:
-    """The whole scene; it is added to the arm's own specification, so that every name stays without a prefix."""
-    spec = arm_spec()
+@functools.cache
+def _compiled() -> mujoco.MjModel:
+    spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "arrow_puzzle"
     add_tabletop(spec)
     add_cubes(spec)
-    add_hand(spec)
-    return spec
-
-
-@functools.cache
-def _compiled() -> mujoco.MjModel:
-    return arrow_spec().compile()
+    add_pointing_hand(spec, fingertip_m(SLOTS_XY_M[1]))
+    return spec.compile()
 
 
 def compile_arrow_scene() -> mujoco.MjModel:

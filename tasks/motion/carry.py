@@ -15,7 +15,7 @@ from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
 from .arm_model import ArmModel
-from .executor import REST_OPENING_M, MacroExecutor, MacroResult
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .trajectory import Waypoint
@@ -23,11 +23,8 @@ from .trajectory import Waypoint
 _LIFT_M = 0.075
 """The gripper comes from and goes to so far above where it grips or lets go."""
 _CLOSE_S, _OPEN_S, _SETTLE_S = 0.12, 0.08, 0.05
-_BLEND_S = 0.10
-"""Going down begins so long before the reach ends, and the return so long before the gripper is fully up."""
 _PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
 """An object is let go so far above the table, or the palm."""
-
 _LOST_M = 0.003
 """Fingers that close so much further than the object is wide have lost it."""
 _MAX_TILT_RAD = math.radians(12)
@@ -39,9 +36,6 @@ class CarryExecutor:
 
     Every action starts and ends with the arm at its observation pose, an object that is held included: then the
     outcome is a pure function of the positions of objects, hands and fingers, and of the arguments, bit for bit.
-
-    Args:
-        model: The compiled scene with arm and objects.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -63,8 +57,8 @@ class CarryExecutor:
             reach = self._solve(pose.position_m, yaw_rad, self._slots[index])
         except UnreachableTargetError as error:
             return self._refuse(data, None, f"the {spec.name} is out of reach: {error}")
-        grip_m = spec.squeeze_m
-        result, qpos = self._run(data, _waypoints(reach, REST_OPENING_M, grip_m), reach, None, capture_motion_hz)
+        waypoints = _waypoints(reach, REST_OPENING_M, spec.squeeze_m)
+        result, qpos = self._run(data, waypoints, reach, None, capture_motion_hz)
         return self._unless_missed(spec, result, qpos)
 
     def place(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
@@ -82,16 +76,13 @@ class CarryExecutor:
         self, data: mujoco.MjData, *, place_m: Floats, held: int | None, capture_motion_hz: float = 0.0
     ) -> MacroResult:
         """Reach out to above ``place_m`` (3,) and come back, holding object ``held`` or nothing."""
-        grip_m = None if held is None else OBJECTS[held].squeeze_m
         try:
             reach = self._solve(place_m, 0.0, self._slots[1])
         except UnreachableTargetError as error:
             return self._refuse(data, held, f"there is no reaching out: {error}")
-        opening_m = REST_OPENING_M if grip_m is None else grip_m
-        waypoints = [
-            Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=opening_m),
-            *_home(opening_m),
-        ]
+        opening_m = REST_OPENING_M if held is None else OBJECTS[held].squeeze_m
+        out = Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=opening_m)
+        waypoints = [out, *back_to_rest(opening_m, _SETTLE_S)]
         result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
         return result if held is None else self._unless_missed(OBJECTS[held], result, qpos)
 
@@ -132,7 +123,6 @@ class CarryExecutor:
         return self._run(data, waypoints, reach, index, capture_motion_hz)[0]
 
     def _measure(self, data: mujoco.MjData, index: int) -> ObjectPose:
-        """Read an object's pose from the simulation."""
         return ObjectPose.of(data.qpos[self._qpos[index] : self._qpos[index] + 7])
 
     def _solve(self, place_m: Floats, yaw_rad: float, start: Reach | None) -> Reach:
@@ -141,21 +131,12 @@ class CarryExecutor:
         return self._ik.reach(place_m, yaw_rad=yaw_rad, lift_m=_LIFT_M, start=first)
 
     def _run(
-        self,
-        data: mujoco.MjData,
-        waypoints: Sequence[Waypoint],
-        reach: Reach,
-        held: int | None,
-        capture_motion_hz: float,
+        self, data: mujoco.MjData, waypoints: Sequence[Waypoint], reach: Reach, held: int | None, motion_hz: float
     ) -> tuple[MacroResult, Floats]:
         """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
+        squeeze_m = None if held is None else OBJECTS[held].squeeze_m
         result, qpos, _ = self.executor.perform(
-            data,
-            self._arm,
-            waypoints,
-            ik_error_m=reach.error_m,
-            squeeze_m=None if held is None else OBJECTS[held].squeeze_m,
-            capture_motion_hz=capture_motion_hz,
+            data, self._arm, waypoints, ik_error_m=reach.error_m, squeeze_m=squeeze_m, capture_motion_hz=motion_hz
         )
         return result, qpos
 
@@ -166,7 +147,6 @@ class CarryExecutor:
         return result
 
     def _refuse(self, data: mujoco.MjData, held: int | None, reason: str) -> MacroResult:
-        """The arm stays where it is."""
         self.rest(data, held)
         return self.executor.refused(reason)
 
@@ -191,18 +171,9 @@ def _waypoints(reach: Reach, before_m: float, after_m: float) -> list[Waypoint]:
     """Down with one finger command, to another one there, and back with that."""
     change_s = _CLOSE_S if after_m < before_m else _OPEN_S
     return [
-        Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=before_m, blend_s=_BLEND_S),
+        Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=before_m, blend_s=BLEND_S),
         Waypoint(name="down", qpos_rad=reach.at_qpos_rad, opening_m=before_m),
         Waypoint(name="grip", qpos_rad=reach.at_qpos_rad, opening_m=after_m, min_duration_s=change_s),
-        Waypoint(name="up", qpos_rad=reach.above_qpos_rad, opening_m=after_m, blend_s=_BLEND_S),
-        *_home(after_m),
-    ]
-
-
-def _home(opening_m: float) -> list[Waypoint]:
-    """Back to the observation pose, and a moment of calm there."""
-    observe = np.array(OBSERVATION_QPOS_RAD)
-    return [
-        Waypoint(name="return", qpos_rad=observe, opening_m=opening_m),
-        Waypoint(name="settle", qpos_rad=observe, opening_m=opening_m, min_duration_s=_SETTLE_S),
+        Waypoint(name="up", qpos_rad=reach.above_qpos_rad, opening_m=after_m, blend_s=BLEND_S),
+        *back_to_rest(after_m, _SETTLE_S),
     ]

@@ -22,18 +22,25 @@ from .trajectory import Trajectory, Waypoint, plan
 REST_OPENING_M = 0.0365
 """Each finger's distance from the grip's middle between macro-actions: a cube's half and 9 mm."""
 
+BLEND_S = 0.10
+"""Going down begins so long before the reach ends, and the return so long before the gripper is fully up."""
 _ARM_AT_REST_RAD = 0.02
 """An arm that ends further off its observation pose, in any joint, is a fault."""
-
 _RUNAWAY_RAD_S = 200.0
 """Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
-_INPUTS = int(
-    mujoco.mjtState.mjSTATE_CTRL.value
-    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
-    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
-)
+_STATE = mujoco.mjtState
+_INPUTS = sum(each.value for each in (_STATE.mjSTATE_CTRL, _STATE.mjSTATE_MOCAP_POS, _STATE.mjSTATE_MOCAP_QUAT))
 """What a rollout is told at every step, controls first; mocap bodies left out would fall back to their defaults."""
 _BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+
+
+def back_to_rest(opening_m: float, settle_s: float) -> list[Waypoint]:
+    """Back to the observation pose, and a moment of calm there."""
+    observe = np.array(OBSERVATION_QPOS_RAD)
+    return [
+        Waypoint(name="return", qpos_rad=observe, opening_m=opening_m),
+        Waypoint(name="settle", qpos_rad=observe, opening_m=opening_m, min_duration_s=settle_s),
+    ]
 
 
 def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
@@ -66,34 +73,26 @@ class MacroResult:
 
 
 class MacroExecutor:
-    """Executes trajectories on a compiled scene that holds the arm.
-
-    Args:
-        model: The scene.
-    """
+    """Executes trajectories on a compiled scene that holds the arm."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
         self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in ARM_JOINTS])
         self._finger_qpos = np.array([int(model.joint(name).qposadr[0]) for name in FINGER_JOINTS])
         self._arm_ctrl = np.array([model.actuator(f"{name}_servo").id for name in ARM_JOINTS])
-        fingers = [name.replace("_slide", "_servo") for name in FINGER_JOINTS]
-        self._finger_ctrl = np.array([model.actuator(name).id for name in fingers])
-        self._state = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-        self._qpos_column = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME.value)
-        self._states = np.empty((0, mujoco.mj_stateSize(model, self._state)))
+        self._finger_ctrl = np.array([model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS])
+        self._qpos_column = mujoco.mj_stateSize(model, _STATE.mjSTATE_TIME.value)
+        # Kept between runs: fresh pages cost time.
+        self._states = np.empty((0, mujoco.mj_stateSize(model, _STATE.mjSTATE_FULLPHYSICS.value)))
         self._control = np.empty((0, mujoco.mj_stateSize(model, _INPUTS)))
 
     def rest(self, data: mujoco.MjData, *, squeeze_m: float | None = None) -> None:
-        """Bring ``data`` to the canonical start: the arm at its observation pose, everything still.
+        """Bring ``data`` to the canonical start, in place: the arm at its observation pose, everything still.
 
         Only the positions of loose objects and of mocap bodies survive, and those of fingers that hold something;
         velocities, warm start, sleep states, time and controls are as if new. Hence what follows depends on those
-        positions and on ``squeeze_m`` alone.
-
-        Args:
-            data: Changed in place; derived quantities are not updated.
-            squeeze_m: Command to each finger that keeps an object held; None opens the fingers to where they rest.
+        positions and on ``squeeze_m`` alone: the command to each finger that keeps an object held, or None, which opens
+        the fingers to where they rest. Derived quantities are not updated.
         """
         qpos, mocap_pos, mocap_quat = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
@@ -114,15 +113,9 @@ class MacroExecutor:
         squeeze_m: float | None = None,
         capture_motion_hz: float = 0.0,
     ) -> tuple[MacroResult, Floats, Trajectory]:
-        """Plan a motion through ``waypoints`` from the canonical start, and execute it.
+        """Plan a motion through ``waypoints``, the last of which is the observation pose, and execute it.
 
-        Args:
-            data: Changed in place.
-            arm: Its limits shape the plan.
-            waypoints: At least one; the last one is the observation pose.
-            ik_error_m: Of the waypoints, for the result.
-            squeeze_m: As in :meth:`rest`, where something is held at the start.
-            capture_motion_hz: As in :meth:`capture`.
+        ``squeeze_m`` is as in :meth:`rest`, ``capture_motion_hz`` as in :meth:`capture`.
 
         Returns:
             The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
@@ -130,13 +123,10 @@ class MacroExecutor:
         Raises:
             DivergedError: As :meth:`run`.
         """
-        timestep_s = self.model.opt.timestep
+        timestep_s, start_rad = self.model.opt.timestep, np.array(OBSERVATION_QPOS_RAD)
+        start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
-            arm,
-            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
-            start_opening_m=REST_OPENING_M if squeeze_m is None else squeeze_m,
-            waypoints=waypoints,
-            timestep_s=timestep_s,
+            arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
         qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
         time_s, samples = self.capture(qpos, capture_motion_hz)
@@ -153,12 +143,9 @@ class MacroExecutor:
         )
 
     def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
-        """Execute ``trajectory`` from the canonical start.
+        """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
 
-        Args:
-            data: Changed in place; its derived quantities (such as ``xpos``) are those of the last step.
-            trajectory: Planned at the model's timestep.
-            squeeze_m: As in :meth:`rest`, where something is held at the start.
+        The derived quantities of ``data`` (such as ``xpos``) are then those of the last step.
 
         Returns:
             Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
@@ -168,8 +155,12 @@ class MacroExecutor:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data, squeeze_m=squeeze_m)
-        states, control = self._buffers(len(trajectory.opening_m))
-        mujoco.mj_getState(self.model, data, states[0], self._state)
+        steps = len(trajectory.opening_m)
+        if len(self._control) < steps:
+            self._states = np.empty((steps + 1, self._states.shape[1]))
+            self._control = np.empty((steps, self._control.shape[1]))
+        states, control = self._states[: steps + 1], self._control[:steps]
+        mujoco.mj_getState(self.model, data, states[0], _STATE.mjSTATE_FULLPHYSICS.value)
         mujoco.mj_getState(self.model, data, control[0], _INPUTS)
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
@@ -187,11 +178,7 @@ class MacroExecutor:
         return qpos[..., self._finger_qpos]
 
     def capture(self, qpos: Floats, motion_hz: float) -> tuple[Floats, Floats]:
-        """Pick samples of a run for a recording.
-
-        Args:
-            qpos: What :meth:`run` returned. Shape (N + 1, nq).
-            motion_hz: Samples a second, at most one a timestep; 0 picks none.
+        """Pick samples of a run (N + 1, nq) for a recording, so many a second, at most one a timestep; 0 picks none.
 
         Returns:
             Times in s (K,) and positions (K, nq), with the first and the last row whenever ``motion_hz > 0``.
@@ -203,13 +190,6 @@ class MacroExecutor:
         stride = max(1.0, 1.0 / (motion_hz * timestep_s))
         rows = np.unique(np.append(np.round(np.arange(0, last, stride)).astype(np.int64), last))
         return rows * timestep_s, qpos[rows].copy()
-
-    def _buffers(self, steps: int) -> tuple[Floats, Floats]:
-        """Rows for states (steps + 1, nstate) and inputs (steps, ninput), kept between runs: fresh pages cost time."""
-        if len(self._control) < steps:
-            self._states = np.empty((steps + 1, self._states.shape[1]))
-            self._control = np.empty((steps, self._control.shape[1]))
-        return self._states[: steps + 1], self._control[:steps]
 
     def _check(self, data: mujoco.MjData, states: Floats, control: Floats) -> None:
         """Raise if the simulation blew up."""

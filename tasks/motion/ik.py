@@ -31,18 +31,11 @@ class UnreachableTargetError(ImagineBenchError):
 
 @dataclass(frozen=True, kw_only=True)
 class IKSolution:
-    """A configuration that reaches its target.
-
-    Attributes:
-        qpos_rad: Arm joints. Shape (7,).
-        position_error_m: Distance of the tool centre point from the target.
-        angle_error_rad: Angle between the tool's orientation and the target's, tilt and yaw together.
-        iterations: Newton steps taken.
-    """
+    """A configuration (7,) that reaches its target, the errors that are left, and the Newton steps taken."""
 
     qpos_rad: Floats
     position_error_m: float
-    angle_error_rad: float
+    angle_error_rad: float  # tilt and yaw together
     iterations: int
 
 
@@ -61,11 +54,7 @@ def pointing_down(yaw_rad: float) -> mink.SO3:
 
 
 class ArmIK:
-    """Solves for the seven joints, one call a waypoint. A solution depends on the arguments alone.
-
-    Args:
-        arm: The arm to solve on.
-    """
+    """Solves for the seven joints, one call a waypoint. A solution depends on the arguments alone."""
 
     def __init__(self, arm: ArmModel) -> None:
         self._configuration = mink.Configuration(arm.model)
@@ -99,14 +88,11 @@ class ArmIK:
         self._configuration.update(np.array(HOME_QPOS_RAD if start_qpos_rad is None else start_qpos_rad))
         tasks = [self._reach, self._posture]
         for iteration in range(max_iterations + 1):
-            position_error_m, angle_error_rad = self._errors()
+            error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
+            position_error_m, angle_error_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
             if position_error_m < POSITION_TOLERANCE_M and angle_error_rad < ANGLE_TOLERANCE_RAD:
-                return IKSolution(
-                    qpos_rad=self._configuration.q.copy(),
-                    position_error_m=position_error_m,
-                    angle_error_rad=angle_error_rad,
-                    iterations=iteration,
-                )
+                errors = {"position_error_m": position_error_m, "angle_error_rad": angle_error_rad}
+                return IKSolution(qpos_rad=self._configuration.q.copy(), iterations=iteration, **errors)
             if iteration < max_iterations:
                 velocity = mink.solve_ik(self._configuration, tasks, _STEP_S, "daqp", limits=self._limits)
                 self._configuration.integrate_inplace(velocity, _STEP_S)
@@ -118,13 +104,9 @@ class ArmIK:
         )
 
     def reach(self, place_m: Floats, *, yaw_rad: float, lift_m: float, start: Reach | Floats | None = None) -> Reach:
-        """Find the configurations at ``place_m`` (3,) and ``lift_m`` above it.
+        """Find the configurations with the tool centre point at ``place_m`` (3,) and ``lift_m`` above it.
 
-        Args:
-            place_m: Where the tool centre point shall be.
-            yaw_rad: Heading of the tool's x axis about the vertical.
-            lift_m: How far above.
-            start: Where the searches start: a solution nearby, one configuration (7,) for both, or home if None.
+        The searches start from a solution nearby, from one configuration (7,) for both, or from home if None.
 
         Raises:
             UnreachableTargetError: As :meth:`solve`.
@@ -138,8 +120,3 @@ class ArmIK:
         )
         error_m = max(at.position_error_m, above.position_error_m)
         return Reach(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)
-
-    def _errors(self) -> tuple[float, float]:
-        """Distance (m) and angle (rad) still missing."""
-        error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
-        return math.hypot(*error[:3]), math.hypot(*error[3:])

@@ -18,11 +18,8 @@ from imagine_bench.interfaces import Floats
 
 from .arm_model import ArmModel
 
-PEAK_SPEED = 15 / 8
-"""Of the minimum-jerk profile, in Δq / T."""
-PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Of the minimum-jerk profile, in Δq / T²."""
-
+PEAK_SPEED, PEAK_ACCELERATION = 15 / 8, 10 / math.sqrt(3)
+"""Of the minimum-jerk profile, in Δq / T and Δq / T²."""
 SPEED_SHARE = 0.97
 """Share of the speed limits that a plan uses; the rest is left to the servos."""
 EFFORT_SHARE = 0.5
@@ -31,21 +28,13 @@ EFFORT_SHARE = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """Where arm and fingers shall be next, at rest.
-
-    Attributes:
-        name: What this motion is for, such as ``"close"``; unique in its trajectory.
-        qpos_rad: Arm joints. Shape (7,).
-        opening_m: Commanded distance of each pad from the grip's middle. Less than the object's half width squeezes it.
-        min_duration_s: The motion takes at least so long, such as the time fingers need.
-        blend_s: The next motion begins so long before this one has ended; the two add up.
-    """
+    """Where arm (7,) and fingers shall be next, at rest; the name, such as ``"close"``, is unique in its trajectory."""
 
     name: str
     qpos_rad: Floats
-    opening_m: float
-    min_duration_s: float = 0.0
-    blend_s: float = 0.0
+    opening_m: float  # commanded distance of each pad from the grip's middle; less than an object's half squeezes it
+    min_duration_s: float = 0.0  # the motion takes at least so long, such as the time fingers need
+    blend_s: float = 0.0  # the next motion begins so long before this one has ended; the two add up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,12 +65,9 @@ def minimum_jerk(steps: int) -> Floats:
 
 
 def shortest_duration_s(arm: ArmModel, delta_rad: Floats, inertia: Floats) -> float:
-    """The least time for a minimum-jerk motion within the shares of the speed and effort limits.
+    """The least time for a minimum-jerk motion by ``delta_rad`` (7,) within the shares of the arm's limits.
 
-    Args:
-        arm: Its limits count.
-        delta_rad: Joint differences. Shape (7,).
-        inertia: Joint-space inertia along the way, kg·m². Shape (7, 7).
+    ``inertia`` (7, 7) is the joint-space inertia along the way, in kg·m².
     """
     by_speed = np.abs(delta_rad / arm.speed_limit_rad_s).max() * PEAK_SPEED / SPEED_SHARE
     by_effort = np.abs(inertia @ delta_rad / arm.effort_limit_nm).max() * PEAK_ACCELERATION / EFFORT_SHARE
@@ -94,19 +80,12 @@ def plan(
     """Join the waypoints by minimum-jerk motions, each as short as the limits allow.
 
     The command is q + (K_d q' + M q'') / K_p, which cancels what damping and inertia would make the servo lag
-    (gravity is compensated in the model). M is taken halfway along each motion.
-
-    Args:
-        arm: The arm that moves.
-        start_qpos_rad: Where it rests before. Shape (7,).
-        start_opening_m: Where each finger rests before.
-        waypoints: At least one.
-        timestep_s: Of the simulation.
+    (gravity is compensated in the model). M is taken halfway along each motion. The arm (7,) and each finger rest at
+    their starts before; there is at least one waypoint.
     """
-    at_qpos_rad, at_opening_m = start_qpos_rad, start_opening_m
+    at_qpos_rad, at_opening_m, first = start_qpos_rad, start_opening_m, 0
     motions: list[tuple[int, Floats]] = []  # first step, rows [steps, 15]
     last_step: dict[str, int] = {}
-    first = 0
     for waypoint in waypoints:
         delta_rad = waypoint.qpos_rad - at_qpos_rad
         duration_s, inertial_nms2 = max(waypoint.min_duration_s, timestep_s), np.zeros(7)

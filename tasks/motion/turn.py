@@ -11,9 +11,9 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
-from ..scenes.constants import CUBE_EDGE_M, OBSERVATION_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M
+from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M, SLOTS_XY_M
 from .arm_model import ArmModel
-from .executor import REST_OPENING_M, MacroExecutor, MacroResult
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .trajectory import Waypoint
@@ -21,29 +21,20 @@ from .trajectory import Waypoint
 _QUARTER_RAD = math.pi / 2
 _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
-
 _MAX_SKEW_RAD = math.radians(8)
 """Beyond it the last joint might leave its range, so the other pair of faces is gripped."""
 _PAD_THICKNESS_M, _CLEARANCE_M = 0.008, 0.003
-
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
 """Each finger's command lies so far inside the cube: about 13 N."""
 _CLOSE_S, _OPEN_S, _SETTLE_S = 0.10, 0.07, 0.03
-_BLEND_S = 0.10
-"""Going down begins so long before the reach ends, and the return so long before the fingers are fully up."""
-
 _MAX_TILT_RAD = math.radians(10)
 _MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
 
 
 class TurnExecutor:
-    """Turns cubes by friction alone: mink plans, the servos move the arm, contact moves the cube.
-
-    Args:
-        model: The compiled scene with arm and cubes.
-    """
+    """Turns the cubes of a compiled scene by friction alone: mink plans, the servos move the arm, contact the cube."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.executor = MacroExecutor(model)
@@ -53,15 +44,9 @@ class TurnExecutor:
         self._slots = [self._reach(np.array(slot), None) for slot in SLOTS_XY_M]
 
     def turn(self, data: mujoco.MjData, *, cube: int, clockwise: bool, capture_motion_hz: float = 0.0) -> MacroResult:
-        """Turn a cube by a quarter, to the nearest right angle and onto its nominal slot.
+        """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
         The outcome is a pure function of the loose objects' positions and the arguments, bit for bit.
-
-        Args:
-            data: The scene, changed in place.
-            cube: Which one, left to right in the agent's frame.
-            clockwise: As seen from above, which is as seen in the frame.
-            capture_motion_hz: Samples of the motion a second to keep; 0 keeps none.
 
         Raises:
             InvalidValueError: No such cube.
@@ -77,16 +62,14 @@ class TurnExecutor:
             grip = self._reach(pose.position_m[:2], slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
-        other_faces = not clockwise and (
-            abs(_skew_rad(pose)) > _MAX_SKEW_RAD
-            or any(_crowds(other, pose) for each, other in enumerate(poses) if each != cube)
+        crowded = any(_crowds(other, pose) for each, other in enumerate(poses) if each != cube)
+        other_faces = not clockwise and (crowded or abs(_skew_rad(pose)) > _MAX_SKEW_RAD)
+        waypoints, error_m = (
+            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces),
+            max(grip.error_m, slot.error_m),
         )
         result, qpos, trajectory = self.executor.perform(
-            data,
-            self._arm,
-            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces),
-            ik_error_m=max(grip.error_m, slot.error_m),
-            capture_motion_hz=capture_motion_hz,
+            data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         turned = qpos[trajectory.last_step["turn"] + 1]
         if self.executor.opening_m(turned).min() < _MIN_GRIP_M:
@@ -95,11 +78,10 @@ class TurnExecutor:
 
     def _reach(self, place_xy_m: Floats, start: Reach | None) -> Reach:
         """Configurations that grip, and hover over, a cube standing at ``place_xy_m`` (2,), at the middle yaw."""
-        place_m = np.array([*place_xy_m, TABLE_HEIGHT_M + CUBE_EDGE_M / 2])
+        place_m = np.array([*place_xy_m, CUBE_REST_Z_M])
         return self._ik.reach(place_m, yaw_rad=_MIDDLE_YAW_RAD, lift_m=_LIFT_M, start=start)
 
     def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
-        """The arm stays where it is."""
         self.executor.rest(data)
         return self.executor.refused(reason)
 
@@ -129,14 +111,12 @@ def _waypoints(grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other
     before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skew_rad
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2
     squeezed_m = CUBE_EDGE_M / 2 - _SQUEEZE_M
-    observe = np.array(OBSERVATION_QPOS_RAD)
     return [
-        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=_BLEND_S),
+        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M),
         Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=squeezed_m, min_duration_s=_CLOSE_S),
         Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=squeezed_m),
         Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
-        Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=_BLEND_S),
-        Waypoint(name="return", qpos_rad=observe, opening_m=REST_OPENING_M),
-        Waypoint(name="settle", qpos_rad=observe, opening_m=REST_OPENING_M, min_duration_s=_SETTLE_S),
+        Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+        *back_to_rest(REST_OPENING_M, _SETTLE_S),
     ]

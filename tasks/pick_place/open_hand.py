@@ -24,11 +24,7 @@ _FINGERS: tuple[tuple[Joint, ...], ...] = tuple(
     )
     for y, reach in ((-0.034, 0.058), (-0.012, 0.068), (0.011, 0.064), (0.033, 0.048))
 )
-_THUMB: tuple[Joint, ...] = (
-    (0.030, -0.034, -0.012, 0.0140),
-    (0.000, -0.060, -0.004, 0.0110),
-    (-0.026, -0.072, 0.004, 0.0088),
-)
+_THUMB: tuple[Joint, ...] = ((0.03, -0.034, -0.012, 0.014), (0, -0.060, -0.004, 0.011), (-0.026, -0.072, 0.004, 0.0088))
 _HEEL: tuple[Joint, ...] = ((0.020, 0.0, -0.020, 0.022), (0.070, 0.004, -0.020, 0.024), (0.100, 0.006, -0.016, 0.023))
 _FOREARM: tuple[Joint, ...] = ((0.090, 0.006, -0.016, 0.024), (0.160, 0.010, 0.004, 0.029))
 _SLEEVE: tuple[Joint, ...] = ((0.160, 0.010, 0.004, 0.038), (0.365, 0.0, 0.094, 0.050), (0.565, -0.02, 0.200, 0.062))
@@ -37,27 +33,17 @@ _PALM_CENTER_M, _PALM_RADII_M = (0.004, 0.0, -0.014), (0.056, 0.047, 0.015)
 _PLATE_HALF_M, _RIM_M, _RIM_RADIUS_M = (0.050, 0.042, 0.008), (0.046, 0.040), 0.007
 
 
-def open_hand_mesh() -> Mesh:
-    """Palm, four fingers bent up a little, and the thumb: what the agent's frame shows."""
+def open_hand_meshes() -> dict[str, Mesh]:
+    """Palm, four fingers bent up a little and the thumb, which the agent's frame shows; the bare wrist; the sleeve."""
     fingers = [limb(finger, sides=5) for finger in _FINGERS]
     palm = ellipsoid(_PALM_CENTER_M, _PALM_RADII_M, sides=11, rings=4)
-    return merge([palm, limb(_THUMB, sides=5), *fingers, limb(_HEEL, sides=7)])
-
-
-def open_wrist_mesh() -> Mesh:
-    """Wrist and bare forearm."""
-    return limb(_FOREARM, sides=10)
-
-
-def open_sleeve_mesh() -> Mesh:
-    """The forearm's sleeve."""
-    return limb(_SLEEVE, sides=12)
+    hand = merge([palm, limb(_THUMB, sides=5), *fingers, limb(_HEEL, sides=7)])
+    return {"palm": hand, "palm_wrist": limb(_FOREARM, sides=10), "palm_sleeve": limb(_SLEEVE, sides=12)}
 
 
 def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> None:
     """Add the mocap body ``palm`` with the middle of its palm at a place in the world."""
-    meshes = {"palm": open_hand_mesh(), "palm_wrist": open_wrist_mesh(), "palm_sleeve": open_sleeve_mesh()}
-    body = add_limb(spec, "palm", palm_m, meshes)
+    body = add_limb(spec, "palm", palm_m, open_hand_meshes())
     touch = {"mass": 0.0, "group": c.COLLISION_GROUP, "friction": (0.9, 0.01, 0.002)}
     body.add_geom(name="palm_plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE_HALF_M,
                   pos=(0, 0, -_PLATE_HALF_M[2]), **touch)  # fmt: skip

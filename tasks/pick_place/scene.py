@@ -10,8 +10,8 @@ import mujoco
 
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec
-from ..scenes.hand import add_person_materials, add_pointing_hand
-from ..scenes.objects import add_objects, standing_m
+from ..scenes.hand import add_pointing_hand
+from ..scenes.objects import add_objects
 from ..scenes.tabletop import add_tabletop
 from .open_hand import add_open_hand
 
@@ -33,20 +33,12 @@ _FOVY_DEG, _PITCH_RAD = 57.0, math.radians(5.5)
 """Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom what the gripper holds."""
 
 
-def fingertip_m(index: int) -> tuple[float, float, float]:
-    """Nominal tip of the index finger that points at object ``index``, in the world."""
-    x_m, y_m, _ = standing_m(index)
-    dx_m, dy_m, dz_m = c.FINGERTIP_IN_SLOT_M
-    return (x_m + dx_m, y_m + dy_m, c.TABLE_HEIGHT_M + c.CUBE_EDGE_M / 2 + dz_m)
-
-
-def pick_spec() -> mujoco.MjSpec:
-    """The whole scene; it is added to the arm's own specification, so that every name stays without a prefix."""
-    spec = arm_spec()
+@functools.cache
+def _compiled() -> mujoco.MjModel:
+    spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "pick_place"
     add_tabletop(spec, TIMESTEP_S)
     add_objects(spec)
-    add_person_materials(spec)
     add_pointing_hand(spec, IDLE_FINGERTIP_M)
     add_open_hand(spec, IDLE_PALM_M)
     for geom in spec.geoms:
@@ -54,12 +46,7 @@ def pick_spec() -> mujoco.MjSpec:
     camera = spec.camera(c.AGENT_CAMERA)
     camera.fovy = _FOVY_DEG
     camera.alt.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
-    return spec
-
-
-@functools.cache
-def _compiled() -> mujoco.MjModel:
-    return pick_spec().compile()
+    return spec.compile()
 
 
 def compile_pick_scene() -> mujoco.MjModel:

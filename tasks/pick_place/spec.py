@@ -66,10 +66,7 @@ SPEC = TaskSpec(
     horizon=HORIZON,
     action_names=(*(f"pick or place the {name}" for name in _OBJECTS), "hand over"),
     macrostate_names=(*(f"{place} object" for place in _PLACES), "gesture"),
-    macrostate_values=(
-        *(("placed", "picked", "handed over"),) * N_OBJECTS,
-        (*_PLACES, "handover", "withdrawn"),
-    ),
+    macrostate_values=(*(("placed", "picked", "handed over"),) * N_OBJECTS, (*_PLACES, "handover", "withdrawn")),
     preprocessing="small_rgb",
     encoder="pick_place",
     rules=_RULES,

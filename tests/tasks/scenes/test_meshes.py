@@ -18,20 +18,18 @@ def signed_volume_m3(mesh: Mesh) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
-def arrow():
-    return prism(arrow_outline(), 0.0, 0.001)
+PARTS = {
+    "arrow": prism(arrow_outline(), 0.0, 0.001),
+    **hand.hand_meshes(),
+    **open_hand.open_hand_meshes(),
+    **{
+        part.__name__: part() for part in (objects._car_body, objects._car_trim, objects._cup_body, objects._cup_inside)
+    },
+}
 
 
-PARTS = [
-    arrow, hand.hand_mesh, hand.wrist_mesh, hand.sleeve_mesh,
-    open_hand.open_hand_mesh, open_hand.open_wrist_mesh, open_hand.open_sleeve_mesh,
-    objects._car_body, objects._car_trim, objects._cup_body, objects._cup_inside,
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.__name__)
-def test_meshes_are_closed_and_face_outward(part):
-    mesh = part()
+@pytest.mark.parametrize("mesh", PARTS.values(), ids=PARTS)
+def test_meshes_are_closed_and_face_outward(mesh):
     edges = Counter(tuple(edge) for face in mesh.faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True))
     assert all(edges[b, a] == count == 1 for (a, b), count in edges.items())
     assert signed_volume_m3(mesh) > 0

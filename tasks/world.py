@@ -1,0 +1,154 @@
+"""A task's scene at run time: loose objects and people's hands, put as a macrostate says and read back."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .motion import orientation
+from .motion.executor import MacroResult, at_rest
+from .scenes.appearance import Appearance, AppearanceSampler
+from .scenes.constants import AGENT_CAMERA
+
+MAX_TILT_RAD = math.radians(10.0)
+MAX_SKEW_RAD = math.radians(20.0)
+"""An object that is tipped, or turned off where it may stand, by more is a problem."""
+MAX_OTHER_SHIFT_M = 0.005
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a world shows.
+
+    Attributes:
+        macrostate: The nearest macrostate.
+        problem: What keeps the scene from being a proper macrostate, in words, or None.
+    """
+
+    macrostate: tuple[int, ...]
+    problem: str | None
+
+
+class World(abc.ABC):
+    """A scene; its macrostates are a value for each loose object, and last one for the human's gesture.
+
+    From the start and after each method all derived positions of ``data`` are up to date.
+
+    Args:
+        model: Compiled scene, this world's own.
+        level: How much the appearance varies.
+        objects: Bodies of the loose objects, and their names in sentences; ``<body>_joint`` is a free joint.
+        materials: Those whose colors vary.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, level: Appearance, *, objects: Mapping[str, str], materials: tuple[str, ...]
+    ) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        self._level, self._names = level, tuple(objects.values())
+        self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
+        starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
+        self._object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
+        self._rest_qpos, self._rest_ctrl = at_rest(model)
+        self.data.qpos[:] = self._rest_qpos
+        self._update()
+
+    def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
+        """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.ctrl[:] = self._rest_qpos, self._rest_ctrl
+        *objects, gesture = macrostate
+        for index, offset in enumerate(rng.uniform(-1.0, 1.0, (len(objects), 3)).tolist()):
+            self._put(index, objects[index], offset)
+        self._gesture(gesture)
+        self._update()
+
+    def vary(self, rng: np.random.Generator) -> None:
+        """Draw this frame's light, colors, camera and hands as the appearance says."""
+        if not self._level.varies_every_frame:
+            return
+        self._appearance.vary(rng)
+        *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
+        if self._hands_vary():
+            offset_m = [self._level.hand_offset_m * each for each in wobble]
+            self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
+        self._update()
+
+    @abc.abstractmethod
+    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+        """Kinematic execution: put the scene where a perfect ``action`` leads."""
+
+    @abc.abstractmethod
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves.
+
+        Raises:
+            DivergedError: The simulation blew up.
+        """
+
+    def read(self) -> Reading:
+        """Read the macrostate back from where objects, gripper and hands are."""
+        objects, problem = self._objects()
+        return Reading(macrostate=(*objects, self._read_gesture()), problem=problem)
+
+    # --- what a task says ----------------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Put an object where ``value`` says, off by shares of what the appearance allows in x, y and yaw."""
+
+    @abc.abstractmethod
+    def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
+        """The value nearest to an object's pose (7), and what is wrong with how it is there."""
+
+    @abc.abstractmethod
+    def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
+        """Where people's hands are, by the number of their mocap body."""
+
+    @abc.abstractmethod
+    def _read_gesture(self) -> int:
+        """What the hands say."""
+
+    def _hands_vary(self) -> bool:
+        return True
+
+    # --- what they all do ----------------------------------------------------------------------------------------
+
+    def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
+        for mocap, place_m in self._hands_m(gesture).items():
+            self.data.mocap_pos[mocap] = [nominal + off for nominal, off in zip(place_m, offset_m, strict=True)]
+            self.data.mocap_quat[mocap] = orientation.about_vertical(yaw_rad)
+
+    def _update(self) -> None:
+        """Bring geoms, sites, cameras and lights up to date with positions."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def _poses(self) -> NDArray[np.float64]:
+        """Positions and quaternions of the objects, copied. Shape (N, 7)."""
+        return np.asarray(self.data.qpos[self._object_qpos])
+
+    def _objects(self) -> tuple[tuple[int, ...], str | None]:
+        """The value of each object, and what is wrong with the first that is not as it should be."""
+        read = [self._read_object(index, pose) for index, pose in enumerate(self._poses().tolist())]
+        return tuple(value for value, _ in read), next((problem for _, problem in read if problem), None)
+
+    def _tipped(self, index: int, pose: list[float]) -> str | None:
+        tilt_rad = orientation.tilt_rad(*pose[4:6])
+        if tilt_rad <= MAX_TILT_RAD:
+            return None
+        return f"{self._names[index]} is tipped by {math.degrees(tilt_rad):.0f} degrees"
+
+    def _pushed(self, moving: Collection[int], before: NDArray[np.float64], how: str) -> str | None:
+        """Which object but the moving ones is elsewhere than in the poses before (N, 7)."""
+        shift_m = np.linalg.norm(self._poses()[:, :3] - before[:, :3], axis=1)
+        for index, name in enumerate(self._names):
+            if index not in moving and shift_m[index] > MAX_OTHER_SHIFT_M:
+                return f"{name} was pushed {1e3 * shift_m[index]:.0f} mm {how}"
+        return None
