@@ -100,7 +100,7 @@ build: ready  ## Build the wheel into dist/ and use it in an empty folder
 lock:  ## Pin every package in .ci/requirements.lock after a change of pyproject.toml; ARGS=--upgrade takes the newest
 	@PATH="$$PATH:$(BIN)" uv pip compile -q pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-emit-package torch --config-file .ci/lock.toml --custom-compile-command 'make lock' -o .ci/requirements.lock $(ARGS) >/dev/null
 
-speed: ready  ## Measure every speed and fidelity figure that is promised
+speed: ready  ## Measure every speed and fidelity figure that has a target
 	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(options)
 
 clean:  ## Remove caches and build leftovers; results and .venv stay

@@ -127,7 +127,7 @@ def torch_version() -> str:
     return pin.removeprefix("torch==")
 
 
-def test_torch_is_pinned_alike_everywhere_and_its_needs_are_locked() -> None:
+def test_torch_is_pinned_alike_and_its_needs_are_locked() -> None:
     (described,) = tomllib.loads((_TOP / ".ci/lock.toml").read_text())["dependency-metadata"]
     assert "torch" not in locked("3.11")
     assert described["version"] == torch_version()

@@ -12,7 +12,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.seeding import Purpose, SeedTree, episode_seed
 
 
-def test_children_do_not_depend_on_order_and_differ_from_one_another():
+def test_children_differ_and_do_not_depend_on_order():
     tree = SeedTree(7)
     first, second = tree.child("agent").integer(), tree.child("agent", "masks").integer()
     again = SeedTree(7)

@@ -42,7 +42,7 @@ def rows(terminal: Terminal) -> dict[int, str]:
     return {len(down): text.rstrip() for down, text in written if down}
 
 
-def test_every_run_that_goes_on_has_a_row_until_another_takes_it_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_running_run_has_a_row_of_the_display(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with ProgressBars(specs()) as show:
@@ -93,9 +93,7 @@ def test_time_left_is_of_what_no_session_has_done(
     assert "10:00:00 gone, 35:00:00 left" in capsys.readouterr().err
 
 
-def test_a_run_that_fails_is_named_at_once_and_asks_for_no_more_time(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failed_run_is_named_at_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     begins = Progress(agent="table", seed=0, phase="training", done=9, work=WORK)
     failed = Progress(agent="table", seed=1, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke")
     after_ten_hours(monkeypatch, begins, failed, far("table", 0, "done"), done={})

@@ -23,14 +23,14 @@ def test_every_preset_survives_json_with_its_hash(task, preset):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_what_counts_as_learned_lies_between_chance_and_the_optimum(name):
+def test_success_thresholds_lie_between_chance_and_optimum(name):
     facts, success_threshold = task(name).facts(), task(name).success_threshold
     assert facts.chance_level < 0.5 < success_threshold <= facts.optimum
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)
 @pytest.mark.parametrize("name", TASKS)
-def test_the_quick_bench_finds_an_encoder_of_each_kind_at_every_appearance(name, appearance):
+def test_quick_finds_encoders_at_every_appearance(name, appearance):
     wanted, paths = plan_control(name, "quick", appearance=appearance)
     assert set(paths) == {"latents", "codes"} and wanted.codes is not None
 
@@ -79,7 +79,7 @@ def test_a_preset_that_changes_is_another_bench(
     assert asked.settings_digest == after.settings_digest
 
 
-def test_a_task_says_what_a_preset_changes_for_it_and_the_caller_has_the_last_word(monkeypatch):
+def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
     own = {"quick": {"seeds": (7, 8), "budgets": (5,)}}
     spec = dataclasses.replace(task("arrow_puzzle"), settings="chapter_3", presets=own)
     monkeypatch.setattr("imagine_bench.protocols.control.task", lambda name: spec)

@@ -41,7 +41,7 @@ def do(folder: Path, agent: str = "pupil", task: str = "arrow_puzzle", **changes
 # --- demonstrations ----------------------------------------------------------------------------------------------
 
 
-def test_demonstrated_episodes_are_optimal_seen_as_frames_and_begin_where_others_do(tmp_path: Path) -> None:
+def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
     plain, shown = do(tmp_path / "plain"), do(tmp_path / "shown", demonstrations=4)
     alone, taught = Pupil.made
     assert shown.training_success[:4].all() and not plain.training_success.all()

@@ -33,7 +33,7 @@ from imagine_bench.store.counters import EvaluationCounts
 
 
 @pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
-def test_whatever_a_run_that_tunes_is_shown_comes_from_tuning_starts(
+def test_a_tuning_run_is_shown_tuning_starts_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
 ) -> None:
     asked = []

@@ -87,7 +87,7 @@ def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
     assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
 
 
-def test_tuning_runs_are_tested_on_starts_that_no_reported_run_meets(tmp_path: Path) -> None:
+def test_tuning_runs_never_meet_starts_of_reported_runs(tmp_path: Path) -> None:
     seeds: dict[int, list[int]] = {}
     real_reset = run_state.gymnasium.make
 

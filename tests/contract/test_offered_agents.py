@@ -70,7 +70,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     registry._offered.cache_clear()
 
 
-def test_another_packages_agent_is_compared_like_one_of_this_suite(
+def test_a_packages_agent_is_compared_like_one_of_ours(
     install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "their_agent" not in registry.agents()

@@ -407,7 +407,7 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     np.testing.assert_array_equal(shown, compared.start_frame)
 
 
-def test_episodes_to_mastery_ask_for_what_the_task_calls_mastered(
+def test_episodes_to_success_use_the_threshold_of_the_task(
     result: BenchResult, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = collect(result).spec

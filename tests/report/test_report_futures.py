@@ -48,12 +48,12 @@ def with_chance(run: RunResult, spec: TaskSpec) -> RunResult:
     rng = np.random.default_rng(run.seed)
     if run.agent == "dqn":
         return run
-    course = compared_rollout(rng, depth=2)
+    compared = compared_rollout(rng, depth=2)
     states = np.array([[0, 1, 0, 2], [0, 0, 0, 2]])
-    inside = dataclasses.replace(course.rollout, macrostates=states, actions=np.array([1, 1]))
-    course = dataclasses.replace(course, rollout=inside, start_macrostate=np.array([0, 0, 0, 1]))
+    inside = dataclasses.replace(compared.rollout, macrostates=states, actions=np.array([1, 1]))
+    compared = dataclasses.replace(compared, rollout=inside, start_macrostate=np.array([0, 0, 0, 1]))
     rows = tuple(dataclasses.replace(row, futures=futures(spec, rng)) for row in run.checkpoints)
-    return dataclasses.replace(run, checkpoints=rows, imagined=(course,), sampled_rollouts=(course,) * 3)
+    return dataclasses.replace(run, checkpoints=rows, imagined=(compared,), sampled_rollouts=(compared,) * 3)
 
 
 @pytest.fixture(scope="module")

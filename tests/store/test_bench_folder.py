@@ -50,7 +50,7 @@ def test_a_missing_run_is_an_error_that_says_how_to_go_on(tmp_path: Path) -> Non
         load_bench(store.folder)
 
 
-def test_a_bench_that_is_whole_says_that_nothing_was_run_and_with_what(
+def test_a_whole_bench_says_that_nothing_was_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = small(agents=("random",))
@@ -105,9 +105,7 @@ def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]
 
 
-def test_a_session_that_was_killed_at_any_write_can_be_begun_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_session_killed_at_any_write_can_begin_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for survived in (0, 1):
         writes = iter(range(10))
 

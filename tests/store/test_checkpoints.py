@@ -52,9 +52,7 @@ def test_the_newest_is_kept_alone(tmp_path: Path) -> None:
     assert load_newest(tmp_path / "nothing") is None
 
 
-def test_a_checkpoint_that_is_replaced_while_it_is_read_is_no_damage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_replaced_while_it_is_read_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_snapshot(tmp_path, snapshot(1))
     real, calls = checkpointing.load_snapshot, []
 

@@ -61,7 +61,7 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     assert dataclasses.asdict(joined.protocol)["evaluation_episodes"] == 3
 
 
-def test_what_was_said_of_the_time_since_a_test_that_is_not_shown_counts_for_the_next(tmp_path: Path) -> None:
+def test_diagnostics_of_a_test_not_shown_count_for_the_next(tmp_path: Path) -> None:
     """Interval means, over 10, 20 and 70 steps, of which the first two end in one test that is shown."""
     whole = Protocol(task="arrow_puzzle", preset="quick", budgets=(10, 30, 100))
     run = bench_result(tmp_path, protocol=whole).of("imagination")[0]
@@ -168,7 +168,7 @@ def test_kept_results_have_a_report_of_their_own(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "kept/report/index.html").is_file()
 
 
-def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Path) -> None:
+def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
     folder = do(tmp_path, "oracle", "random", seeds=(0, 1), budgets=(4, 9))
     kept = kept_from(folder, tmp_path / "kept")
     rows = (kept / "results.csv").read_text().splitlines(keepends=True)
@@ -179,7 +179,7 @@ def test_results_kept_of_an_unfinished_bench_are_its_largest_table(tmp_path: Pat
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
 
 
-def test_kept_results_of_a_regression_bench_are_said_to_have_no_report(capsys: pytest.CaptureFixture[str]) -> None:
+def test_kept_regression_results_have_no_report_and_say_so(capsys: pytest.CaptureFixture[str]) -> None:
     kept = Path(__file__).parents[2] / "docs/results/toy_regression-thesis"
     assert main(["report", str(kept)]) == 2
     assert "keeps a bench of toy_regression, whose tables are its .csv files" in capsys.readouterr().err

@@ -18,7 +18,7 @@ import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.seeding import SeedTree
 
-PROMISED = [
+TARGETS = [
     (name, appearance, required)
     for name, spec in ((name, registry.task(name)) for name in registry.TASKS)
     if spec.targets is not None
@@ -27,7 +27,7 @@ PROMISED = [
 """Share of fresh frames whose whole macrostate must be read right."""
 
 
-@pytest.mark.parametrize(("task", "appearance", "required"), PROMISED)
+@pytest.mark.parametrize(("task", "appearance", "required"), TARGETS)
 def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearance: str, required: float) -> None:
     """1,000 frames of a seed that made nothing else; the margin is three binomial standard deviations."""
     spec = registry.task(task)
@@ -51,7 +51,7 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
     assert shuffled < 2 / len(spec.rules.states) + 0.04  # the same measure fails where it should
 
 
-@pytest.mark.parametrize("task", sorted({name for name, *_ in PROMISED}))
+@pytest.mark.parametrize("task", sorted({name for name, *_ in TARGETS}))
 def test_bundled_encoder_reads_what_physics_leaves_behind(task: str) -> None:
     """It was trained on frames whose outcomes were set; objects that were carried or turned lie a little elsewhere."""
     spec = registry.task(task)
@@ -71,7 +71,7 @@ def test_bundled_encoder_reads_what_physics_leaves_behind(task: str) -> None:
 
 
 @pytest.mark.parametrize("appearance", ["clean", "mild"])
-@pytest.mark.parametrize("task", sorted({name for name, *_ in PROMISED}))
+@pytest.mark.parametrize("task", sorted({name for name, *_ in TARGETS}))
 def test_bundled_codes_give_every_macrostate_a_code_of_its_own(task: str, appearance: str) -> None:
     """Neither torn by jitter nor mixed up. A code for every fourth frame of a macrostate would be a third torn."""
     spec = registry.task(task)
