@@ -66,7 +66,7 @@ class Figure:
 
 
 def _figure(what: str, value: float, sign: str, target: float, form: str, more: str = "") -> Figure:
-    """A figure beside its target; ``sign`` (``"<"``, ``"<="`` or ``">="``) says how it must stand, ``more`` follows it."""
+    """A figure; ``sign`` (``"<"``, ``"<="`` or ``">="``) says how it must stand to its target, ``more`` follows it."""
     required = f"{target:.1%}" if form.endswith("%") else f"{target:,g}"
     met = _SIGNS[sign](value, target)
     return Figure(what=what, required=f"{sign} {required}", measured=f"{value:{form}}{more}", met=met)
