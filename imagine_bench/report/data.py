@@ -148,13 +148,19 @@ class ReportData:
 
     @property
     def decisive_budget(self) -> int:
-        """The budget at which the learners' scores lie furthest apart; the last of several such ones."""
+        """The budget at which the learners differ most; the last of several such ones."""
         return max(reversed(self.budgets), key=self.spread)
 
     def spread(self, budget: int) -> float:
-        """How far the learners' scores lie apart at a budget, as a share."""
-        values = [self.scores[agent][budget].value for agent in self.areas]
-        return max(values, default=0.0) - min(values, default=0.0)
+        """Median distance of the learners' scores from DQN's at a budget, as a share; without DQN, their range.
+
+        A median, so that one agent far ahead of all others does not choose a budget at which the others are alike.
+        """
+        values = {agent: self.scores[agent][budget].value for agent in self.areas}
+        base = values.pop(BASE_AGENT, None)
+        if base is None:
+            return max(values.values(), default=0.0) - min(values.values(), default=0.0)
+        return float(np.median([abs(value - base) for value in values.values()])) if values else 0.0
 
 
 def collect(result: BenchResult) -> ReportData:
