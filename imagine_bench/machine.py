@@ -156,11 +156,7 @@ def usable_cores() -> int:
 
 
 def gl_renderer() -> str:
-    """Vendor and renderer of the OpenGL that draws the frames.
-
-    Raises:
-        SetupError: There is none; the message says what to install.
-    """
+    """Vendor and renderer of the OpenGL that draws the frames. Raises SetupError: there is none."""
     name: str = registry.load(GL_RENDERER)()
     return name
 

@@ -16,49 +16,32 @@ from imagine_bench.regression.interfaces import RegressionSpec, Regressor, Regre
 
 @dataclass(frozen=True, kw_only=True)
 class TaskEntry:
-    """A registered task.
+    """A registered task."""
 
-    Attributes:
-        spec: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it.
-        env_id: Gymnasium id, registered by ``import imagine_bench``.
-        env: ``"module:attr"`` of the environment's constructor.
-        horizon: Macro-actions before truncation.
-        options: Keyword arguments of both, which say which member of a family it is.
-    """
-
-    spec: str
-    env_id: str
-    env: str
-    horizon: int
+    spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
+    env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
+    env: str  #: ``"module:attr"`` of the environment's constructor
+    horizon: int  #: Macro-actions before truncation
+    #: Keyword arguments of both, which say which member of a family it is.
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry:
-    """A registered agent.
+    """A registered agent."""
 
-    Attributes:
-        make: ``"module:attr"`` of a function from AgentContext to Agent.
-        learns: Whether training changes it; others are only evaluated.
-        needs_encoder: Whether it sees what an encoder gives.
-        encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
-            ``resolve(hyperparameters, overrides, group)``.
-        privileged: Whether it is shown the macrostate and the rules (references only).
-        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
-        title: For headings, legends and tables; by default the registered name in plain words.
-        description: One sentence for a reader who knows none of this.
-    """
-
-    make: str
-    learns: bool = True
-    needs_encoder: bool = True
-    encoder_kind: str = "latents"
+    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
+    learns: bool = True  #: Whether training changes it; others are only evaluated
+    needs_encoder: bool = True  #: Whether it sees what an encoder gives
+    encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
+    #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
+    #: group)``.
     settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
-    privileged: bool = False
+    privileged: bool = False  #: Whether it is shown the macrostate and the rules (references only)
+    #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
     external_training_loop: bool = False
-    title: str = ""
-    description: str = "A registered agent."
+    title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
+    description: str = "A registered agent."  #: One sentence for a reader who knows none of this
 
 
 TASKS: dict[str, TaskEntry] = {
@@ -172,28 +155,18 @@ DEMONSTRATOR = "oracle"
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionEntry:
-    """A registered regression task.
+    """A registered regression task."""
 
-    Attributes:
-        spec: ``"module:attr"`` of its RegressionSpec.
-    """
-
-    spec: str
+    spec: str  #: ``"module:attr"`` of its RegressionSpec
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressorEntry:
-    """A registered regressor.
+    """A registered regressor."""
 
-    Attributes:
-        make: ``"module:attr"`` of a function from RegressorContext to Regressor.
-        title: For headings, legends and tables.
-        description: One sentence for a reader who knows none of this.
-    """
-
-    make: str
-    title: str
-    description: str
+    make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
+    title: str  #: For headings, legends and tables
+    description: str  #: One sentence for a reader who knows none of this
 
 
 REGRESSIONS: dict[str, RegressionEntry] = {
@@ -239,8 +212,7 @@ def load(target: str) -> Any:
 def agents() -> dict[str, AgentEntry]:
     """All agents by name: this suite's, and those that installed packages offer.
 
-    Raises:
-        SetupError: A package offers something that is no agent, or under a name that is taken; the message names it.
+    Raises SetupError: a package offers something that is no agent, or under a name that is taken.
     """
     return {**AGENTS, **_offered()}
 
@@ -279,11 +251,7 @@ def agent_packages() -> dict[str, frozenset[str]]:
 
 
 def task_entry(name: str) -> TaskEntry:
-    """The registry line of a task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists all of them.
-    """
+    """The registry line of a task. Raises UnknownNameError: no such task."""
     return TASKS[require_known("task", name, TASKS)]
 
 
@@ -291,7 +259,7 @@ def agent_entry(name: str) -> AgentEntry:
     """The registry line of an agent, this suite's or an installed package's.
 
     Raises:
-        UnknownNameError: No such agent; the message lists all of them.
+        UnknownNameError: No such agent.
         SetupError: As :func:`agents`.
     """
     known = agents()
@@ -324,7 +292,7 @@ def task(name: str) -> TaskSpec:
     """The TaskSpec of a registered task.
 
     Raises:
-        UnknownNameError: No such task; the message lists all of them.
+        UnknownNameError: No such task.
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
@@ -358,21 +326,13 @@ def make_agent(name: str, context: AgentContext) -> Agent:
 
 
 def regression(name: str) -> RegressionSpec:
-    """The RegressionSpec of a registered regression task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists all of them.
-    """
+    """The RegressionSpec of a registered regression task. Raises UnknownNameError: no such task."""
     spec: RegressionSpec = load(REGRESSIONS[require_known("regression task", name, REGRESSIONS)].spec)
     return spec
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor.
-
-    Raises:
-        UnknownNameError: No such regressor; the message lists all of them.
-    """
+    """The registry line of a regressor. Raises UnknownNameError: no such regressor."""
     return REGRESSORS[require_known("regressor", name, REGRESSORS)]
 
 

@@ -32,7 +32,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
             bundled name or a path.
 
     Raises:
-        UnknownNameError: Any name that does not exist; the message lists those that do.
+        UnknownNameError: Any name that does not exist.
         InvalidValueError: A value out of its range, or an option that tasks of this type do not take.
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
@@ -57,7 +57,7 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
         BusyError: Another bench works in the same folder.
         SetupError: The folder cannot be written, or there is no GL.
-        ArtefactError: A file is damaged or foreign; it is left untouched.
+        ArtefactError: A file is damaged or foreign.
     """
     store = BenchStore(bench_folder(root, wanted), wanted)
     store.open()

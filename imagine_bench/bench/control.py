@@ -32,7 +32,7 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
         changes: Fields of the protocol that differ from the preset's.
 
     Raises:
-        UnknownNameError: Any name that does not exist; the message lists those that do.
+        UnknownNameError: Any name that does not exist.
         InvalidValueError: A value out of its range, or something that an agent cannot do.
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
@@ -70,7 +70,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
     """All settings of every learner by its name, each override checked by the agents that have such a setting.
 
     Raises:
-        UnknownNameError: No agent of the protocol has it; the message lists what there is.
+        UnknownNameError: No agent of the protocol has it.
         InvalidValueError: A value of the wrong type or out of its range.
     """
     overrides = dict(wanted.overrides)

@@ -22,8 +22,7 @@ from imagine_bench.protocols.runs import RunSpec
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
     """Check that a learner can do what a protocol asks of it.
 
-    Raises:
-        InvalidValueError: It cannot carry anything over to the next task, cannot watch, or cannot ask.
+    Raises InvalidValueError: it cannot carry anything over to the next task, cannot watch, or cannot ask.
     """
     if protocol.demonstrations and isinstance(agent, ExternalTrainer):
         raise InvalidValueError(
@@ -68,10 +67,8 @@ class LabelOracle:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
 
         The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
-        may happen is looked at; None where that differs in reward or end: a matter of chance has no label.
-
-        Raises:
-            InvalidValueError: No action, or one that does not exist.
+        may happen is looked at; None where that differs in reward or end: a matter of chance has no label. Raises
+        InvalidValueError: no action, or one that does not exist.
         """
         planned = [int(action) for action in actions]
         if not planned or not all(0 <= action < self._rules.n_actions for action in planned):

@@ -48,8 +48,7 @@ class RayCluster:
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job; see :class:`imagine_bench.bench.launchers.Launcher`.
 
-        Raises:
-            SetupError: There is no cluster at ``RAY_ADDRESS``, or none with the GPU that the runs ask for.
+        Raises SetupError: there is no cluster at ``RAY_ADDRESS``, or none with the GPU that the runs ask for.
         """
         import ray  # noqa: PLC0415 - as above
 

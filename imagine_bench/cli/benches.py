@@ -174,8 +174,7 @@ class List:
 def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
 
-    Raises:
-        InvalidValueError: A word without ``=``, or a name given twice.
+    Raises InvalidValueError: a word without ``=``, or a name given twice.
     """
     settings: dict[str, Any] = {}
     for pair in pairs:

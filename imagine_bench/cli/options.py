@@ -32,8 +32,7 @@ def require_values(name: str, values: Sequence[object] | None) -> None:
 def added_up(name: str, each: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
     """All values of an option that may be given several times.
 
-    Raises:
-        InvalidValueError: It was given without a value.
+    Raises InvalidValueError: it was given without a value.
     """
     for values in each:
         require_values(name, values)
@@ -44,7 +43,7 @@ def only(task: str | None, given: Path | None) -> tuple[str, ...]:
     """A task by itself, or none for any.
 
     Raises:
-        UnknownNameError: No such task; the message lists those of every type.
+        UnknownNameError: No such task.
         InvalidValueError: A path was given too.
     """
     require_either(given, task)

@@ -21,46 +21,36 @@ _FIRST_STAGE = 2000
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(ProtocolData):
-    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others.
+    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others."""
 
-    Attributes:
-        settings: Config group of the agents' settings, as the task names it.
-        hyperparameters: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
-        budgets: Real training episodes at which the agent is evaluated, ascending.
-        evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
-        execution: ``"physics"`` or ``"kinematic"``.
-        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
-        open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
-        sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
-            distribution at each budget; 0 asks for none.
-        recorded_episodes: Real episodes in each recording; 0 records none.
-        encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
-        codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
-        after: Tasks of the same world that learners are trained on before, in this order; what they know of the
-            world is carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
-        after_episodes: Real training episodes on each of them.
-        demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
-            observe; they are real episodes as any, and budgets count them.
-        queries: Most oracle queries of a learner in a training episode.
-    """
-
-    settings: str = "chapter_5"
+    settings: str = "chapter_5"  #: Config group of the agents' settings, as the task names it
+    #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
+    #: Real training episodes at which the agent is evaluated, ascending.
     budgets: tuple[int, ...] = (100, 250, 500, 1000)
-    evaluation_episodes: int = 200
-    execution: str = "physics"
-    appearance: str = "clean"
+    evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
+    execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
+    appearance: str = "clean"  #: ``"clean"``, ``"mild"`` or ``"strong"``
+    #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
+    #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
+    #: budget; 0 asks for none.
     sampled_futures: int = 16
-    recorded_episodes: int = 5
+    recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
+    #: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
     encoder: str | None = None
+    #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
+    #: Tasks of the same world that learners are trained on before, in this order; what they know of the world is
+    #: carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
     after: tuple[str, ...] = ()
-    after_episodes: int = _AFTER_EPISODES
+    after_episodes: int = _AFTER_EPISODES  #: Real training episodes on each of them
+    #: Training episodes, the first ones, that the bench's demonstrator plays while learners merely observe; they are
+    #: real episodes as any, and budgets count them.
     demonstrations: int = 0
-    queries: int = 0
+    queries: int = 0  #: Most oracle queries of a learner in a training episode
 
     def __post_init__(self) -> None:
         task_entry(self.task)

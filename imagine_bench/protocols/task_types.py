@@ -69,31 +69,18 @@ class Plan(Interface[P_co]):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskType(Generic[P]):
-    """What a type of task brings along.
+    """What a type of task brings along."""
 
-    Attributes:
-        tasks: Its registered tasks.
-        learners: Gives its agents or regressors, by name.
-        draws: Whether its runs need OpenGL.
-        protocol: The class of its protocols.
-        presets: What each protocol preset changes, by name.
-        plan: Makes a protocol.
-        run: Carries out a run in a folder.
-        load_run: Reads a finished run folder.
-        load_so_far: Reads a bench folder, as far as it can be reported.
-        result: Class of a finished bench.
-    """
-
-    tasks: Mapping[str, object]
-    learners: Callable[[], Mapping[str, object]]
-    draws: bool
-    protocol: type[P]
-    presets: Mapping[str, Mapping[str, Any]]
-    plan: Plan[P]
-    run: Callable[[RunSpec[P], Path, OnProgress], object]
-    load_run: Callable[[Path], FinishedRun]
-    load_so_far: Callable[[Path], Result]
-    result: Callable[..., Result]
+    tasks: Mapping[str, object]  #: Its registered tasks
+    learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
+    draws: bool  #: Whether its runs need OpenGL
+    protocol: type[P]  #: The class of its protocols
+    presets: Mapping[str, Mapping[str, Any]]  #: What each protocol preset changes, by name
+    plan: Plan[P]  #: Makes a protocol
+    run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
+    load_run: Callable[[Path], FinishedRun]  #: Reads a finished run folder
+    load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported
+    result: Callable[..., Result]  #: Class of a finished bench
 
 
 @functools.cache
@@ -103,11 +90,7 @@ def task_types() -> dict[str, TaskType[ProtocolData]]:
 
 
 def task_type(task: str) -> TaskType[ProtocolData]:
-    """The type of a registered task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists those of every type.
-    """
+    """The type of a registered task. Raises UnknownNameError: no such task."""
     for kind in task_types().values():
         if task in kind.tasks:
             return kind

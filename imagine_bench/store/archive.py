@@ -67,7 +67,7 @@ def load_archive(folder: Path) -> BenchResult:
     """Read such a folder.
 
     Raises:
-        ArtefactError: It is damaged; the message names the file.
+        ArtefactError: It is damaged.
         InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
@@ -97,8 +97,7 @@ def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
     numbers |= {name: int(row[name]) for name in (*_COUNTS, _COSTS[0])}
     known = ("agent", "seed", *numbers, *_DERIVED)
     return Checkpoint(
-        **numbers,
-        diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},
+        **numbers, diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""}
     )
 
 

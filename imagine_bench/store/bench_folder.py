@@ -55,11 +55,7 @@ class BenchStore:
             raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
 
     def lock(self) -> AbstractContextManager[None]:
-        """Hold the folder for this process.
-
-        Raises:
-            BusyError: Another bench works there.
-        """
+        """Hold the folder for this process. Raises BusyError: another bench works there."""
         return lock(self.folder / ".lock", f"The bench folder {self.folder}")
 
     def run_folder(self, agent: str, seed: int) -> Path:
@@ -119,8 +115,7 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
 def load_bench(folder: Path) -> Result:
     """Read a finished bench, as the result class of its task's type.
 
-    Raises:
-        ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
+    Raises ArtefactError: it is not a bench, runs are missing, or a file is damaged.
     """
     protocol = read_protocol(folder)
     folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
@@ -132,8 +127,7 @@ def load_bench(folder: Path) -> Result:
 def bench_facts(folder: Path) -> dict[str, Any]:
     """``environment``, ``folder`` and ``wall_s`` of a bench's result.
 
-    Raises:
-        ArtefactError: A file is missing or damaged; the message names it.
+    Raises ArtefactError: a file is missing or damaged.
     """
     if (folder / KEPT).exists():
         kept = read_json(folder / KEPT, "a kept bench")
@@ -155,8 +149,7 @@ def require_either(given: Path | None, task: str | None) -> None:
 def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
     """The bench folder below ``root`` that was worked on last, of any task or of some.
 
-    Raises:
-        ArtefactError: There is none.
+    Raises ArtefactError: there is none.
     """
     found = [path for path in root.glob(f"*/*/{_SESSIONS}") if not tasks or path.parts[-3] in tasks]
     if not found:
@@ -172,8 +165,7 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
 def newest_recording(root: Path, task: str | None = None) -> Path:
     """The recording below ``root`` that was written last, of a run or of a plan, of any task or of one.
 
-    Raises:
-        ArtefactError: There is none.
+    Raises ArtefactError: there is none.
     """
     where = root / (task or "")
     found = sorted(where.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
@@ -202,11 +194,7 @@ def _run_folder(folder: Path, agent: str, seed: int) -> Path:
 
 
 def read_protocol(folder: Path) -> ProtocolData:
-    """The protocol of a bench folder.
-
-    Raises:
-        ArtefactError: It is missing or damaged; the message names it.
-    """
+    """The protocol of a bench folder. Raises ArtefactError: it is missing or damaged."""
     kept = (folder / KEPT).exists()
     path, what = folder / (KEPT if kept else _PROTOCOL), "a bench's protocol"
     data = read_json(path, what)
@@ -218,8 +206,7 @@ def read_protocol(folder: Path) -> ProtocolData:
 def read_control(folder: Path) -> Protocol:
     """The protocol of a bench folder of agents that act.
 
-    Raises:
-        ArtefactError: It is of a regression task, missing or damaged; the message names it.
+    Raises ArtefactError: it is of a regression task, missing or damaged.
     """
     protocol = read_protocol(folder)
     if not isinstance(protocol, Protocol):

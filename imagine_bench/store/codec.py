@@ -105,22 +105,14 @@ def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays, atomically.
-
-    Raises:
-        SetupError: They cannot be written.
-    """
+    """Write named arrays, atomically. Raises SetupError: they cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
 
 def read_arrays(path: Path) -> Arrays:
-    """The inverse of :func:`write_arrays`.
-
-    Raises:
-        ArtefactError: The file is missing or damaged.
-    """
+    """The inverse of :func:`write_arrays`. Raises ArtefactError: the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

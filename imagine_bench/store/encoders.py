@@ -29,7 +29,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
         kind: Which of the task's own: ``"latents"``, continuous, or ``"codes"``, one-hot, of factors.
 
     Raises:
-        UnknownNameError: ``given`` is neither; the message lists the bundled names.
+        UnknownNameError: ``given`` is neither.
         ArtefactError: The task has no bundled encoder at this level.
     """
     known = bundled()
@@ -53,8 +53,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 def kind(path: Path) -> str:
     """Whether an encoder gives ``"latents"`` or ``"codes"``, by the card beside it.
 
-    Raises:
-        ArtefactError: The card is damaged.
+    Raises ArtefactError: the card is damaged.
     """
     card = path.with_suffix(".json")
     return "codes" if card.is_file() and read_json(card, "an encoder's card").get("code_sizes") else "latents"
@@ -63,7 +62,6 @@ def kind(path: Path) -> str:
 def identity(path: Path) -> str:
     """What stands for an encoder in a protocol: its name and the beginning of its digest.
 
-    Raises:
-        ArtefactError: The file cannot be read.
+    Raises ArtefactError: the file cannot be read.
     """
     return f"{path.stem}@{sha256(path)[:12]}"

@@ -37,8 +37,7 @@ _REASONS = {
 def writing(path: Path) -> Iterator[None]:
     """Turn the operating system's refusal to write at ``path`` into one sentence.
 
-    Raises:
-        SetupError: The folder is not writable, the disk is full, or the like.
+    Raises SetupError: the folder is not writable, the disk is full, or the like.
     """
     try:
         yield
@@ -48,11 +47,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> Path:
-    """Create ``folder`` with its parents if need be.
-
-    Raises:
-        SetupError: It cannot be made.
-    """
+    """Create ``folder`` with its parents if need be. Raises SetupError: it cannot be made."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -61,8 +56,7 @@ def make_folder(folder: Path) -> Path:
 def require_writable(folder: Path) -> None:
     """Make sure, before long work whose result is to lie in ``folder``, that it can; the folder is made if need be.
 
-    Raises:
-        SetupError: It cannot be made or written to.
+    Raises SetupError: it cannot be made or written to.
     """
     with writing(make_folder(folder)), TemporaryFile(dir=folder):
         pass
@@ -82,8 +76,7 @@ def sync_folder(folder: Path) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file at once: to a temporary neighbour, to the disk, then into place.
 
-    Raises:
-        SetupError: It cannot be written; an earlier file at ``path`` is untouched.
+    Raises SetupError: it cannot be written; an earlier file at ``path`` is untouched.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
@@ -113,11 +106,7 @@ def json_text(value: Any) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically.
-
-    Raises:
-        SetupError: It cannot be written.
-    """
+    """Write ``value`` as JSON, atomically. Raises SetupError: it cannot be written."""
     write_bytes(path, json_text(value).encode())
 
 
@@ -137,7 +126,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
         holds: The type of what it should hold.
 
     Raises:
-        ArtefactError: It is missing or damaged; it is left untouched.
+        ArtefactError: It is missing or damaged.
     """
     with reading(path, what):
         found = json.loads(path.read_bytes())
@@ -150,8 +139,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
 def reading(path: Path, what: str) -> Iterator[None]:
     """Turn whatever is wrong with the file ``path``, which should be ``what``, into one sentence.
 
-    Raises:
-        ArtefactError: It is missing or damaged; it is left untouched.
+    Raises ArtefactError: it is missing or damaged.
     """
     try:
         yield
@@ -180,11 +168,7 @@ def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file.
-
-    Raises:
-        ArtefactError: It cannot be read.
-    """
+    """Hex digest of a file. Raises ArtefactError: it cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -202,7 +186,7 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
         patience_s: How long to wait for the holder, in seconds.
 
     Raises:
-        BusyError: Another live process holds it; the message says which.
+        BusyError: Another live process holds it.
         SetupError: The folder cannot be written or locked.
     """
     held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")

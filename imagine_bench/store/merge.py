@@ -31,10 +31,8 @@ def load_so_far(folder: Path) -> BenchResult:
     """Read a bench of agents, finished or not.
 
     Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
-    and no agent has more seeds or episodes than another.
-
-    Raises:
-        ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
+    and no agent has more seeds or episodes than another. Raises ArtefactError: it is not a bench, no seed has brought
+    every agent to the first budget, or a file is damaged.
     """
     whole = read_control(folder)
     store = BenchStore(folder, whole)

@@ -50,7 +50,7 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Write what is run into a new run folder, or see that an old one holds the same.
 
     Raises:
-        ArtefactError: The folder was begun with something else; the message names the first difference.
+        ArtefactError: The folder was begun with something else.
         SetupError: It cannot be written.
     """
     path, now = folder / _CONFIG, json.loads(json.dumps({"format": FORMAT, **config}))
@@ -70,11 +70,7 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
-    """Write one row a budget done so far, atomically.
-
-    Raises:
-        SetupError: It cannot be written.
-    """
+    """Write one row a budget done so far, atomically. Raises SetupError: it cannot be written."""
     rows = []
     for values in pack(list(checkpoints))[0]:
         diagnostics = {_DIAGNOSTIC + name: value for name, value in sorted(values["diagnostics"].items())}
@@ -115,19 +111,14 @@ def finish(
 
 
 def mark_done(folder: Path, names: Sequence[str]) -> None:
-    """Mark a run as done: from now on these files of it never change.
-
-    Raises:
-        SetupError: The mark cannot be written.
-    """
+    """Mark a run as done: from now on these files of it never change. Raises SetupError: the mark cannot be written."""
     write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
 
 
 def require_done(folder: Path) -> dict[str, Any]:
     """What was run in a finished folder, whose files are all as the run left them.
 
-    Raises:
-        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
+    Raises ArtefactError: it is unfinished, damaged or made by something else.
     """
     done = read_json(folder / _DONE, "the mark of a finished run")
     if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
@@ -143,11 +134,7 @@ def require_done(folder: Path) -> dict[str, Any]:
 
 
 def load_run(folder: Path) -> RunResult:
-    """Read a finished run.
-
-    Raises:
-        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
-    """
+    """Read a finished run. Raises ArtefactError: it is unfinished, damaged or made by something else."""
     config = require_done(folder)
     training, rollouts = read_arrays(folder / _TRAINING), read_arrays(folder / _IMAGINED)
     recording = recording_path(folder)
@@ -168,8 +155,7 @@ def load_run(folder: Path) -> RunResult:
 def load_unfinished(folder: Path) -> RunResult:
     """Read a run as far as its newest checkpoint has come.
 
-    Raises:
-        ArtefactError: There is no checkpoint, or a file is damaged; the message names it.
+    Raises ArtefactError: there is no checkpoint, or a file is damaged.
     """
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:  # it had one a moment ago
