@@ -25,11 +25,8 @@ _SAVE_EVERY_S = 10.0
 def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders]:
     """The protocol of a bench and the encoders it uses, with everything checked that can be before anything is run.
 
-    Args:
-        task: Registered task of any type.
-        preset: Name of a protocol preset.
-        options: Fields of the type's protocol that differ from the preset's; for control tasks, ``encoder`` may be a
-            bundled name or a path.
+    ``options`` are fields of the protocol that differ from the preset's; for control tasks also ``encoder``, a bundled
+    name or a path.
 
     Raises:
         UnknownNameError: Any name that does not exist.
@@ -42,22 +39,13 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
 
 
 def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launcher) -> Result:
-    """Run what is missing of a protocol, and read all of it.
-
-    Args:
-        wanted: What is compared: a protocol of any type.
-        paths: The encoder artefacts that its agents need, by kind.
-        root: Folder of all benches.
-        launcher: Carries out the runs.
-
-    Returns:
-        The result class of the task's type.
+    """Run what is missing of a protocol, with the encoders that its agents need by kind, and read all of it.
 
     Raises:
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
         BusyError: Another bench works in the same folder.
         SetupError: The folder cannot be written, or there is no GL.
-        ArtefactError: A file is damaged or foreign.
+        ArtefactError: A file is damaged or foreign; it is left untouched.
     """
     store = BenchStore(bench_folder(root, wanted), wanted)
     store.open()

@@ -22,20 +22,10 @@ _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
 def plan_control(task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[Protocol, Encoders]:
-    """The protocol of a control bench and the encoders it uses.
+    """The protocol of a control bench and the encoders it uses; for the errors see :func:`.bench.plan`.
 
-    Args:
-        task: Registered task.
-        preset: Name of a protocol preset.
-        encoder: Bundled name or path, instead of the task's own. One that gives codes is for every agent, one that
-            gives latents for those that read latents.
-        changes: Fields of the protocol that differ from the preset's.
-
-    Raises:
-        UnknownNameError: Any name that does not exist.
-        InvalidValueError: A value out of its range, or something that an agent cannot do.
-        ArtefactError: The task has no bundled encoder at this appearance level.
-        SetupError: The device does not exist here.
+    ``encoder`` is a bundled name or a path, instead of the task's own. One that gives codes is for every agent, one
+    that gives latents for those that read latents.
     """
     wanted = protocol(task, preset, **changes)
     filled = {"settings_digest": digest(resolved_settings(wanted))}

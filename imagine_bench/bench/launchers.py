@@ -67,11 +67,7 @@ LAUNCHERS = {"local": "imagine_bench.bench.local:LocalPool", "ray": "imagine_ben
 
 
 def launcher(name: str, workers: int | None = None) -> Launcher:
-    """The launcher of that name.
-
-    Args:
-        name: One of :data:`LAUNCHERS`.
-        workers: Processes at a time on this machine; None for one a core.
+    """The launcher of that name, with ``workers`` processes at a time on this machine; None for one a core.
 
     Raises:
         UnknownNameError: No such launcher.
@@ -87,14 +83,10 @@ class Launcher(Protocol):
     """Carries out jobs, somewhere."""
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job, whatever becomes of the others.
+        """Carry out every job, whatever becomes of the others, and return those that failed.
 
-        Args:
-            jobs: Independent of one another; each resumes by itself.
-            on_progress: Told now and then, from this process, how far each is, and at once of one that failed.
-
-        Returns:
-            The jobs that failed.
+        Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
+        process, how far each is, and at once of one that failed.
         """
 
 
@@ -104,15 +96,9 @@ def run_job(job: Job, on_progress: OnProgress) -> None:
 
 
 def carry_out(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress], None] = run_job) -> str:
-    """Carry out a job in this process, with beginning and end in its log, where all that libraries print goes too.
+    """Carry out a job in this process by ``run``; returns why it failed, or an empty string.
 
-    Args:
-        job: What to do.
-        on_progress: Told now and then how far it is.
-        run: What carries it out.
-
-    Returns:
-        Why it failed, or an empty string.
+    Beginning and end are in its log, where all that libraries print goes too.
     """
     with suppress(SetupError):  # where the log cannot be written, the run will say so
         _redirect_output(job)

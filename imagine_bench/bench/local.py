@@ -19,13 +19,9 @@ _PATIENCE_S = 5.0
 
 
 class LocalPool:
-    """Processes of this machine, each with one thread; none outlives this process, however it ends.
+    """``workers`` processes of this machine at a time, each with one thread; none outlives this process.
 
-    Args:
-        workers: Processes at a time.
-
-    Raises:
-        InvalidValueError: Fewer than one worker.
+    Raises InvalidValueError: fewer than one worker.
     """
 
     def __init__(self, workers: int) -> None:

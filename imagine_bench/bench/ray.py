@@ -27,10 +27,7 @@ _FREED_WITHIN_S = 60.0
 
 
 class RayCluster:
-    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or of one started here for the purpose.
-
-    Args:
-        workers: Tasks at a time on a cluster started here; an existing one runs as many as it has CPUs.
+    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or ``workers`` at a time of one started here for the purpose.
 
     Raises:
         InvalidValueError: Fewer than one worker.

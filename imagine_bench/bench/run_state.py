@@ -40,12 +40,6 @@ def make_env(protocol: Protocol, task: str) -> Env:
 class Run:
     """A run as far as it has come: a new one, or what the newest checkpoint in its folder holds.
 
-    Args:
-        spec: What to run.
-        folder: The run's own folder.
-        on_progress: Told now and then how far it is.
-        env: The environment of its task.
-
     Raises:
         ArtefactError: The folder was begun with something else, or the encoder is not the protocol's.
         InvalidValueError: The agent cannot do what the protocol asks of it.

@@ -52,16 +52,7 @@ class RunObserver(Interface):
 def run(
     spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observers: Sequence[RunObserver] = ()
 ) -> RunResult | None:
-    """Do a run, or what is left of it, and read its result; a finished run is only read.
-
-    Args:
-        spec: What to run.
-        folder: The run's own folder.
-        on_progress: Told now and then how far it is.
-        observers: What looks at it on the way.
-
-    Returns:
-        The result, or None if the run pauses before its end.
+    """Do a run, or what is left of it, and read its result, None if it pauses before; a finished run is only read.
 
     Raises:
         BusyError: Another process is at this run.

@@ -28,12 +28,7 @@ _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 
 
 class BenchStore:
-    """The folder of one protocol.
-
-    Args:
-        folder: The folder itself: that of :func:`bench_folder`, or wherever somebody has moved it to.
-        protocol: What is compared.
-    """
+    """The folder of one protocol: that of :func:`bench_folder`, or wherever somebody has moved it to."""
 
     def __init__(self, folder: Path, protocol: ProtocolData) -> None:
         self.protocol, self.folder = protocol, folder
@@ -69,13 +64,8 @@ class BenchStore:
         return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
     def begin_session(self, environment: dict[str, Any]) -> list[str]:
-        """Note that work starts now.
-
-        Args:
-            environment: What :func:`imagine_bench.machine.describe_environment` says.
-
-        Returns:
-            Names of facts that decide the bits and are not as in the first session.
+        """Note that work starts now, in this :func:`~imagine_bench.machine.describe_environment`; returns
+        :meth:`changed`.
         """
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
@@ -125,9 +115,8 @@ def load_bench(folder: Path) -> Result:
 
 
 def bench_facts(folder: Path) -> dict[str, Any]:
-    """``environment``, ``folder`` and ``wall_s`` of a bench's result.
-
-    Raises ArtefactError: a file is missing or damaged.
+    """``environment``, ``folder`` and ``wall_s`` of a bench's result. Raises ArtefactError: a file is missing or
+    damaged.
     """
     if (folder / KEPT).exists():
         kept = read_json(folder / KEPT, "a kept bench")

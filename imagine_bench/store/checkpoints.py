@@ -38,13 +38,9 @@ class Snapshot:
 
 
 def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
-    """Write a snapshot below ``folder`` and remove the ones it replaces.
+    """Write a snapshot as a folder below ``folder``, remove the ones it replaces, and return where it lies.
 
-    Returns:
-        The checkpoint's own folder.
-
-    Raises:
-        SetupError: It cannot be written; the earlier checkpoint is untouched.
+    Raises SetupError: it cannot be written; the earlier checkpoint is untouched.
     """
     make_folder(folder)
     earlier = _checkpoints(folder)

@@ -26,11 +26,9 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
-    """A dataclass, or a sequence of them, as JSON-like values and arrays.
+    """A dataclass, or a sequence of them, as JSON-like values and arrays that lie at ``path`` among others.
 
-    Args:
-        value: Its fields are dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None.
-        path: Where its arrays lie among others.
+    Its fields are dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None.
     """
     if isinstance(value, np.ndarray | np.generic):
         return None, {path: np.asarray(value)}
@@ -46,13 +44,7 @@ def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
 
 
 def unpack(kind: type[T], values: Any, arrays: Mapping[str, NDArray[Any]], path: str = "") -> T:
-    """The inverse of :func:`pack`.
-
-    Args:
-        kind: The type that was packed.
-        values: Its values; None where it has none beside arrays.
-        arrays: Those that were packed, and maybe others.
-        path: Where they lie.
+    """The inverse of :func:`pack`; ``values`` is None where there are none beside arrays, which may be among others.
 
     Raises:
         KeyError: A value or an array is missing.
@@ -130,15 +122,7 @@ def table_text(rows: Sequence[Row]) -> str:
 
 
 def table_rows(text: str, texts: Iterable[str] = ()) -> list[dict[str, Any]]:
-    """The inverse of :func:`table_text`.
-
-    Args:
-        text: CSV.
-        texts: Columns that hold text; all others hold numbers.
-
-    Raises:
-        ValueError: A number is none.
-    """
+    """The inverse of :func:`table_text`: all columns but ``texts`` hold numbers, or ValueError is raised."""
     words = set(texts)
     rows = csv.DictReader(io.StringIO(text))
     return [{name: cell if name in words else _number(cell) for name, cell in row.items() if cell} for row in rows]

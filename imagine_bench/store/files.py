@@ -35,10 +35,7 @@ _REASONS = {
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the operating system's refusal to write at ``path`` into one sentence.
-
-    Raises SetupError: the folder is not writable, the disk is full, or the like.
-    """
+    """Turn the operating system's refusal to write at ``path`` into a SetupError of one sentence."""
     try:
         yield
     except OSError as error:
@@ -54,10 +51,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def require_writable(folder: Path) -> None:
-    """Make sure, before long work whose result is to lie in ``folder``, that it can; the folder is made if need be.
-
-    Raises SetupError: it cannot be made or written to.
-    """
+    """Raise SetupError, before long work, where its result cannot be written to ``folder``, which is made if need be."""
     with writing(make_folder(folder)), TemporaryFile(dir=folder):
         pass
 
@@ -118,16 +112,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def read_json(path: Path, what: str, holds: type = dict) -> Any:
-    """What a JSON file holds.
-
-    Args:
-        path: The file.
-        what: What it should be, for the error.
-        holds: The type of what it should hold.
-
-    Raises:
-        ArtefactError: It is missing or damaged.
-    """
+    """What a JSON file holds, of type ``holds``. Raises ArtefactError: it is missing, damaged or not ``what``."""
     with reading(path, what):
         found = json.loads(path.read_bytes())
         if not isinstance(found, holds):
@@ -137,10 +122,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one sentence.
-
-    Raises ArtefactError: it is missing or damaged.
-    """
+    """Turn whatever is wrong with the file ``path``, which should be ``what``, into an ArtefactError of one sentence."""
     try:
         yield
     except FileNotFoundError as error:
@@ -180,13 +162,10 @@ def sha256(path: Path) -> str:
 def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock file ``path``; the system lets go of it when this process ends, however it ends.
 
-    Args:
-        path: The lock file, which stays behind, as does the name of its last holder beside it.
-        busy: Where another process works, for the error.
-        patience_s: How long to wait for the holder, in seconds.
+    It stays behind, as does the name of its last holder beside it. ``busy`` says where another process works.
 
     Raises:
-        BusyError: Another live process holds it.
+        BusyError: Another live process holds it for longer than ``patience_s`` seconds; the message says which.
         SetupError: The folder cannot be written or locked.
     """
     held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")

@@ -53,15 +53,9 @@ def largest_part(
 ) -> BenchResult:
     """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
 
-    Args:
-        whole: Its protocol.
-        reached: The last budget with results of every agent and seed; 0 where there are none.
-        load: Reads the run of an agent and seed.
-        folder: Where the bench's files lie.
-        made_with: See :class:`BenchResult`.
+    ``reached`` is the last budget with results of every agent and seed, 0 where there are none.
 
-    Raises:
-        ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
+    Raises ArtefactError: no seed has brought every agent to the first budget, or a file is damaged.
     """
     part = _largest_table(whole, reached)
     missing = tuple(
@@ -146,14 +140,10 @@ def _over(rows: Sequence[Checkpoint], before: int) -> Checkpoint:
 
 
 def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
-    """Several benches, or parts of them, that differ only in agents or in seeds, as one.
+    """Several benches, or parts of them, that differ only in agents or in seeds, as one in a new folder below ``root``.
 
-    Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that
-    any has. Budgets are those of all.
-
-    Args:
-        results: Theirs.
-        root: Folder of all benches; the result's own is a new one in it, named by what was compared.
+    Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that any
+    has. Budgets are those of all.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no seed or budget is in all.

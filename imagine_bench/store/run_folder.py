@@ -91,16 +91,9 @@ def finish(
     imagined: Sequence[ComparedRollout] = (),
     sampled_rollouts: Sequence[ComparedRollout] = (),
 ) -> None:
-    """Write the results of a run and mark it as done.
+    """Write the results of a run, beside its ``config.json``, and mark it as done.
 
-    Args:
-        folder: The run's folder, with its ``config.json``.
-        counters: With a row a budget.
-        imagined: Example rollouts.
-        sampled_rollouts: Several rollouts from one beginning.
-
-    Raises:
-        SetupError: Something cannot be written; the run is then not marked.
+    Raises SetupError: something cannot be written; the run is then not marked.
     """
     write_metrics(folder, counters.rows)
     write_arrays(folder / _MEASURED, pack(counters.rows)[1])
@@ -116,7 +109,7 @@ def mark_done(folder: Path, names: Sequence[str]) -> None:
 
 
 def require_done(folder: Path) -> dict[str, Any]:
-    """What was run in a finished folder, whose files are all as the run left them.
+    """The configuration of a finished run whose files are all as it left them.
 
     Raises ArtefactError: it is unfinished, damaged or made by something else.
     """

@@ -46,9 +46,8 @@ class Trained:
 def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
 
-    Args:
-        folder: A run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``.
-        encoder: Bundled name or path, where the run used an encoder that is not bundled.
+    ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
+    path, where the run used an encoder that is not bundled.
 
     Raises:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.

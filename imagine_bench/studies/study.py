@@ -105,14 +105,7 @@ class Line:
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant, in order, and compare; the same call goes on where it stopped.
 
-    Args:
-        study: What to run.
-        task: Registered task.
-        root: Folder of all benches.
-        launcher: Carries out the runs.
-
-    Raises:
-        ImagineBenchError: As for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
+    Raises ImagineBenchError: as for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
     """
     if task not in TASKS:
         task_type(task)  # knows every name
