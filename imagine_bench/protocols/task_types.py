@@ -17,7 +17,7 @@ from typing import Protocol as Interface
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import OnProgress, P_co, RunSpec
+from imagine_bench.protocols.runs import OnProgress, RunSpec
 
 P = TypeVar("P", bound=ProtocolData)
 Encoders = Mapping[str, Path]
@@ -28,28 +28,12 @@ class FinishedRun(Interface):
     """What runs of every type leave."""
 
     @property
-    def agent(self) -> str:
-        """Registered agent or regressor."""
-
-    @property
-    def seed(self) -> int:
-        """The run's seed."""
-
-    @property
-    def folder(self) -> Path:
-        """Where the run's files lie."""
-
-    @property
     def recording(self) -> Path | None:
         """Its Rerun recording, or None."""
 
 
 class Result(Interface):
-    """What benches of every type measured."""
-
-    @property
-    def protocol(self) -> ProtocolData:
-        """What was compared."""
+    """What benches of every type measured: one run an agent and seed, in a folder."""
 
     @property
     def runs(self) -> Sequence[FinishedRun]:
@@ -58,13 +42,6 @@ class Result(Interface):
     @property
     def folder(self) -> Path:
         """Where the bench's files lie."""
-
-
-class Plan(Interface[P_co]):
-    """Makes the protocol of a bench, with everything checked that can be before anything is run."""
-
-    def __call__(self, task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[P_co, Encoders]:
-        """The protocol of a preset, with ``changes`` to single fields, and the encoders it needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +53,8 @@ class TaskType(Generic[P]):
     draws: bool  #: Whether its runs need OpenGL
     protocol: type[P]  #: The class of its protocols
     presets: Mapping[str, Mapping[str, Any]]  #: What each protocol preset changes, by name
-    plan: Plan[P]  #: Makes a protocol
+    #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
+    plan: Callable[..., tuple[P, Encoders]]
     run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
     load_run: Callable[[Path], FinishedRun]  #: Reads a finished run folder
     load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported

@@ -51,5 +51,5 @@ def kind(path: Path) -> str:
 
 
 def identity(path: Path) -> str:
-    """What stands for an encoder in a protocol: its name and 12 digits of its digest. Raises ArtefactError: no file."""
+    """What stands for an encoder in a protocol: its name and 12 digits of its digest, or ArtefactError."""
     return f"{path.stem}@{sha256(path)[:12]}"

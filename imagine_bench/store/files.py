@@ -51,7 +51,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def require_writable(folder: Path) -> None:
-    """Raise SetupError, before long work, where its result cannot be written to ``folder``, which is made if need be."""
+    """Raise SetupError, before long work, where its result cannot be written to ``folder``; made if need be."""
     with writing(make_folder(folder)), TemporaryFile(dir=folder):
         pass
 
@@ -122,7 +122,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is wrong with the file ``path``, which should be ``what``, into an ArtefactError of one sentence."""
+    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one ArtefactError."""
     try:
         yield
     except FileNotFoundError as error:
