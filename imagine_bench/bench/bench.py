@@ -57,7 +57,8 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
             _warn(store.begin_session(describe_environment()), store.folder)
             failures = _in_stages(store, paths, launcher)
             store.save_time()
-            _raise_if_any(failures, missing)
+            if failures:
+                _raise(failures, missing)
         else:
             print(f"All runs lie in {store.folder} already; nothing was run.")
             _warn(store.changed(describe_environment()), store.folder)
@@ -67,20 +68,17 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
 def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
     """Take all runs as far as the protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
+    order = store.protocol.agents  # those listed last cost most and come first of each seed, so no worker idles
     specs = [_job(store, paths, *pair, None).spec for pair in store.missing()]
     with ProgressBars(specs, _done_before(store)) as show:
         for until in store.protocol.stages:
             failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
-            pairs = _costliest_first([pair for pair in store.missing(until) if pair not in failed], store.protocol)
+            pairs = [pair for pair in store.missing(until) if pair not in failed]
+            pairs.sort(key=lambda pair: (pair[1], -order.index(pair[0])))
             jobs = [_job(store, paths, *pair, until) for pair in pairs]
             if jobs:
                 failures += launcher.launch(jobs, _saving_time(store, show))
     return failures
-
-
-def _costliest_first(pairs: Sequence[tuple[str, int]], protocol: ProtocolData) -> list[tuple[str, int]]:
-    """Seed by seed, and of each seed the agents listed last, which cost most, first: so no worker is idle for long."""
-    return sorted(pairs, key=lambda pair: (pair[1], -protocol.agents.index(pair[0])))
 
 
 def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:
@@ -124,13 +122,9 @@ def _warn(changed: Sequence[str], folder: Path) -> None:
         )
 
 
-def _raise_if_any(failures: Sequence[Failure], jobs: int) -> None:
-    if failures:
-        lines = [
-            f"  {failure.job.spec.agent} seed {failure.job.spec.seed}: {failure.reason} Log: {failure.job.log}"
-            for failure in failures
-        ]
-        raise RunFailedError(
-            f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others.\n"
-            + "\n".join(lines)
-        )
+def _raise(failures: Sequence[Failure], jobs: int) -> None:
+    lines = [f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others."]
+    for failure in failures:
+        spec = failure.job.spec
+        lines.append(f"  {spec.agent} seed {spec.seed}: {failure.reason} Log: {failure.job.log}")
+    raise RunFailedError("\n".join(lines))

@@ -99,14 +99,6 @@ def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress)
 
 
 CONTROL = TaskType(
-    tasks=registry.TASKS,
-    learners=registry.agents,
-    draws=True,
-    protocol=Protocol,
-    presets=PRESETS,
-    plan=plan_control,
-    run=run_observed,
-    load_run=run_folder.load_run,
-    load_so_far=load_so_far,
-    result=BenchResult,
-)
+    tasks=registry.TASKS, learners=registry.agents, draws=True, protocol=Protocol, presets=PRESETS, plan=plan_control,
+    run=run_observed, load_run=run_folder.load_run, load_so_far=load_so_far, result=BenchResult,
+)  # fmt: skip

@@ -44,17 +44,11 @@ def play(
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
         after = observation(frame, info, privileged=privileged)
-        yield (
-            Transition(
-                observation=before,
-                action=action,
-                reward=float(reward),
-                next_observation=after,
-                terminated=bool(terminated),
-                truncated=bool(truncated),
-            ),
-            info,
-        )
+        transition = Transition(
+            observation=before, action=action, reward=float(reward), next_observation=after,
+            terminated=bool(terminated), truncated=bool(truncated),
+        )  # fmt: skip
+        yield transition, info
         before, over = after, terminated or truncated
 
 

@@ -19,14 +19,10 @@ from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
 from imagine_bench.protocols.task_types import task_type
 from imagine_bench.store.files import make_folder, writing
 
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
-}
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
 """Small networks are slower on two threads than on one, and bits repeat only at a fixed count."""
-_LOG = "log.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +35,7 @@ class Job:
     @property
     def log(self) -> Path:
         """Everything the run printed."""
-        return self.folder / _LOG
+        return self.folder / "log.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +71,7 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    made: Launcher = make(usable_cores() if workers is None else workers)
-    return made
+    return make(usable_cores() if workers is None else workers)
 
 
 class Launcher(Protocol):

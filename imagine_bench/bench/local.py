@@ -19,10 +19,7 @@ _PATIENCE_S = 5.0
 
 
 class LocalPool:
-    """``workers`` processes of this machine at a time, each with one thread; none outlives this process.
-
-    Raises InvalidValueError: fewer than one worker.
-    """
+    """``workers`` processes of this machine at a time, at least 1, each with one thread; none outlives this process."""
 
     def __init__(self, workers: int) -> None:
         require_workers(workers)

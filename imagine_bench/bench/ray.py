@@ -43,9 +43,8 @@ class RayCluster:
         self._workers = workers
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job; see :class:`imagine_bench.bench.launchers.Launcher`.
-
-        Raises SetupError: there is no cluster at ``RAY_ADDRESS``, or none with the GPU that the runs ask for.
+        """Carry out every job. Raises SetupError: no cluster is at ``RAY_ADDRESS``, or none with the GPU that runs
+        need.
         """
         import ray  # noqa: PLC0415 - as above
 

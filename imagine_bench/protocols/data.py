@@ -37,8 +37,7 @@ class ProtocolData:
 
     def as_dict(self) -> dict[str, Any]:
         """A JSON-serialisable copy."""
-        values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
-        return values
+        return json.loads(json.dumps(dataclasses.asdict(self)))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

@@ -103,13 +103,6 @@ def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
 
 def _run(folder: Path, agent: str, seed: int, checkpoints: tuple[Checkpoint, ...]) -> RunResult:
     return RunResult(
-        agent=agent,
-        seed=seed,
-        checkpoints=checkpoints,
-        settings={},
-        training_success=np.zeros(0, dtype=np.bool_),
-        training_length=np.zeros(0, dtype=np.int64),
-        imagined=(),
-        folder=folder,
-        recording=None,
-    )
+        agent=agent, seed=seed, checkpoints=checkpoints, settings={}, folder=folder,
+        training_success=np.zeros(0, dtype=np.bool_), training_length=np.zeros(0, dtype=np.int64),
+    )  # fmt: skip

@@ -69,10 +69,7 @@ def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
 
 
 def load_newest(folder: Path) -> Snapshot | None:
-    """The newest checkpoint below ``folder``, or None where there is none yet; the run may go on meanwhile.
-
-    Raises ArtefactError: it is damaged or not a checkpoint.
-    """
+    """The newest checkpoint below ``folder``, or None; the run may go on meanwhile. ArtefactError: it is damaged."""
     while found := _checkpoints(folder):
         try:
             return load_snapshot(found[-1])

@@ -57,9 +57,7 @@ def require_writable(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in ``folder`` survive a power cut, where the system can be asked to."""
-    if os.name == "nt":  # a folder cannot be opened there
-        return
+    """Make the names in ``folder`` survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -68,10 +66,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a whole file at once: to a temporary neighbour, to the disk, then into place.
-
-    Raises SetupError: it cannot be written; an earlier file at ``path`` is untouched.
-    """
+    """Write a whole file at once, by a temporary neighbour, or raise SetupError and leave an earlier one untouched."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
         try:

@@ -102,11 +102,10 @@ def _load(folder: Path) -> RunResult:
 
 def cut(result: RunResult, part: Protocol) -> RunResult:
     """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
-    kept = _as_if_untested(result.checkpoints, part.budgets)
     episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
     return dataclasses.replace(
         result,
-        checkpoints=kept,
+        checkpoints=_as_if_untested(result.checkpoints, part.budgets),
         training_success=result.training_success[:episodes],
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),

@@ -108,18 +108,15 @@ class RunResult:
     settings: Mapping[str, Any]  #: The agent's settings as run
     training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
     training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
-    imagined: tuple[ComparedRollout, ...]  #: Example rollouts at the last budget, for agents that imagine
     folder: Path  #: Where the run's files lie
-    recording: Path | None  #: Its Rerun recording, or None
+    recording: Path | None = None  #: Its Rerun recording, or None
+    imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
     #: Several from one beginning at the last budget, where the rules leave something to chance.
     sampled_rollouts: tuple[ComparedRollout, ...] = ()
 
 
 def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
-    """Refuse runs of one agent, by folder, with different settings; kept results, which have none, are passed over.
-
-    Raises ArtefactError: two runs differ.
-    """
+    """Raise ArtefactError for runs of an agent, by folder, of different settings; kept results have none and pass."""
     known = [(folder, settings) for folder, settings in runs if settings]
     for folder, settings in known[1:]:
         difference = first_difference(known[0][1], settings)

@@ -57,16 +57,14 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     if not path.exists():
         write_json(path, now)
         return
-    then = read_json(path, "a run's configuration")
-    difference = first_difference(then, now)
-    if difference is None:
-        return
-    name, was, would_be = difference
-    raise ArtefactError(
-        f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was left "
-        "untouched. Finish it with the version and on the kind of machine that began it, or choose another folder with "
-        "--out."
-    )
+    difference = first_difference(read_json(path, "a run's configuration"), now)
+    if difference is not None:
+        name, was, would_be = difference
+        raise ArtefactError(
+            f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was "
+            "left untouched. Finish it with the version and on the kind of machine that began it, or choose another "
+            "folder with --out."
+        )
 
 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
@@ -91,10 +89,7 @@ def finish(
     imagined: Sequence[ComparedRollout] = (),
     sampled_rollouts: Sequence[ComparedRollout] = (),
 ) -> None:
-    """Write the results of a run, beside its ``config.json``, and mark it as done.
-
-    Raises SetupError: something cannot be written; the run is then not marked.
-    """
+    """Write the results of a run and mark it as done, or raise SetupError and leave it unmarked."""
     write_metrics(folder, counters.rows)
     write_arrays(folder / _MEASURED, pack(counters.rows)[1])
     write_arrays(folder / _TRAINING, counters.training())
@@ -109,10 +104,7 @@ def mark_done(folder: Path, names: Sequence[str]) -> None:
 
 
 def require_done(folder: Path) -> dict[str, Any]:
-    """The configuration of a finished run whose files are all as it left them.
-
-    Raises ArtefactError: it is unfinished, damaged or made by something else.
-    """
+    """The configuration of a finished run. Raises ArtefactError: it is unfinished, damaged or of another format."""
     done = read_json(folder / _DONE, "the mark of a finished run")
     if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
@@ -122,8 +114,7 @@ def require_done(folder: Path) -> dict[str, Any]:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    config: dict[str, Any] = read_json(folder / _CONFIG, "a run's configuration")
-    return config
+    return read_json(folder / _CONFIG, "a run's configuration")
 
 
 def load_run(folder: Path) -> RunResult:
@@ -146,10 +137,7 @@ def load_run(folder: Path) -> RunResult:
 
 
 def load_unfinished(folder: Path) -> RunResult:
-    """Read a run as far as its newest checkpoint has come.
-
-    Raises ArtefactError: there is no checkpoint, or a file is damaged.
-    """
+    """Read a run as far as its newest checkpoint has come. Raises ArtefactError: none is there, or it is damaged."""
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:  # it had one a moment ago
         raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
@@ -165,9 +153,7 @@ def load_unfinished(folder: Path) -> RunResult:
             settings=config["settings"],
             training_success=training["success"],
             training_length=training["length"],
-            imagined=(),
             folder=folder,
-            recording=None,
         )
 
 

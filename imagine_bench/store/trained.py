@@ -81,10 +81,7 @@ def require_control(task: str, what: str) -> None:
 
 
 def protocol_of_agents(bench: Path) -> Protocol:
-    """The protocol of a bench whose agents can be taken up again.
-
-    Raises ArtefactError: there is none, or it is of a regression task, or its results were kept without the agents.
-    """
+    """The protocol of a bench whose agents can be taken up again. Raises ArtefactError: there is none such."""
     protocol = read_control(bench)
     if is_archive(bench):
         raise ArtefactError(
@@ -94,10 +91,7 @@ def protocol_of_agents(bench: Path) -> Protocol:
 
 
 def learners(bench: Path) -> tuple[Path, ...]:
-    """The run folders of a bench, finished or not, whose agents have learned and can be taken up again.
-
-    Raises ArtefactError: there are none.
-    """
+    """The run folders of a bench, finished or not, whose agents have learned and are at hand, or ArtefactError."""
     protocol = read_control(bench)
     store = BenchStore(bench, protocol)
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
@@ -119,10 +113,7 @@ def _has_learned(run: Path) -> bool:
 
 
 def best_run(result: Result) -> RunResult:
-    """The imagining run of a bench that solves most of its last test; of equals, most of the one before, and so on.
-
-    Raises ArtefactError: there is none.
-    """
+    """The imagining run that solves most of its last test, of equals most of the one before, or ArtefactError."""
     runs = [run for run in result.runs if run.imagined] if isinstance(result, BenchResult) else []
     if not runs:
         raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")

@@ -44,10 +44,7 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What a study runs.
-
-    Raises InvalidValueError: a name given twice, a comparison with nothing, or a seed that reports results.
-    """
+    """What a study runs. Raises InvalidValueError: a name given twice, a comparison with nothing, a reported seed."""
 
     name: str  #: Its name on the command line
     question: str  #: One sentence for the reader of its page
@@ -75,10 +72,7 @@ class Study:
             )
 
     def only(self, names: tuple[str, ...]) -> Study:
-        """The same study with the named variants and those they are compared with; all of them where none is named.
-
-        Raises UnknownNameError: a variant that the study lacks.
-        """
+        """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
         known = {variant.name: variant for variant in self.variants}
         wanted = {require_known("variant", name, known) for name in names} or set(known)
         while True:
@@ -103,10 +97,7 @@ class Line:
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
-    """Run what is missing of every variant, in order, and compare; the same call goes on where it stopped.
-
-    Raises ImagineBenchError: as for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
-    """
+    """Run what is missing of every variant, in order, and compare; errors are those of :func:`.bench.bench`."""
     if task not in TASKS:
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
@@ -132,18 +123,11 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
     return plan(
-        task,
-        "quick",
-        agents=(variant.agent,),
-        seeds=study.seeds,
-        budgets=study.budgets,
-        evaluation_episodes=study.evaluation_episodes,
-        appearance=variant.appearance or study.appearance,
-        execution=study.execution,
-        overrides=tuple(sorted(variant.settings.items())),
-        open_loop_starts=0,
-        recorded_episodes=0,
-    )
+        task, "quick", agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,
+        evaluation_episodes=study.evaluation_episodes, execution=study.execution,
+        appearance=variant.appearance or study.appearance, overrides=tuple(sorted(variant.settings.items())),
+        open_loop_starts=0, recorded_episodes=0,
+    )  # fmt: skip
 
 
 def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
