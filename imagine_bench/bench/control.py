@@ -22,7 +22,7 @@ _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
 def plan_control(task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[Protocol, Encoders]:
-    """The protocol of a control bench and the encoders it uses; for the errors see :func:`.bench.plan`.
+    """The protocol of a control bench and the encoders it uses; errors as of :func:`imagine_bench.bench.bench.plan`.
 
     ``encoder`` is a bundled name or a path, instead of the task's own. One that gives codes is for every agent, one
     that gives latents for those that read latents.

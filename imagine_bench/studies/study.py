@@ -97,7 +97,7 @@ class Line:
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
-    """Run what is missing of every variant, in order, and compare; errors are those of :func:`.bench.bench`."""
+    """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
     if task not in TASKS:
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
