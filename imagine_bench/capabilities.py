@@ -19,33 +19,23 @@ from imagine_bench.interfaces import Frame, Observation
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginedRollout:
-    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``.
+    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``."""
 
-    Attributes:
-        actions: Macro-actions imagined. Shape (D,), int64.
-        frames: Decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3).
-        start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
-        rewards: Predicted rewards. Shape (D,).
-        p_terminated: Predicted probability that the episode ended there. Shape (D,).
-        q_values: The controller's values in the state *before* each action. Shape (D, A).
-        epistemic: Epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
-        aleatoric: The same for aleatoric. Shape (D,).
-        modal: The same for modal. Shape (D,).
-        accepted: Whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
-        macrostates: The macrostate a probe reads from each imagined latent. Shape (D, M).
-    """
-
-    actions: NDArray[np.int64]
+    actions: NDArray[np.int64]  #: macro-actions imagined. Shape (D,), int64.
+    #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
     frames: NDArray[np.float32]
+    #: the decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
     start_frame: NDArray[np.float32]
-    rewards: NDArray[np.float32]
-    p_terminated: NDArray[np.float32]
-    q_values: NDArray[np.float32]
+    rewards: NDArray[np.float32]  #: predicted rewards. Shape (D,).
+    p_terminated: NDArray[np.float32]  #: predicted probability that the episode ended there. Shape (D,).
+    q_values: NDArray[np.float32]  #: the controller's values in the state *before* each action. Shape (D, A).
+    #: epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
     epistemic: NDArray[np.float32]
-    aleatoric: NDArray[np.float32]
-    modal: NDArray[np.float32]
+    aleatoric: NDArray[np.float32]  #: the same for aleatoric. Shape (D,).
+    modal: NDArray[np.float32]  #: the same for modal. Shape (D,).
+    #: whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
     accepted: NDArray[np.bool_]
-    macrostates: NDArray[np.int64]
+    macrostates: NDArray[np.int64]  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
 
 
 @runtime_checkable
@@ -190,17 +180,11 @@ Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
 
 @dataclass(frozen=True, kw_only=True)
 class SampledFutures:
-    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held.
+    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held."""
 
-    Attributes:
-        macrostates: What a probe reads. Shape (D, R, S, M).
-        rewards: Predicted rewards, 0 once a future has ended. Shape (D, R, S).
-        ended: Whether the model has said, here or before, that the episode is over. Shape (D, R, S).
-    """
-
-    macrostates: NDArray[np.int64]
-    rewards: NDArray[np.float32]
-    ended: NDArray[np.bool_]
+    macrostates: NDArray[np.int64]  #: what a probe reads. Shape (D, R, S, M).
+    rewards: NDArray[np.float32]  #: predicted rewards, 0 once a future has ended. Shape (D, R, S).
+    ended: NDArray[np.bool_]  #: whether the model has said, here or before, that the episode is over. Shape (D, R, S).
 
 
 @runtime_checkable

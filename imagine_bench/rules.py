@@ -20,21 +20,13 @@ _TIE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class RuleTables:
-    """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1.
+    """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1."""
 
-    Attributes:
-        index: Macrostate to row.
-        starts: Rows an episode may start in, equally likely.
-        alive: Probability of going on in each next macrostate. Shape (A, S, S).
-        reward: Expected reward. Shape (A, S).
-        success: Probability of ending here as a success. Shape (A, S).
-    """
-
-    index: dict[State, int]
-    starts: NDArray[np.int64]
-    alive: Floats
-    reward: Floats
-    success: Floats
+    index: dict[State, int]  #: macrostate to row
+    starts: NDArray[np.int64]  #: rows an episode may start in, equally likely
+    alive: Floats  #: probability of going on in each next macrostate. Shape (A, S, S).
+    reward: Floats  #: expected reward. Shape (A, S).
+    success: Floats  #: probability of ending here as a success. Shape (A, S).
 
 
 def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -110,19 +102,12 @@ def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyValues:
-    """What a policy reaches within a horizon, from each macrostate. Shapes (S,).
+    """What a policy reaches within a horizon, from each macrostate. Shapes (S,)."""
 
-    Attributes:
-        success: Success probability.
-        failure: Probability of an end that is no success; the rest of them is still going on at the horizon.
-        returns: Expected undiscounted return.
-        length: Expected number of actions.
-    """
-
-    success: Floats
-    failure: Floats
-    returns: Floats
-    length: Floats
+    success: Floats  #: success probability
+    failure: Floats  #: probability of an end that is no success; the rest of them is still going on at the horizon
+    returns: Floats  #: expected undiscounted return
+    length: Floats  #: expected number of actions
 
 
 def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
@@ -148,8 +133,7 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
 
 
-Belief = dict[tuple[State, bool], float]
-"""Probability of each (macrostate, whether the episode ended there)."""
+Belief = dict[tuple[State, bool], float]  #: probability of each (macrostate, whether the episode ended there)
 
 
 def advance(rules: Rules, belief: Belief, action: int | None) -> tuple[Belief, float]:

@@ -17,8 +17,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
 RESAMPLES = 4000
-_LEVEL = 0.95
-"""Coverage of every interval."""
+_LEVEL = 0.95  #: coverage of every interval
 _DIGITS = 12
 """Decimals of differences: success rates lie on a lattice, and two equal sums in another order must not differ."""
 

@@ -17,11 +17,9 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 from imagine_bench.regression.interfaces import Mixtures
 
-LEVELS = (0.5, 0.8, 0.95)
-"""Central intervals whose coverage is reported."""
+LEVELS = (0.5, 0.8, 0.95)  # central intervals whose coverage is reported
 _LOG_2PI = math.log(2.0 * math.pi)
-_AT_ONCE = 2**24
-"""Pairs of components, in all dimensions, that a score compares at a time: 128 MiB an array."""
+_AT_ONCE = 2**24  # pairs of components, in all dimensions, that a score compares at a time: 128 MiB an array
 
 
 def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:

@@ -17,14 +17,10 @@ from imagine_bench.rules import Belief, advance, by_macrostate
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import Futures
 
-DEPTH = 5
-"""Macro-actions of each future."""
-FRAMES = 4
-"""Different frames of each start among which its samples are divided."""
-MODE = 0.05
-"""Least probability of an outcome that counts as a mode."""
-MISSED = 0.2
-"""A mode is missed if it is imagined less than this times as often as it happens."""
+DEPTH = 5  # macro-actions of each future
+FRAMES = 4  # different frames of each start among which its samples are divided
+MODE = 0.05  # least probability of an outcome that counts as a mode
+MISSED = 0.2  # a mode is missed if it is imagined less than this times as often as it happens
 
 
 def imagined_futures(

@@ -36,23 +36,14 @@ VISIT_COUNTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TransitionSet:
-    """Every (macrostate, action) of a task, from one real frame each. N = macrostates x actions.
+    """Every (macrostate, action) of a task, from one real frame each. N = macrostates x actions."""
 
-    Attributes:
-        macrostates: Shape (N, M).
-        actions: Shape (N,).
-        frames: A frame of each macrostate (kinematic mode). Shape (N, 64, 64, 3).
-        terminal: Whether no episode goes on from the macrostate: the transition cannot be in any training data.
-        legal: Whether the macrostate breaks no rule. Shape (N,).
-        possible: What may come of it, by the rules. Length N.
-    """
-
-    macrostates: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    frames: Frame
-    terminal: Mask
-    legal: Mask
-    possible: tuple[tuple[Outcome, ...], ...]
+    macrostates: NDArray[np.int64]  # shape (N, M)
+    actions: NDArray[np.int64]  # shape (N,)
+    frames: Frame  # a frame of each macrostate (kinematic mode). Shape (N, 64, 64, 3).
+    terminal: Mask  # whether no episode goes on from the macrostate: the transition cannot be in any training data
+    legal: Mask  # whether the macrostate breaks no rule. Shape (N,).
+    possible: tuple[tuple[Outcome, ...], ...]  # what may come of it, by the rules. Length N.
 
     @property
     def consequences(self) -> list[str]:
@@ -67,22 +58,17 @@ class TransitionSet:
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
-    """What one agent predicts of a :class:`TransitionSet`, held against the rules. Each of shape (N,).
+    """What one agent predicts of a :class:`TransitionSet`, held against the rules. Each of shape (N,)."""
 
-    Attributes:
-        right: Whether the imagined macrostate, read by the evaluation-only probe, is one the rules allow.
-        epistemic: Epistemic uncertainty, reduced as the agent's filter does.
-        reward_error: Distance of the imagined reward from the nearest one that the rules allow, in units of reward.
-        end_right: Whether the rules allow what is imagined more likely: that the episode ends here, or that it goes on.
-        likeliest_right: As ``right``, of what the model holds likeliest instead of what it samples; None if unknown.
-        visit_count: How many real visits of the transition the agent remembers; None if unknown.
-    """
-
-    right: Mask
-    epistemic: Floats
+    right: Mask  # whether the imagined macrostate, read by the evaluation-only probe, is one the rules allow
+    epistemic: Floats  # epistemic uncertainty, reduced as the agent's filter does
+    # distance of the imagined reward from the nearest one that the rules allow, in units of reward
     reward_error: Floats
+    # whether the rules allow what is imagined more likely: that the episode ends here, or that it goes on
     end_right: Mask
+    # as ``right``, of what the model holds likeliest instead of what it samples; None if unknown
     likeliest_right: Mask | None = None
+    # how many real visits of the transition the agent remembers; None if unknown
     visit_count: NDArray[np.int64] | None = None
 
     def scores(self, part: Mask) -> Scores:
@@ -113,23 +99,15 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class Generalisation:
-    """The scores of one agent's predictions.
+    """The scores of one agent's predictions."""
 
-    Attributes:
-        unseen: Of transitions out of terminal macrostates, which no training can contain.
-        unseen_legal: Of those of them out of legal macrostates, such as goals.
-        seen: Of all other transitions.
-        auroc: Probability that a transition out of a terminal macrostate has more epistemic uncertainty than another.
-        consequences: Of the other transitions, by those of :data:`CONSEQUENCES` that there are.
-        visit_counts: The same transitions by :data:`VISIT_COUNTS`; empty if unknown.
-    """
-
-    unseen: Scores
-    unseen_legal: Scores
-    seen: Scores
+    unseen: Scores  # of transitions out of terminal macrostates, which no training can contain
+    unseen_legal: Scores  # of those of them out of legal macrostates, such as goals
+    seen: Scores  # of all other transitions
+    # probability that a transition out of a terminal macrostate has more epistemic uncertainty than another
     auroc: float
-    consequences: dict[str, Scores]
-    visit_counts: dict[str, Scores]
+    consequences: dict[str, Scores]  # of the other transitions, by those of :data:`CONSEQUENCES` that there are
+    visit_counts: dict[str, Scores]  # the same transitions by :data:`VISIT_COUNTS`; empty if unknown
 
 
 def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> TransitionSet:

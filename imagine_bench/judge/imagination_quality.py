@@ -19,10 +19,8 @@ from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
-OPEN_LOOP_DEPTH = 10
-"""Steps of the open-loop comparison, the thesis' I_D."""
-EXAMPLES = 5
-"""Greedy imagined rollouts kept with each run, with their real counterparts."""
+OPEN_LOOP_DEPTH = 10  # steps of the open-loop comparison, the thesis' I_D
+EXAMPLES = 5  # greedy imagined rollouts kept with each run, with their real counterparts
 SAMPLED_ROLLOUTS, SAMPLED_DEPTH = 4, 5
 """Rollouts sampled from one start and kept with each run, and macro-actions of each."""
 
@@ -31,19 +29,12 @@ Alive = Callable[[frozenset[State], int], bool]
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopStart:
-    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them.
+    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them."""
 
-    Attributes:
-        frame: The real frame.
-        actions: Drawn uniformly among those that end no episode, now or by force later. Shape (D,).
-        beliefs: Probabilities of the macrostates after each action. Length D.
-        rewards: Expected reward of each action. Shape (D,).
-    """
-
-    frame: Frame
-    actions: NDArray[np.int64]
-    beliefs: tuple[dict[State, float], ...]
-    rewards: Floats
+    frame: Frame  # the real frame
+    actions: NDArray[np.int64]  # drawn uniformly among those that end no episode, now or by force later. Shape (D,).
+    beliefs: tuple[dict[State, float], ...]  # probabilities of the macrostates after each action. Length D.
+    rewards: Floats  # expected reward of each action. Shape (D,).
 
 
 def open_loop_starts(

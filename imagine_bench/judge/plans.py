@@ -26,31 +26,20 @@ from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
-OnStep = Callable[[int], None]
-"""Told after each macro-action how many of the plan are done."""
+OnStep = Callable[[int], None]  # told after each macro-action how many of the plan are done
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """One plan and what became of it.
+    """One plan and what became of it."""
 
-    Attributes:
-        number: Its start, from 0; the same for every agent.
-        start: The macrostate it starts from.
-        compared: What was imagined beside what the camera then saw, cut where the episode ended.
-        refused: Why it was not carried out, or an empty string.
-        solved: Whether the task was solved when the plan was done.
-        shortest: The fewest macro-actions that can solve it from there, by the rules.
-        faults: Macro-actions whose physics disagreed with the rules.
-    """
-
-    number: int
-    start: State
-    compared: ComparedRollout
-    refused: str
-    solved: bool
-    shortest: int
-    faults: int
+    number: int  # its start, from 0; the same for every agent
+    start: State  # the macrostate it starts from
+    compared: ComparedRollout  # what was imagined beside what the camera then saw, cut where the episode ended
+    refused: str  # why it was not carried out, or an empty string
+    solved: bool  # whether the task was solved when the plan was done
+    shortest: int  # the fewest macro-actions that can solve it from there, by the rules
+    faults: int  # macro-actions whose physics disagreed with the rules
 
     @property
     def length(self) -> int:

@@ -74,9 +74,7 @@ def _imagined_now() -> rrb.Horizontal:
 
 def _sampled_rollouts() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
-        origin="/imagined/sampled_rollouts",
-        name="Several futures from the current frame",
-        background=[255, 255, 255],
+        origin="/imagined/sampled_rollouts", name="Several futures from the current frame", background=[255, 255, 255]
     )
 
 

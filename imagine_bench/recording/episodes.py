@@ -29,8 +29,7 @@ from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 
 MOTION_HZ = 20.0
-IMAGINED_DEPTH = 6
-"""Macro-actions imagined at each step; as many as a strip shows legibly."""
+IMAGINED_DEPTH = 6  # macro-actions imagined at each step; as many as a strip shows legibly
 _STILL_S = 1.5
 _BAR_CELLS = 16
 _KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}

@@ -26,8 +26,7 @@ from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
-_LOOK_S = 2.0
-"""How long the scene stands still while the plan is shown, before and after the arm moves."""
+_LOOK_S = 2.0  # how long the scene stands still while the plan is shown, before and after the arm moves
 
 
 def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None, path: Path) -> Path:

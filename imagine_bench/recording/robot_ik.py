@@ -19,8 +19,7 @@ from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.regression.interfaces import RegressionSpec
 
-CHOICES = 6
-"""Decisions of the first network that are shown: the first ones, not the best."""
+CHOICES = 6  # decisions of the first network that are shown: the first ones, not the best
 _HZ, _STILL_S, _LOOK_S = 25.0, 1.5, 1.0
 _SURE, _UNSURE = np.array([0, 158, 115]), np.array([213, 94, 0])  # Okabe-Ito green and vermilion
 _CHOSEN, _ERROR, _OUTSIDE = (0, 90, 200), (200, 30, 60), (120, 120, 120)

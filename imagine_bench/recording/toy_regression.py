@@ -20,8 +20,7 @@ from imagine_bench.regression.interfaces import RegressionSpec
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
 _PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (150, 150, 150), (190, 190, 196)
 _SHOWN = (-30, 40)
-_TICKS = 100
-"""Steps of the timeline per unit of x: a timeline counts whole numbers."""
+_TICKS = 100  # steps of the timeline per unit of x: a timeline counts whole numbers
 _TIMELINE = "x_hundredths"
 
 

@@ -13,8 +13,7 @@ from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
-BASE_AGENT = "dqn"
-"""What gains are measured against, as in the thesis."""
+BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 
 _SUMMARY_COLUMNS = (
     *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
@@ -25,59 +24,36 @@ _SUMMARY_COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Success of one agent at one budget, as shares in [0, 1].
+    """Success of one agent at one budget, as shares in [0, 1]."""
 
-    Attributes:
-        value: Interquartile mean over the seeds.
-        low: Lower end of the 95 % interval.
-        high: Upper end.
-        over: What the interval covers: ``"seeds"``, or ``"episodes"`` where there is one seed only.
-        by_seed: Success of each seed, in the protocol's order.
-        thesis: (mean, standard deviation) of the thesis at this budget, or None.
-    """
-
-    value: float
-    low: float
-    high: float
-    over: str
-    by_seed: tuple[float, ...]
-    thesis: tuple[float, float] | None
+    value: float  # interquartile mean over the seeds
+    low: float  # lower end of the 95 % interval
+    high: float  # upper end
+    over: str  # what the interval covers: ``"seeds"``, or ``"episodes"`` where there is one seed only
+    by_seed: tuple[float, ...]  # success of each seed, in the protocol's order
+    thesis: tuple[float, float] | None  # (mean, standard deviation) of the thesis at this budget, or None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """An agent against DQN at one budget; NaN ends where one seed allows no interval.
+    """An agent against DQN at one budget; NaN ends where one seed allows no interval."""
 
-    Attributes:
-        difference: Difference of the interquartile means of the success shares, with its 95 % interval.
-        gain: (P_aug - P_base) / P_base of the means over seeds, with its interval.
-        thesis_gain: The thesis' gain at this budget, or None.
-    """
-
+    # difference of the interquartile means of the success shares, with its 95 % interval
     difference: statistics.Estimate
-    gain: statistics.Estimate
-    thesis_gain: float | None
+    gain: statistics.Estimate  # (P_aug - P_base) / P_base of the means over seeds, with its interval
+    thesis_gain: float | None  # the thesis' gain at this budget, or None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Means over an agent's runs.
+    """Means over an agent's runs."""
 
-    Attributes:
-        train_cpu_s: CPU seconds of training in one run.
-        learner_cpu_s: Those the agent itself reports for learning and imagining; NaN where it reports none.
-        eval_cpu_s: CPU seconds of all evaluations of one run.
-        env_steps: Real training macro-actions of one run.
-        test_steps: Test macro-actions of all runs.
-        faults: Those whose physics disagreed with the rules.
-    """
-
-    train_cpu_s: float
-    learner_cpu_s: float
-    eval_cpu_s: float
-    env_steps: float
-    test_steps: int
-    faults: int
+    train_cpu_s: float  # CPU seconds of training in one run
+    learner_cpu_s: float  # those the agent itself reports for learning and imagining; NaN where it reports none
+    eval_cpu_s: float  # CPU seconds of all evaluations of one run
+    env_steps: float  # real training macro-actions of one run
+    test_steps: int  # test macro-actions of all runs
+    faults: int  # those whose physics disagreed with the rules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,32 +61,21 @@ class FuturesSummary:
     """Sampled futures against the rules, means over all pairs of macrostate and macro-action and over seeds.
 
     Arrays have shape (D,), index d for macro-action d + 1, at the last budget.
-
-    Attributes:
-        pairs: Macrostates of play times macro-actions.
-        samples: Futures of each pair.
-        total_variation: Distance of imagined and exact distributions of macrostates.
-        where_random: The same over the pairs after which several macrostates are possible; the others dilute it.
-        while_alive: The same where the episode goes on until this macro-action, weighted by how likely that is.
-        floor: What as many samples of the exact distribution would show (sampling noise).
-        missed: Possible outcomes that are not imagined, all pairs together.
-        hallucinated: Imagined outcomes that are impossible, all pairs together.
-        reward_error: Absolute error of the expected reward.
-        termination_error: Absolute error of the probability that the episode is over.
-        by_budget: Total variation at the first and at the last depth, by real episodes.
     """
 
-    pairs: int
-    samples: int
-    total_variation: np.ndarray
+    pairs: int  # macrostates of play times macro-actions
+    samples: int  # futures of each pair
+    total_variation: np.ndarray  # distance of imagined and exact distributions of macrostates
+    # the same over the pairs after which several macrostates are possible; the others dilute it
     where_random: np.ndarray
+    # the same where the episode goes on until this macro-action, weighted by how likely that is
     while_alive: np.ndarray
-    floor: np.ndarray
-    missed: np.ndarray
-    hallucinated: np.ndarray
-    reward_error: np.ndarray
-    termination_error: np.ndarray
-    by_budget: dict[int, tuple[float, float]]
+    floor: np.ndarray  # what as many samples of the exact distribution would show (sampling noise)
+    missed: np.ndarray  # possible outcomes that are not imagined, all pairs together
+    hallucinated: np.ndarray  # imagined outcomes that are impossible, all pairs together
+    reward_error: np.ndarray  # absolute error of the expected reward
+    termination_error: np.ndarray  # absolute error of the probability that the episode is over
+    by_budget: dict[int, tuple[float, float]]  # total variation at the first and at the last depth, by real episodes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,13 +11,7 @@ from typing import Any
 from imagine_bench import reference
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.generalisation import (
-    Generalisation,
-    Predictions,
-    generalisation,
-    predict,
-    transition_set,
-)
+from imagine_bench.judge.generalisation import Generalisation, Predictions, generalisation, predict, transition_set
 from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.trained import Trained

@@ -29,12 +29,10 @@ _COLUMNS = (
     *("max_epistemic", "actions"),
 )
 RECORDING = "recording.rrd"
-_FILMSTRIPS = 6
-"""Plans in plans.png, of as many lengths as there are."""
+_FILMSTRIPS = 6  # plans in plans.png, of as many lengths as there are
 _SHOWN_FAILURES = 12
 
-Record = Callable[..., Path]
-"""Records plans: :func:`imagine_bench.recording.plans.record_plans`."""
+Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.plans.record_plans`
 
 
 def plan_report(

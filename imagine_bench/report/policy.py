@@ -22,10 +22,8 @@ _SHARES = {
     "late_failure": "out of time, then ends otherwise",
     "endless": "never ends",
 }
-_SURE = 0.999
-"""From here on a start counts as always solved: rules may leave something to chance."""
-_LISTED = 12
-"""Starts that the page lists; starts.csv has all."""
+_SURE = 0.999  # from here on a start counts as always solved: rules may leave something to chance
+_LISTED = 12  # starts that the page lists; starts.csv has all
 
 
 def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:

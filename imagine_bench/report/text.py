@@ -13,10 +13,8 @@ from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate
 
-FEW_SEEDS = 5
-"""Below this the bootstrap interval is hardly more than the range of the seeds, and the report says so."""
-_NAMED = 4
-"""Missing runs that are named; the others are counted."""
+FEW_SEEDS = 5  # below this the bootstrap interval is hardly more than the range of the seeds, and the report says so
+_NAMED = 4  # missing runs that are named; the others are counted
 
 
 class AgentWords(NamedTuple):

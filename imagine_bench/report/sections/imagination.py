@@ -19,8 +19,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, reading
 from imagine_bench.store.results import BenchResult, ComparedRollout
 
-SHOWN_ROLLOUTS = 3
-"""Rollouts shown of each imagining agent: the first ones of its first seed."""
+SHOWN_ROLLOUTS = 3  # rollouts shown of each imagining agent: the first ones of its first seed
 _LOOP_ROWS = (
     ("count", "transitions compared", "{:.0f}"),
     ("correct", "macrostate right (%)", "%"),
@@ -59,19 +58,12 @@ _CARD_HIDDEN = {"format", "cardinalities"}
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderView:
-    """What the report knows of an encoder.
+    """What the report knows of an encoder."""
 
-    Attributes:
-        agents: Those that see through it.
-        identity: As in the protocol: name and beginning of the digest.
-        card: The card's contents; empty where the file is not among the bundled ones.
-        image: Real and reconstructed frames, a PNG file, or None.
-    """
-
-    agents: tuple[str, ...]
-    identity: str
-    card: dict[str, Any]
-    image: Path | None
+    agents: tuple[str, ...]  # those that see through it
+    identity: str  # as in the protocol: name and beginning of the digest
+    card: dict[str, Any]  # the card's contents; empty where the file is not among the bundled ones
+    image: Path | None  # real and reconstructed frames, a PNG file, or None
 
 
 def sections(data: ReportData) -> Iterator[Section]:

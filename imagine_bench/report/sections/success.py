@@ -9,13 +9,7 @@ from imagine_bench import statistics
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
-from imagine_bench.report.text import (
-    agent_words,
-    interval_text,
-    lasting,
-    percent,
-    signed_percent,
-)
+from imagine_bench.report.text import agent_words, interval_text, lasting, percent, signed_percent
 
 
 def compared(data: ReportData) -> Section:
@@ -159,10 +153,7 @@ def _estimate(
     estimate: statistics.Estimate, words: Callable[[float], str], data: dict[str, object], note: str = ""
 ) -> Cell:
     return Cell(
-        text=words(estimate.value),
-        interval=interval_text(estimate.low, estimate.high, words),
-        note=note,
-        data=data,
+        text=words(estimate.value), interval=interval_text(estimate.low, estimate.high, words), note=note, data=data
     )
 
 
