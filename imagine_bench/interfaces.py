@@ -75,9 +75,7 @@ class Rules(Protocol):
         """The macrostates an episode may start in, equally likely."""
 
     def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
-        """Every possible result of ``action`` in ``macrostate``, also out of a terminal one: the scene goes on obeying
-        its dynamics there, though no episode does.
-        """
+        """Every possible result of ``action``, also out of a terminal macrostate: there its dynamics hold too."""
 
     def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
         """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
@@ -196,27 +194,19 @@ class Agent(Protocol):
     """A learner, or a fixed policy, seen by the runner. One agent lives through one run."""
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """Choose a macro-action in [0, A). With ``explore=False`` it changes nothing and is deterministic,
-        but for agents whose policy is random by definition.
-        """
+        """Choose a macro-action in [0, A); ``explore=False`` changes nothing and is random only in random agents."""
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Take in one real transition of training episode ``episode`` (from 0) and learn from it."""
 
     def diagnostics(self) -> dict[str, float]:
-        """Means since the last call, by slashed name (``loss/dynamics``, ``imagination/acceptance_rate``,
-        ``time/model_s``, ...).
-        """
+        """Means since the last call, by slashed name: ``imagination/acceptance_rate``, ``time/model_s``, ..."""
 
     def state(self) -> AgentState:
         """A snapshot for a checkpoint; later learning does not alter it."""
 
     def restore(self, state: AgentState) -> None:
-        """Continue from ``state``, bit for bit.
-
-        Raises:
-            ArtefactError: The snapshot does not fit this agent; the message names the first difference.
-        """
+        """Continue from ``state``, bit for bit; ArtefactError names the first difference of one that does not fit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,15 +23,12 @@ from imagine_bench.seeding import Purpose, SeedTree
 
 Mask = NDArray[np.bool_]
 
-CONSEQUENCES = ("success", "failure", "the episode goes on")
-"""What may come of a transition by the rules, as far as they leave no choice between these."""
+CONSEQUENCES = ("success", "failure", "the episode goes on")  # of a transition, where the rules leave no choice
 _OFTEN = 10
+# How many real visits of a transition an agent remembers: least and most.
 VISIT_COUNTS = {
-    "never": (0, 0),
-    f"1 to {_OFTEN - 1} times": (1, _OFTEN - 1),
-    f"{_OFTEN} times or more": (_OFTEN, math.inf),
-}
-"""How many real visits of a transition an agent remembers: least and most."""
+    "never": (0, 0), f"1 to {_OFTEN - 1} times": (1, _OFTEN - 1), f"{_OFTEN} times or more": (_OFTEN, math.inf),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,13 +74,8 @@ class Predictions:
         def mean(values: Mask | Floats | None) -> float:
             return math.nan if values is None or not part.any() else float(values[part].mean())
 
-        return Scores(
-            count=int(part.sum()),
-            right=mean(self.right),
-            likeliest_right=mean(self.likeliest_right),
-            end_right=mean(self.end_right),
-            reward_error=mean(self.reward_error),
-        )
+        names = ("right", "likeliest_right", "end_right", "reward_error")
+        return Scores(count=int(part.sum()), **{name: mean(getattr(self, name)) for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,13 +129,7 @@ def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evalu
 
 
 def predict(agent: Imaginer, transitions: TransitionSet, seeds: SeedTree) -> Predictions:
-    """Imagine every transition, one step each, and take what else the agent can say of it.
-
-    Args:
-        agent: It is not changed.
-        transitions: What is predicted.
-        seeds: Names the generators that imagination draws from.
-    """
+    """Imagine every transition, one step each, and take what else the agent, which is not changed, can say of it."""
     pairs = enumerate(zip(transitions.frames, transitions.actions, strict=True))
     steps = [
         agent.imagine(frame, actions=np.array([action]), depth=1, rng=seeds.child(index).generator())
@@ -157,9 +143,7 @@ def predict(agent: Imaginer, transitions: TransitionSet, seeds: SeedTree) -> Pre
         right=transitions.allows([step.macrostates[0].tolist() for step in steps]),
         epistemic=np.array([float(step.epistemic[0]) for step in steps]),
         reward_error=np.array([min(abs(float(step.rewards[0]) - o.reward) for o in outs) for step, outs in imagined]),
-        end_right=np.array(
-            [bool(step.p_terminated[0] > 0.5) in {o.terminated for o in outs} for step, outs in imagined]
-        ),
+        end_right=np.array([(step.p_terminated[0] > 0.5) in {o.terminated for o in outs} for step, outs in imagined]),
         likeliest_right=None if likeliest is None else transitions.allows(likeliest),
         visit_count=_visit_count(agent, transitions),
     )

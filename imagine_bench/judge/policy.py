@@ -76,13 +76,7 @@ def optimal_length(spec: TaskSpec) -> Floats:
 
 
 def terminations(spec: TaskSpec, states: EvalStates, policy: Floats) -> Terminations:
-    """Follow a policy from every start, by the rules.
-
-    Args:
-        spec: The task.
-        states: All macrostates that are not terminal.
-        policy: Probability of each macro-action in each of them. Shape (A, N).
-    """
+    """Follow a policy from every start, by the rules: probabilities (A, N) in the N macrostates not terminal."""
     tables = tabulate(spec.rules)
     everywhere = np.full(tables.reward.shape, 1.0 / len(policy))  # anything, where episodes have ended
     everywhere[:, [tables.index[tuple(state)] for state in states.macrostates.tolist()]] = policy

@@ -139,7 +139,7 @@ def collect(result: BenchResult) -> ReportData:
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
-        reached={agent: _reached(result.of(agent), spec.success_threshold) for agent in learners},
+        reached={agent: _reached(result, agent, spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
@@ -171,12 +171,8 @@ def summary_csv(data: ReportData) -> str:
         for budget, score in scores.items():
             row: list[object] = [agent, budget, len(score.by_seed), score.value, score.low, score.high, score.over]
             row += list(score.thesis or ("", ""))
-            comparison = data.comparisons.get(agent, {}).get(budget)
-            if comparison:
-                row += [*comparison.difference, *comparison.gain]
-                row.append("" if comparison.thesis_gain is None else comparison.thesis_gain)
-            else:
-                row += [""] * 7
+            versus = data.comparisons.get(agent, {}).get(budget)
+            row += [*versus.difference, *versus.gain, versus.thesis_gain] if versus else [""] * 7
             rows.append(row + list(data.areas.get(agent, {}).get(budget, [""] * 3)))
     return csv_text(rows)
 
@@ -212,20 +208,12 @@ def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, floa
     scores = {}
     for index, budget in enumerate(result.protocol.budgets):
         shares = result.success_rates(agent)[:, index]  # [seeds]
-        low, high = statistics.bootstrap_interval(shares, _rng(result, agent, budget))
-        over = "seeds"
+        (low, high), over = statistics.bootstrap_interval(shares, _rng(result, agent, budget)), "seeds"
         if len(shares) == 1:
             checkpoint = result.of(agent)[0].checkpoints[index]
-            low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
-            over = "episodes"
-        scores[budget] = Score(
-            value=statistics.iqm(shares),
-            low=low,
-            high=high,
-            over=over,
-            by_seed=tuple(float(share) for share in shares),
-            thesis=thesis.get(budget),
-        )
+            (low, high), over = statistics.wilson(checkpoint.successes, checkpoint.test_episodes), "episodes"
+        value, by_seed = statistics.iqm(shares), tuple(shares.tolist())
+        scores[budget] = Score(value=value, low=low, high=high, over=over, by_seed=by_seed, thesis=thesis.get(budget))
     return scores
 
 
@@ -234,10 +222,9 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
     agents = result.protocol.agents
     if BASE_AGENT not in agents:
         return {}
-    learners = [agent for agent in agents if agent != BASE_AGENT and registry.agent_entry(agent).learns]
     base = result.success_rates(BASE_AGENT)
     comparisons: dict[str, dict[int, Comparison]] = {}
-    for agent in learners:
+    for agent in (each for each in agents if each != BASE_AGENT and registry.agent_entry(each).learns):
         treated = result.success_rates(agent)
         comparisons[agent] = {}
         for index, budget in enumerate(result.protocol.budgets):
@@ -313,20 +300,13 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 def _nan_mean(table: np.ndarray) -> np.ndarray:
     """Mean over the first axis of what is known, boundless uncertainty included; NaN where nothing is."""
     known = ~np.isnan(table)
-    count = known.sum(axis=0)
-    total = np.where(known, table, 0.0).sum(axis=0)
-    mean: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return mean
+    count, total = known.sum(axis=0), np.where(known, table, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _reached(runs: tuple[RunResult, ...], success_threshold: float) -> tuple[int | None, ...]:
-    def first(run: RunResult) -> int | None:
-        rows = run.checkpoints
-        return statistics.first_lasting(
-            [row.episodes for row in rows], [row.success_rate for row in rows], success_threshold
-        )
-
-    return tuple(first(run) for run in runs)
+def _reached(result: BenchResult, agent: str, threshold: float) -> tuple[int | None, ...]:
+    budgets = result.protocol.budgets
+    return tuple(statistics.first_lasting(budgets, rates, threshold) for rates in result.success_rates(agent))
 
 
 def _areas(result: BenchResult, agent: str, chance_level: float) -> dict[int, statistics.Estimate]:

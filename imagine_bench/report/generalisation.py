@@ -105,8 +105,7 @@ class GeneralisationAnalysis(Analysis[Found]):
         """The figures of the table."""
         _, found = value
         figures = {name: attrgetter(figure)(found) for name, (figure, _) in _ROWS.items()}
-        parts = asdict(found)
-        return {**figures, "consequences": parts["consequences"], "visit_counts": parts["visit_counts"]}
+        return {**figures, **{name: asdict(found)[name] for name in ("consequences", "visit_counts")}}
 
 
 def _by_consequence(groups: Groups[Found]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,6 +106,8 @@ def _acceptance(data: ReportData) -> Section:
         "imagined transitions. Mean over seeds."
     )
     alt = "Share of imagined transitions that the uncertainty filter kept while training."
+    draw = functools.partial(plots.acceptance_figure, data)
+    figure = plots.image("acceptance", draw, alt=alt, caption=caption, svg=True, dpi=180)
     return Section(
         title="How much imagination is kept",
         words=(
@@ -113,11 +116,7 @@ def _acceptance(data: ReportData) -> Section:
             "whose epistemic uncertainty (what the model does not know for want of data) is too high. Two other kinds "
             "are shown beside it: aleatoric (noise) and modal (several outcomes are possible).",
         ),
-        images=[
-            plots.image(
-                "acceptance", lambda: plots.acceptance_figure(data), alt=alt, caption=caption, svg=True, dpi=180
-            )
-        ],
+        images=[figure],
     )
 
 
@@ -251,14 +250,9 @@ def encoder_views(result: BenchResult) -> list[EncoderView]:
     for identity, agents in readers.items():
         path = bundled.get(identity)
         card, image = (path.with_suffix(".json"), path.with_suffix(".png")) if path else (None, None)
-        views.append(
-            EncoderView(
-                agents=tuple(agents),
-                identity=identity,
-                card=read_json(card, "an encoder's card") if card and card.is_file() else {},
-                image=image if image and image.is_file() else None,
-            )
-        )
+        facts = read_json(card, "an encoder's card") if card and card.is_file() else {}
+        shown = image if image and image.is_file() else None
+        views.append(EncoderView(agents=tuple(agents), identity=identity, card=facts, image=shown))
     return views
 
 
@@ -273,11 +267,8 @@ def _encoders(views: Sequence[EncoderView]) -> Section:
             caption = f"{heading}: real frames the encoder never saw in training, and what it makes of them."
             alt = "Real frames and what the encoder keeps of them"
             images.append(Image(name=f"encoder-{name}", png=content, alt=alt, caption=caption))
-        rows = [
-            [_CARD_NAMES.get(key, key), _card_text(key, value)]
-            for key, value in view.card.items()
-            if key not in _CARD_HIDDEN
-        ]
+        shown = {key: value for key, value in view.card.items() if key not in _CARD_HIDDEN}
+        rows = [[_CARD_NAMES.get(key, key), _card_text(key, value)] for key, value in shown.items()]
         missing = "" if rows else "It is not one of the bundled encoders, so its card is beside its file and not here."
         tables.append(Table(name=f"card-{name}", header=[heading, "its card"], rows=rows, caption=missing, prose=True))
     return Section(
