@@ -19,33 +19,23 @@ from imagine_bench.interfaces import Frame, Observation
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginedRollout:
-    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``.
+    """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``."""
 
-    Attributes:
-        actions: Macro-actions imagined. Shape (D,), int64.
-        frames: Decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3).
-        start_frame: The decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
-        rewards: Predicted rewards. Shape (D,).
-        p_terminated: Predicted probability that the episode ended there. Shape (D,).
-        q_values: The controller's values in the state *before* each action. Shape (D, A).
-        epistemic: Epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
-        aleatoric: The same for aleatoric. Shape (D,).
-        modal: The same for modal. Shape (D,).
-        accepted: Whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
-        macrostates: The macrostate a probe reads from each imagined latent. Shape (D, M).
-    """
-
-    actions: NDArray[np.int64]
+    actions: NDArray[np.int64]  #: macro-actions imagined. Shape (D,), int64.
+    #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
     frames: NDArray[np.float32]
+    #: the decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
     start_frame: NDArray[np.float32]
-    rewards: NDArray[np.float32]
-    p_terminated: NDArray[np.float32]
-    q_values: NDArray[np.float32]
+    rewards: NDArray[np.float32]  #: predicted rewards. Shape (D,).
+    p_terminated: NDArray[np.float32]  #: predicted probability that the episode ended there. Shape (D,).
+    q_values: NDArray[np.float32]  #: the controller's values in the state *before* each action. Shape (D, A).
+    #: epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
     epistemic: NDArray[np.float32]
-    aleatoric: NDArray[np.float32]
-    modal: NDArray[np.float32]
+    aleatoric: NDArray[np.float32]  #: the same for aleatoric. Shape (D,).
+    modal: NDArray[np.float32]  #: the same for modal. Shape (D,).
+    #: whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
     accepted: NDArray[np.bool_]
-    macrostates: NDArray[np.int64]
+    macrostates: NDArray[np.int64]  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
 
 
 @runtime_checkable
@@ -63,8 +53,7 @@ class ModelOnlyTrainer(Protocol):
     def train_in_model(self) -> bool:
         """Train a little in the model as it is; False, which changes nothing, says that nothing is left to do.
 
-        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`, so that
-        interrupted training goes on bit for bit.
+        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`.
         """
 
 
@@ -77,14 +66,10 @@ class ExternalTrainer(Protocol):
     """An agent whose training loop is its own, as a library's is; an interrupted run of it starts anew."""
 
     def train(self, env: Any, *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
-        """Train in ``env``, from nothing.
+        """Train from nothing in the task's ``env``: real ``episodes``, one a reset, of at most ``horizon`` actions.
 
-        Args:
-            env: The task's Gymnasium environment; every reset is the next training episode of the run.
-            episodes: Real training episodes there will be.
-            horizon: Most macro-actions of one.
-            on_episode: To be told of each episode as it ends, before the next macro-action; it may ask the agent to
-                act. Training ends when it answers False.
+        ``on_episode`` is to be told of each episode as it ends, before the next macro-action; it may ask the agent to
+        act. Training ends when it answers False.
         """
 
 
@@ -101,9 +86,7 @@ class TransferLearner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """What an oracle says of an action that was only imagined: the reward it would bring, and whether it would end
-    the episode.
-    """
+    """What an oracle says of an imagined action: the reward it would bring, and whether it would end the episode."""
 
     reward: float
     terminated: bool
@@ -114,13 +97,9 @@ class QueryingAgent(Protocol):
     """An agent that can query an oracle about actions that it only imagines."""
 
     def query(self, observation: Observation) -> NDArray[np.int64] | None:
-        """Before it acts: the macro-actions whose last one is asked about, from the frame seen, or None to ask nothing.
+        """Before it acts: macro-actions (D >= 1,) from the frame seen, whose last is asked about; None asks nothing.
 
-        It changes nothing but the agent's measurements.
-
-        Returns:
-            Macro-actions (D,) with D of at least 1. The scene is imagined to go on through ends of episodes, so the
-            label concerns the last one alone.
+        The scene is imagined to go on through ends of episodes. Nothing changes but the agent's measurements.
         """
 
     def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
@@ -134,14 +113,10 @@ class Imaginer(Protocol):
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        """Imagine up to ``depth`` transitions from ``frame``.
+        """Imagine up to ``depth`` transitions from a real ``frame``; ``rng`` draws components, noise, dropout masks.
 
-        Args:
-            frame: A real camera image. Shape (64, 64, 3).
-            actions: The macro-actions to imagine, (D,) with D <= depth, never stopped early; None lets the greedy
-                controller choose and stops where the model says the episode has ended.
-            depth: Longest rollout.
-            rng: Draws components, noise and dropout masks.
+        Given ``actions``, (D,) with D <= depth, are never stopped early; None lets the greedy controller choose and
+        stops where the model says the episode has ended.
         """
 
 
@@ -150,15 +125,9 @@ class MapPredictor(Protocol):
     """An agent whose model names what it holds likeliest, apart from what it samples when it imagines."""
 
     def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """The likeliest result of one macro-action from each of N real frames; changes nothing in the agent.
+        """Macrostates (N, M), as a probe reads them, likeliest after one of the actions (N,) from each real frame.
 
-        Args:
-            frames: Shape (N, 64, 64, 3).
-            actions: Shape (N,).
-            rng: Draws dropout masks.
-
-        Returns:
-            Macrostates, as a probe reads them. Shape (N, M).
+        ``rng`` draws dropout masks; nothing changes in the agent.
         """
 
 
@@ -190,17 +159,11 @@ Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
 
 @dataclass(frozen=True, kw_only=True)
 class SampledFutures:
-    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held.
+    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held."""
 
-    Attributes:
-        macrostates: What a probe reads. Shape (D, R, S, M).
-        rewards: Predicted rewards, 0 once a future has ended. Shape (D, R, S).
-        ended: Whether the model has said, here or before, that the episode is over. Shape (D, R, S).
-    """
-
-    macrostates: NDArray[np.int64]
-    rewards: NDArray[np.float32]
-    ended: NDArray[np.bool_]
+    macrostates: NDArray[np.int64]  #: what a probe reads. Shape (D, R, S, M).
+    rewards: NDArray[np.float32]  #: predicted rewards, 0 once a future has ended. Shape (D, R, S).
+    ended: NDArray[np.bool_]  #: whether the model has said, here or before, that the episode is over. Shape (D, R, S).
 
 
 @runtime_checkable
@@ -217,13 +180,7 @@ class FutureSampler(Protocol):
         depth: int,
         rng: np.random.Generator,
     ) -> SampledFutures:
-        """Imagine S = ``samples`` futures of D = ``depth`` macro-actions from each of R frames.
+        """Imagine S = ``samples`` futures of D = ``depth`` macro-actions from each of R real frames (R, 64, 64, 3).
 
-        Args:
-            frames: Real camera images. Shape (R, 64, 64, 3).
-            actions: The first macro-action from each. Shape (R,).
-            follow: Chooses the later ones.
-            samples: Futures of each row.
-            depth: Macro-actions of each future.
-            rng: Draws components, noise and dropout masks.
+        ``actions`` (R,) come first, ``follow`` chooses the later ones; ``rng`` draws components, noise, dropout masks.
         """

@@ -19,9 +19,7 @@ import imagine_bench
 from imagine_bench import registry
 from imagine_bench.errors import SetupError
 
-PACKAGES = (
-    "daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch",
-)  # fmt: skip
+PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
 OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "stable-baselines3")
 """Of adapters and of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
@@ -31,10 +29,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def describe_environment() -> dict[str, Any]:
-    """Command, commit, versions, machine, GL renderer, threads; JSON-like.
-
-    Where there is no GL, ``gl_renderer`` says why not.
-    """
+    """Command, commit, versions, machine, GL renderer (or why there is none), threads; JSON-like."""
     return {
         "command": command(),
         "commit": commit(),
@@ -80,15 +75,10 @@ def versions() -> dict[str, str]:
     One that offers agents is likely still being written: the beginning of its sources' digest follows its version.
     """
     found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
-    needed = {package: installed(package) for package in PACKAGES}
+    found |= {package: installed(package) for package in PACKAGES}
     optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
-    offering = {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.agent_packages().items()}
-    return {
-        **found,
-        **needed,
-        **{name: version for name, version in optional.items() if version != "missing"},
-        **offering,
-    }
+    found |= {name: version for name, version in optional.items() if version != "missing"}
+    return found | {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.agent_packages().items()}
 
 
 def _sources(modules: Iterable[str]) -> str:
@@ -117,17 +107,10 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "cpu": cpu_model(),
         "cores": usable_cores(),
-        "memory_gib": _memory_gib(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "gpu": gpu_model(),
         "thread_variables": {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ},
     }
-
-
-def _memory_gib() -> float | None:
-    """Memory of the machine; None where the system does not say."""
-    if not hasattr(os, "sysconf"):
-        return None
-    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
 
 
 def cpu_model() -> str:
@@ -156,13 +139,8 @@ def usable_cores() -> int:
 
 
 def gl_renderer() -> str:
-    """Vendor and renderer of the OpenGL that draws the frames.
-
-    Raises:
-        SetupError: There is none; the message says what to install.
-    """
-    name: str = registry.load(GL_RENDERER)()
-    return name
+    """Vendor and renderer of the OpenGL that draws the frames. Raises SetupError: there is none."""
+    return registry.load(GL_RENDERER)()
 
 
 def _gl_renderer_or_reason() -> str:

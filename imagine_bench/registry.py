@@ -4,71 +4,51 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, require_known
-from imagine_bench.interfaces import Agent, AgentContext, Rules, TaskSpec
+from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskEntry:
-    """A registered task.
+    """A registered task."""
 
-    Attributes:
-        spec: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it.
-        env_id: Gymnasium id, registered by ``import imagine_bench``.
-        env: ``"module:attr"`` of the environment's constructor.
-        horizon: Macro-actions before truncation.
-        options: Keyword arguments of both, which say which member of a family it is.
-    """
-
-    spec: str
-    env_id: str
-    env: str
-    horizon: int
+    spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
+    env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
+    env: str  #: ``"module:attr"`` of the environment's constructor
+    horizon: int  #: Macro-actions before truncation
+    #: Keyword arguments of both, which say which member of a family it is.
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry:
-    """A registered agent.
+    """A registered agent."""
 
-    Attributes:
-        make: ``"module:attr"`` of a function from AgentContext to Agent.
-        learns: Whether training changes it; others are only evaluated.
-        needs_encoder: Whether it sees what an encoder gives.
-        encoder_kind: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``.
-        settings: Its settings: ``"module:attr"``, or a module, with ``names()`` and
-            ``resolve(hyperparameters, overrides, group)``.
-        privileged: Whether it is shown the macrostate and the rules (references only).
-        external_training_loop: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
-        title: For headings, legends and tables; by default the registered name in plain words.
-        description: One sentence for a reader who knows none of this.
-    """
-
-    make: str
-    learns: bool = True
-    needs_encoder: bool = True
-    encoder_kind: str = "latents"
+    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
+    learns: bool = True  #: Whether training changes it; others are only evaluated
+    needs_encoder: bool = True  #: Whether it sees what an encoder gives
+    encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
+    #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
+    #: group)``.
     settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
-    privileged: bool = False
+    privileged: bool = False  #: Whether it is shown the macrostate and the rules (references only)
+    #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
     external_training_loop: bool = False
-    title: str = ""
-    description: str = "A registered agent."
+    title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
+    description: str = "A registered agent."  #: One sentence for a reader who knows none of this
 
 
 TASKS: dict[str, TaskEntry] = {
     **{
         name: TaskEntry(
-            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of",
-            env_id=f"imagine_bench/{gymnasium_name}-v0",
-            env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
-            horizon=10,
-            options={"goal": goal},
+            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of", env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
+            env_id=f"imagine_bench/{gymnasium_name}-v0", horizon=10, options={"goal": goal},
         )
         for name, gymnasium_name, goal in (
             ("arrow_puzzle", "ArrowPuzzle", "toward_human"),
@@ -78,90 +58,66 @@ TASKS: dict[str, TaskEntry] = {
         )
     },
     "pick_place": TaskEntry(
-        spec="imagine_bench.tasks.pick_place.spec:SPEC",
-        env_id="imagine_bench/PickPlace-v0",
-        env="imagine_bench.tasks.pick_place.spec:make_env",
-        horizon=50,
+        spec="imagine_bench.tasks.pick_place.spec:SPEC", env="imagine_bench.tasks.pick_place.spec:make_env",
+        env_id="imagine_bench/PickPlace-v0", horizon=50,
     ),
-}
+}  # fmt: skip
+
+_LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
 AGENTS: dict[str, AgentEntry] = {
     "random": AgentEntry(
-        make="imagine_bench.agents.baselines:make_random",
-        learns=False,
-        needs_encoder=False,
-        title="random",
+        make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False,
         description="Picks every macro-action by chance: the floor.",
     ),
     "oracle": AgentEntry(
-        make="imagine_bench.agents.baselines:make_oracle",
-        learns=False,
-        needs_encoder=False,
-        privileged=True,
-        title="oracle",
+        make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True,
         description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
     ),
     "dqn": AgentEntry(
-        make="imagine_bench.agents.dqn:make",
-        settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
-        title="DQN",
+        make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS", title="DQN",
         description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
     ),
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
-        title="imagination",
         description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
-        make="imagine_bench.agents.imagination.agent:make_uncertainty",
-        title="imagination + uncertainty",
+        make="imagine_bench.agents.imagination.agent:make_uncertainty", title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
     ),
     "factored": AgentEntry(
-        make="imagine_bench.agents.factored.agent:make",
-        encoder_kind="codes",
+        make="imagine_bench.agents.factored.agent:make", encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
-        title="factored",
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
         "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
     "sb3_dqn": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_dqn",
-        needs_encoder=False,
-        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
-        external_training_loop=True,
-        title="SB3 DQN (pixels)",
+        make="imagine_bench.agents.library.sb3:make_dqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
+        external_training_loop=True, title="SB3 DQN (pixels)",
         description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
     ),
     "sb3_qrdqn": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_qrdqn",
-        needs_encoder=False,
-        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
-        external_training_loop=True,
-        title="SB3 QR-DQN (pixels)",
+        make="imagine_bench.agents.library.sb3:make_qrdqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
+        external_training_loop=True, title="SB3 QR-DQN (pixels)",
         description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_dqn",
-        settings="imagine_bench.agents.library.settings:HYPERPARAMETERS",
-        external_training_loop=True,
-        title="SB3 DQN (latents)",
+        make="imagine_bench.agents.library.sb3:make_dqn", settings=_LIBRARY_SETTINGS,
+        external_training_loop=True, title="SB3 DQN (latents)",
         description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
     ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
-        title="imagination only",
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
         "world is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
-        make="imagine_bench.agents.imagination.model_only:make_uncertainty",
-        title="imagination only + uncertainty",
+        make="imagine_bench.agents.imagination.model_only:make_uncertainty", title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
-}
-
+}  # fmt: skip
 
 AGENT_GROUP = "imagine_bench.agents"
 """Entry points in which installed packages offer agents of their own, each the ``"module:attr"`` of an AgentEntry."""
@@ -171,49 +127,30 @@ DEMONSTRATOR = "oracle"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegressionEntry:
-    """A registered regression task.
-
-    Attributes:
-        spec: ``"module:attr"`` of its RegressionSpec.
-    """
-
-    spec: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class RegressorEntry:
-    """A registered regressor.
+    """A registered regressor."""
 
-    Attributes:
-        make: ``"module:attr"`` of a function from RegressorContext to Regressor.
-        title: For headings, legends and tables.
-        description: One sentence for a reader who knows none of this.
-    """
-
-    make: str
-    title: str
-    description: str
+    make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
+    title: str  #: For headings, legends and tables
+    description: str  #: One sentence for a reader who knows none of this
 
 
-REGRESSIONS: dict[str, RegressionEntry] = {
-    "toy_regression": RegressionEntry(spec="imagine_bench.tasks.toy_regression:SPEC"),
-    "robot_ik": RegressionEntry(spec="imagine_bench.tasks.robot_ik.spec:SPEC"),
+REGRESSIONS = {
+    "toy_regression": "imagine_bench.tasks.toy_regression:SPEC",
+    "robot_ik": "imagine_bench.tasks.robot_ik.spec:SPEC",
 }
+"""Regression tasks, each the ``"module:attr"`` of its RegressionSpec."""
 
 REGRESSORS: dict[str, RegressorEntry] = {
     "mc_dropout": RegressorEntry(
-        make="imagine_bench.agents.regressors.regressor:make_mc_dropout",
-        title="MC dropout",
+        make="imagine_bench.agents.regressors.regressor:make_mc_dropout", title="MC dropout",
         description="One network whose hidden units are dropped at random, again and again: the thesis' Bayesian MDN.",
     ),
     "ensemble": RegressorEntry(
-        make="imagine_bench.agents.regressors.regressor:make_ensemble",
-        title="deep ensemble",
+        make="imagine_bench.agents.regressors.regressor:make_ensemble", title="deep ensemble",
         description="Several networks that began and trained differently; where they disagree, they do not know.",
     ),
-}
-
+}  # fmt: skip
 
 TASK_TYPES = {
     "control": "imagine_bench.bench.control:CONTROL",
@@ -237,11 +174,7 @@ def load(target: str) -> Any:
 
 
 def agents() -> dict[str, AgentEntry]:
-    """All agents by name: this suite's, and those that installed packages offer.
-
-    Raises:
-        SetupError: A package offers something that is no agent, or under a name that is taken; the message names it.
-    """
+    """All agents by name, also those of installed packages. Raises SetupError: one offers no agent, or a taken name."""
     return {**AGENTS, **_offered()}
 
 
@@ -279,11 +212,7 @@ def agent_packages() -> dict[str, frozenset[str]]:
 
 
 def task_entry(name: str) -> TaskEntry:
-    """The registry line of a task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists all of them.
-    """
+    """The registry line of a task. Raises UnknownNameError: no such task."""
     return TASKS[require_known("task", name, TASKS)]
 
 
@@ -291,7 +220,7 @@ def agent_entry(name: str) -> AgentEntry:
     """The registry line of an agent, this suite's or an installed package's.
 
     Raises:
-        UnknownNameError: No such agent; the message lists all of them.
+        UnknownNameError: No such agent.
         SetupError: As :func:`agents`.
     """
     known = agents()
@@ -300,8 +229,7 @@ def agent_entry(name: str) -> AgentEntry:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    names: frozenset[str] = load(agent_entry(agent).settings).names()
-    return names
+    return load(agent_entry(agent).settings).names()
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -324,19 +252,20 @@ def task(name: str) -> TaskSpec:
     """The TaskSpec of a registered task.
 
     Raises:
-        UnknownNameError: No such task; the message lists all of them.
+        UnknownNameError: No such task.
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
     loaded = load(entry.spec)
     spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
+    counts = tuple(1 + max(values) for values in zip(*spec.rules.states, strict=True))
     for what, ours, theirs in (
         ("id", name, spec.id),
         ("env_id", entry.env_id, spec.env_id),
         ("horizon", entry.horizon, spec.horizon),
         ("n_actions", spec.rules.n_actions, spec.n_actions),
         ("number of macrostate_names", len(spec.rules.states[0]), len(spec.macrostate_names)),
-        ("numbers of macrostate_values", _numbers_of_values(spec.rules), tuple(map(len, spec.macrostate_values))),
+        ("numbers of macrostate_values", counts, tuple(map(len, spec.macrostate_values))),
     ):
         if ours != theirs:
             raise InvalidValueError(
@@ -346,37 +275,21 @@ def task(name: str) -> TaskSpec:
     return spec
 
 
-def _numbers_of_values(rules: Rules) -> tuple[int, ...]:
-    """How many values each coordinate of a macrostate takes."""
-    return tuple(1 + max(values) for values in zip(*rules.states, strict=True))
-
-
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name."""
-    make: Callable[[AgentContext], Agent] = load(agent_entry(name).make)
-    return make(context)
+    return load(agent_entry(name).make)(context)
 
 
 def regression(name: str) -> RegressionSpec:
-    """The RegressionSpec of a registered regression task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists all of them.
-    """
-    spec: RegressionSpec = load(REGRESSIONS[require_known("regression task", name, REGRESSIONS)].spec)
-    return spec
+    """The RegressionSpec of a registered regression task. Raises UnknownNameError: no such task."""
+    return load(REGRESSIONS[require_known("regression task", name, REGRESSIONS)])
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor.
-
-    Raises:
-        UnknownNameError: No such regressor; the message lists all of them.
-    """
+    """The registry line of a regressor. Raises UnknownNameError: no such regressor."""
     return REGRESSORS[require_known("regressor", name, REGRESSORS)]
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name."""
-    make: Callable[[RegressorContext], Regressor] = load(regressor_entry(name).make)
-    return make(context)
+    return load(regressor_entry(name).make)(context)

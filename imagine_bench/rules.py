@@ -20,38 +20,22 @@ _TIE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class RuleTables:
-    """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1.
+    """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1."""
 
-    Attributes:
-        index: Macrostate to row.
-        starts: Rows an episode may start in, equally likely.
-        alive: Probability of going on in each next macrostate. Shape (A, S, S).
-        reward: Expected reward. Shape (A, S).
-        success: Probability of ending here as a success. Shape (A, S).
-    """
-
-    index: dict[State, int]
-    starts: NDArray[np.int64]
-    alive: Floats
-    reward: Floats
-    success: Floats
+    index: dict[State, int]  #: macrostate to row
+    starts: NDArray[np.int64]  #: rows an episode may start in, equally likely
+    alive: Floats  #: probability of going on in each next macrostate. Shape (A, S, S).
+    reward: Floats  #: expected reward. Shape (A, S).
+    success: Floats  #: probability of ending here as a success. Shape (A, S).
 
 
 def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Check rows of macrostates.
-
-    Args:
-        rules: The machine.
-        macrostates: Shape (N, M).
-
-    Returns:
-        The same as an array.
+    """Rows of macrostates (N, M), checked, as an array.
 
     Raises:
         InvalidValueError: Another shape or type, or a row that is no macrostate of the machine.
     """
-    macrostates, known = np.asarray(macrostates), set(rules.states)
-    width = len(rules.states[0])
+    macrostates, known, width = np.asarray(macrostates), set(rules.states), len(rules.states[0])
     if macrostates.ndim != 2 or macrostates.shape[1] != width or not np.issubdtype(macrostates.dtype, np.integer):
         given = f"{macrostates.dtype} of shape {macrostates.shape}"
         raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {given}.")
@@ -104,35 +88,21 @@ def optimal_values(tables: RuleTables) -> Floats:
 def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
     action_values = optimal_values(tables)
-    near_best: NDArray[np.bool_] = action_values >= action_values.max(axis=0) - _TIE_TOLERANCE
-    return np.asarray(near_best.argmax(axis=0), dtype=np.int64)
+    return np.asarray((action_values >= action_values.max(axis=0) - _TIE_TOLERANCE).argmax(axis=0), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyValues:
-    """What a policy reaches within a horizon, from each macrostate. Shapes (S,).
+    """What a policy reaches within a horizon, from each macrostate. Shapes (S,)."""
 
-    Attributes:
-        success: Success probability.
-        failure: Probability of an end that is no success; the rest of them is still going on at the horizon.
-        returns: Expected undiscounted return.
-        length: Expected number of actions.
-    """
-
-    success: Floats
-    failure: Floats
-    returns: Floats
-    length: Floats
+    success: Floats  #: success probability
+    failure: Floats  #: probability of an end that is no success; the rest of them is still going on at the horizon
+    returns: Floats  #: expected undiscounted return
+    length: Floats  #: expected number of actions
 
 
 def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
-    """Evaluate a stationary policy exactly.
-
-    Args:
-        tables: The machine.
-        policy: Action probabilities in each macrostate. Shape (A, S).
-        horizon: Actions before truncation, at least 1.
-    """
+    """Evaluate a stationary policy, action probabilities (A, S), exactly; truncated after ``horizon`` >= 1 actions."""
     if horizon < 1:
         raise InvalidValueError(f"Horizon {horizon} is too short; give at least 1 action.")
     alive = np.einsum("as,ast->st", policy, tables.alive)
@@ -148,17 +118,13 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
 
 
-Belief = dict[tuple[State, bool], float]
-"""Probability of each (macrostate, whether the episode ended there)."""
+Belief = dict[tuple[State, bool], float]  #: probability of each (macrostate, whether the episode ended there)
 
 
 def advance(rules: Rules, belief: Belief, action: int | None) -> tuple[Belief, float]:
     """The belief after one more macro-action, and the reward expected of it; what has ended stays where it is.
 
-    Args:
-        rules: The machine.
-        belief: What may be the case now.
-        action: The macro-action; None for the optimal one in each macrostate.
+    ``action`` None is the optimal one in each macrostate.
     """
     after: Belief = {}
     reward = 0.0
@@ -216,8 +182,7 @@ def facts(rules: Rules, horizon: int) -> RuleFacts:
     """
     tables = tabulate(rules)
     optimal = evaluate(tables, greedy(optimal_policy(tables), rules.n_actions), horizon)
-    uniform = np.full(tables.reward.shape, 1.0 / rules.n_actions)
-    chance = evaluate(tables, uniform, horizon)
+    chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / rules.n_actions), horizon)
     return RuleFacts(
         chance_level=float(chance.success[tables.starts].mean()),
         optimum=float(optimal.success[tables.starts].mean()),

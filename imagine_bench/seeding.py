@@ -33,9 +33,7 @@ def _key(name: str | int) -> int:
 class SeedTree:
     """A node of the seed tree; children are addressed by name, in any order, with the same result.
 
-    Args:
-        root: The seed of the whole tree, at least 0.
-        path: The names from the root to this node.
+    ``root`` is the seed of the whole tree, at least 0, and ``path`` the names from there to this node.
     """
 
     root: int
@@ -75,14 +73,9 @@ def evaluation_split(seed: int) -> Purpose:
 def episode_seed(purpose: Purpose, seed: int, episode: int) -> int:
     """The environment seed of one episode; distinct (purpose, seed, episode) give distinct numbers, by construction.
 
-    Args:
-        purpose: What the episode is for. Evaluation never meets a training seed.
-        seed: The run's seed, in [0, 2**24).
-        episode: The episode's index, in [0, 2**32).
-
     Raises:
         UnknownNameError: An unknown purpose.
-        InvalidValueError: A number out of range.
+        InvalidValueError: A seed outside [0, 2**24) or an episode outside [0, 2**32).
     """
     require_known("seed purpose", purpose, _PURPOSES)
     if not (0 <= seed < SEEDS and 0 <= episode < 1 << _EPISODE_BITS):

@@ -17,8 +17,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
 RESAMPLES = 4000
-_LEVEL = 0.95
-"""Coverage of every interval."""
+_LEVEL = 0.95  #: coverage of every interval
 _DIGITS = 12
 """Decimals of differences: success rates lie on a lattice, and two equal sums in another order must not differ."""
 
@@ -41,15 +40,9 @@ def iqm(scores: ArrayLike) -> float:
 def bootstrap_interval(
     scores: ArrayLike, rng: np.random.Generator, *, statistic: Statistic = "iqm"
 ) -> tuple[float, float]:
-    """95 % percentile interval of ``statistic`` by the bootstrap over runs.
+    """95 % percentile interval of ``statistic`` by the bootstrap over runs, from ``scores`` (runs,).
 
-    Args:
-        scores: Shape (runs,).
-        rng: Draws the resamples.
-        statistic: ``"iqm"`` or ``"mean"``.
-
-    Returns:
-        The two ends; both NaN with fewer than two runs, which say nothing of their spread.
+    Both ends are NaN with fewer than two runs, which say nothing of their spread.
 
     Raises:
         InvalidValueError: Scores that are empty, not finite, or of another shape.
@@ -73,12 +66,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def first_lasting(budgets: Sequence[int], scores: ArrayLike, threshold: float) -> int | None:
-    """The first budget from which on every score is at least ``threshold``; None where even the last one is not.
-
-    Args:
-        budgets: Ascending. Length B.
-        scores: The score at each of them. Shape (B,).
-        threshold: What counts as reached.
+    """The first of ascending budgets from which on every score (B,) is at least ``threshold``; None where none is.
 
     Raises:
         InvalidValueError: Not one score a budget.
@@ -94,39 +82,23 @@ def first_lasting(budgets: Sequence[int], scores: ArrayLike, threshold: float) -
 def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> Floats:
     """Area under each curve up to each budget, divided by the budget: the mean score of all episodes until then.
 
-    Curves are straight between tests, and from episode 0 to the first test.
-
-    Args:
-        budgets: Episodes at which there was a test, ascending. Length B.
-        scores: Shape (runs, B).
-        at_zero: Score before the first episode.
-
-    Returns:
-        Shape (runs, B).
+    Curves are straight between tests at ascending budgets, and from ``at_zero`` at episode 0 to the first test.
+    Scores and result have shape (runs, B).
 
     Raises:
         InvalidValueError: Not one score a budget.
     """
     table = _finite(scores)
     if table.ndim != 2 or table.shape[1] != len(budgets):
-        raise InvalidValueError(
-            f"{len(budgets)} budgets need scores of shape (runs, {len(budgets)}), not {table.shape}."
-        )
+        raise InvalidValueError(f"{len(budgets)} budgets need scores (runs, {len(budgets)}), not {table.shape}.")
     episodes = np.array([0, *budgets], dtype=np.float64)
     values = np.concatenate([np.full((len(table), 1), at_zero), table], axis=1)  # [runs, B + 1]
     pieces = np.diff(episodes) * (values[:, 1:] + values[:, :-1]) / 2.0
-    means: Floats = pieces.cumsum(axis=1) / episodes[1:]
-    return means
+    return np.asarray(pieces.cumsum(axis=1) / episodes[1:])
 
 
 def difference(treated: ArrayLike, base: ArrayLike, rng: np.random.Generator) -> Estimate:
-    """Difference of the interquartile means of two agents, whose runs are resampled independently.
-
-    Args:
-        treated: Shape (runs,).
-        base: Shape (other runs,).
-        rng: Draws the resamples.
-    """
+    """Difference of the interquartile means of two agents, whose runs, (n,) and (m,), are resampled independently."""
     a, b = _runs(treated), _runs(base)
     value = round(iqm(a) - iqm(b), _DIGITS)
     if min(len(a), len(b)) < 2:
@@ -140,15 +112,8 @@ def gain(treated: ArrayLike, base: ArrayLike, rng: np.random.Generator) -> Estim
 
     Both sides are resampled independently, as in :func:`difference`: runs of one seed share starts and first weights,
     but what training makes of them differs, so pairing them would promise more than a few seeds hold.
-
-    Args:
-        treated: Success rates of the augmented agent. Shape (runs,).
-        base: Success rates of the base agent. Shape (other runs,).
-        rng: Draws the resamples.
-
-    Returns:
-        The gain, 0.5 for half as much again; NaN where the base never succeeds. Its ends are NaN where too many
-        resamples of the base never do, so that the interval has no upper end.
+    A gain of 0.5 is half as much again; NaN where the base never succeeds. Its ends are NaN where too many resamples of
+    the base never do, so that the interval has no upper end.
     """
     a, b = _runs(treated), _runs(base)
     value = float(_relative(a[None], b[None])[0])
@@ -162,8 +127,7 @@ def gain(treated: ArrayLike, base: ArrayLike, rng: np.random.Generator) -> Estim
 
 def _summary(scores: Floats, statistic: Statistic) -> Floats:
     """The statistic over the last axis."""
-    trimmed: Floats = scores.mean(axis=-1) if statistic == "mean" else stats.trim_mean(scores, 0.25, axis=-1)
-    return trimmed
+    return np.asarray(scores.mean(axis=-1) if statistic == "mean" else stats.trim_mean(scores, 0.25, axis=-1))
 
 
 def _relative(a: Floats, b: Floats) -> Floats:
@@ -178,8 +142,7 @@ def _resample(values: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _percentiles(draws: Floats) -> tuple[float, float]:
-    tail = 50.0 * (1.0 - _LEVEL)
-    low, high = np.percentile(draws, [tail, 100.0 - tail])
+    low, high = np.percentile(draws, [50.0 * (1.0 - _LEVEL), 50.0 * (1.0 + _LEVEL)])
     return float(low), float(high)
 
 

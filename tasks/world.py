@@ -24,15 +24,10 @@ MAX_OTHER_SHIFT_M = 0.005
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a world shows.
+    """What a world shows."""
 
-    Attributes:
-        macrostate: The nearest macrostate.
-        problem: What keeps the scene from being a proper macrostate, in words, or None.
-    """
-
-    macrostate: tuple[int, ...]
-    problem: str | None
+    macrostate: tuple[int, ...]  #: the nearest macrostate
+    problem: str | None  #: what keeps the scene from being a proper macrostate, in words, or None
 
 
 class World(abc.ABC):

@@ -35,43 +35,26 @@ _FRAME_SHAPE = (64, 64, 3)
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderCard:
-    """Where an encoder comes from and what it can do.
+    """Where an encoder comes from and what it can do."""
 
-    Attributes:
-        task: Id of the task whose frames it was trained on.
-        appearance: Their appearance level.
-        recipe: Every setting of its making.
-        preprocessing: Name in :mod:`imagine_bench.preprocessing`.
-        latent_size: Latents Z.
-        macrostate_names: The coordinates its probe reads. Length M.
-        cardinalities: Values of each. Length M.
-        seed: Root of the seed tree it was made from.
-        command: Makes it again.
-        data: What the frames were, in words.
-        versions: Of the libraries that made it.
-        cpu_s: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``.
-        kl_nats: KL from the prior on held-out frames, mean a frame.
-        reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
-        probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
-            ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
-        code_sizes: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
-    """
-
-    task: str
-    appearance: str
-    recipe: Recipe
-    preprocessing: str
-    latent_size: int
-    macrostate_names: tuple[str, ...]
-    cardinalities: tuple[int, ...]
-    seed: int
-    command: str
-    data: str
-    versions: dict[str, str]
-    cpu_s: dict[str, float]
-    kl_nats: float
-    reconstruction: float
+    task: str  #: id of the task whose frames it was trained on
+    appearance: str  #: their appearance level
+    recipe: Recipe  #: every setting of its making
+    preprocessing: str  #: name in :mod:`imagine_bench.preprocessing`
+    latent_size: int  #: latents Z
+    macrostate_names: tuple[str, ...]  #: the coordinates its probe reads. Length M.
+    cardinalities: tuple[int, ...]  #: values of each. Length M.
+    seed: int  #: root of the seed tree it was made from
+    command: str  #: makes it again
+    data: str  #: what the frames were, in words
+    versions: dict[str, str]  #: of the libraries that made it
+    cpu_s: dict[str, float]  #: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``
+    kl_nats: float  #: KL from the prior on held-out frames, mean a frame
+    reconstruction: float  #: squared error of the decoded held-out frames, mean a pixel, in the network's own units
+    #: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a ``linear`` reader and
+    #: by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
     probe: dict[str, float]
+    #: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     code_sizes: tuple[int, ...] = ()
 
     def to_json(self) -> str:

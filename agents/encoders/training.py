@@ -42,15 +42,10 @@ _LIBRARIES = ("torch", "numpy", "mujoco")
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSet:
-    """Labelled frames, preprocessed, with 8 bits a value to quarter the memory.
+    """Labelled frames, preprocessed, with 8 bits a value to quarter the memory."""
 
-    Attributes:
-        images: Shape (N, C, H, W), uint8.
-        macrostates: Shape (N, M).
-    """
-
-    images: Tensor
-    macrostates: NDArray[np.int64]
+    images: Tensor  #: shape (N, C, H, W), uint8
+    macrostates: NDArray[np.int64]  #: shape (N, M)
 
     def batch(self, rows: Tensor) -> Tensor:
         """The images of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""

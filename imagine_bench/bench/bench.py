@@ -25,14 +25,11 @@ _SAVE_EVERY_S = 10.0
 def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders]:
     """The protocol of a bench and the encoders it uses, with everything checked that can be before anything is run.
 
-    Args:
-        task: Registered task of any type.
-        preset: Name of a protocol preset.
-        options: Fields of the type's protocol that differ from the preset's; for control tasks, ``encoder`` may be a
-            bundled name or a path.
+    ``options`` are fields of the protocol that differ from the preset's; for control tasks also ``encoder``, a bundled
+    name or a path.
 
     Raises:
-        UnknownNameError: Any name that does not exist; the message lists those that do.
+        UnknownNameError: Any name that does not exist.
         InvalidValueError: A value out of its range, or an option that tasks of this type do not take.
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
@@ -42,16 +39,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
 
 
 def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launcher) -> Result:
-    """Run what is missing of a protocol, and read all of it.
-
-    Args:
-        wanted: What is compared: a protocol of any type.
-        paths: The encoder artefacts that its agents need, by kind.
-        root: Folder of all benches.
-        launcher: Carries out the runs.
-
-    Returns:
-        The result class of the task's type.
+    """Run what is missing of a protocol, with the encoders that its agents need by kind, and read all of it.
 
     Raises:
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
@@ -69,7 +57,8 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
             _warn(store.begin_session(describe_environment()), store.folder)
             failures = _in_stages(store, paths, launcher)
             store.save_time()
-            _raise_if_any(failures, missing)
+            if failures:
+                _raise(failures, missing)
         else:
             print(f"All runs lie in {store.folder} already; nothing was run.")
             _warn(store.changed(describe_environment()), store.folder)
@@ -79,20 +68,17 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
 def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
     """Take all runs as far as the protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
+    order = store.protocol.agents  # those listed last cost most and come first of each seed, so no worker idles
     specs = [_job(store, paths, *pair, None).spec for pair in store.missing()]
     with ProgressBars(specs, _done_before(store)) as show:
         for until in store.protocol.stages:
             failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
-            pairs = _costliest_first([pair for pair in store.missing(until) if pair not in failed], store.protocol)
+            pairs = [pair for pair in store.missing(until) if pair not in failed]
+            pairs.sort(key=lambda pair: (pair[1], -order.index(pair[0])))
             jobs = [_job(store, paths, *pair, until) for pair in pairs]
             if jobs:
                 failures += launcher.launch(jobs, _saving_time(store, show))
     return failures
-
-
-def _costliest_first(pairs: Sequence[tuple[str, int]], protocol: ProtocolData) -> list[tuple[str, int]]:
-    """Seed by seed, and of each seed the agents listed last, which cost most, first: so no worker is idle for long."""
-    return sorted(pairs, key=lambda pair: (pair[1], -protocol.agents.index(pair[0])))
 
 
 def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:
@@ -136,13 +122,9 @@ def _warn(changed: Sequence[str], folder: Path) -> None:
         )
 
 
-def _raise_if_any(failures: Sequence[Failure], jobs: int) -> None:
-    if failures:
-        lines = [
-            f"  {failure.job.spec.agent} seed {failure.job.spec.seed}: {failure.reason} Log: {failure.job.log}"
-            for failure in failures
-        ]
-        raise RunFailedError(
-            f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others.\n"
-            + "\n".join(lines)
-        )
+def _raise(failures: Sequence[Failure], jobs: int) -> None:
+    lines = [f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others."]
+    for failure in failures:
+        spec = failure.job.spec
+        lines.append(f"  {spec.agent} seed {spec.seed}: {failure.reason} Log: {failure.job.log}")
+    raise RunFailedError("\n".join(lines))

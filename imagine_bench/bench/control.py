@@ -22,20 +22,10 @@ _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
 def plan_control(task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[Protocol, Encoders]:
-    """The protocol of a control bench and the encoders it uses.
+    """The protocol of a control bench and the encoders it uses; errors as of :func:`imagine_bench.bench.bench.plan`.
 
-    Args:
-        task: Registered task.
-        preset: Name of a protocol preset.
-        encoder: Bundled name or path, instead of the task's own. One that gives codes is for every agent, one that
-            gives latents for those that read latents.
-        changes: Fields of the protocol that differ from the preset's.
-
-    Raises:
-        UnknownNameError: Any name that does not exist; the message lists those that do.
-        InvalidValueError: A value out of its range, or something that an agent cannot do.
-        ArtefactError: The task has no bundled encoder at this appearance level.
-        SetupError: The device does not exist here.
+    ``encoder`` is a bundled name or a path, instead of the task's own. One that gives codes is for every agent, one
+    that gives latents for those that read latents.
     """
     wanted = protocol(task, preset, **changes)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
@@ -70,7 +60,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
     """All settings of every learner by its name, each override checked by the agents that have such a setting.
 
     Raises:
-        UnknownNameError: No agent of the protocol has it; the message lists what there is.
+        UnknownNameError: No agent of the protocol has it.
         InvalidValueError: A value of the wrong type or out of its range.
     """
     overrides = dict(wanted.overrides)
@@ -109,14 +99,6 @@ def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress)
 
 
 CONTROL = TaskType(
-    tasks=registry.TASKS,
-    learners=registry.agents,
-    draws=True,
-    protocol=Protocol,
-    presets=PRESETS,
-    plan=plan_control,
-    run=run_observed,
-    load_run=run_folder.load_run,
-    load_so_far=load_so_far,
-    result=BenchResult,
-)
+    tasks=registry.TASKS, learners=registry.agents, draws=True, protocol=Protocol, presets=PRESETS, plan=plan_control,
+    run=run_observed, load_run=run_folder.load_run, load_so_far=load_so_far, result=BenchResult,
+)  # fmt: skip

@@ -31,18 +31,10 @@ def play(
     privileged: bool,
     before_acting: Callable[[Observation, Info], None] | None = None,
 ) -> Iterator[tuple[Transition, Info]]:
-    """One episode, a real transition at a time; the agent learns nothing here.
+    """One episode, a real transition at a time, each with the ``info`` that followed it; the agent learns nothing here.
 
-    Args:
-        env: The task's environment.
-        agent: Chooses the macro-actions.
-        seed: Decides the whole episode but for the agent: the environment carries nothing over from the one before.
-        explore: Whether the agent explores.
-        privileged: Whether it is shown the macrostate.
-        before_acting: Called with what the agent sees and the ``info`` that it does not, before each macro-action.
-
-    Yields:
-        Each transition with the ``info`` that followed it.
+    ``seed`` decides the whole episode but for the agent: the environment carries nothing over from the one before.
+    Before each macro-action, ``before_acting`` is called with what the agent sees and the ``info`` that it does not.
     """
     frame, info = env.reset(seed=seed)
     before, over = observation(frame, info, privileged=privileged), False
@@ -52,17 +44,11 @@ def play(
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
         after = observation(frame, info, privileged=privileged)
-        yield (
-            Transition(
-                observation=before,
-                action=action,
-                reward=float(reward),
-                next_observation=after,
-                terminated=bool(terminated),
-                truncated=bool(truncated),
-            ),
-            info,
-        )
+        transition = Transition(
+            observation=before, action=action, reward=float(reward), next_observation=after,
+            terminated=bool(terminated), truncated=bool(truncated),
+        )  # fmt: skip
+        yield transition, info
         before, over = after, terminated or truncated
 
 
@@ -81,12 +67,7 @@ def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privi
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for.
-
-    Args:
-        env: The task's environment.
-        seed: The run's seed.
-    """
+    """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for."""
 
     def __init__(self, env: Env, seed: int) -> None:
         super().__init__(env)

@@ -19,14 +19,10 @@ from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
 from imagine_bench.protocols.task_types import task_type
 from imagine_bench.store.files import make_folder, writing
 
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
-}
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
 """Small networks are slower on two threads than on one, and bits repeat only at a fixed count."""
-_LOG = "log.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +35,7 @@ class Job:
     @property
     def log(self) -> Path:
         """Everything the run printed."""
-        return self.folder / _LOG
+        return self.folder / "log.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +63,7 @@ LAUNCHERS = {"local": "imagine_bench.bench.local:LocalPool", "ray": "imagine_ben
 
 
 def launcher(name: str, workers: int | None = None) -> Launcher:
-    """The launcher of that name.
-
-    Args:
-        name: One of :data:`LAUNCHERS`.
-        workers: Processes at a time on this machine; None for one a core.
+    """The launcher of that name, with ``workers`` processes at a time on this machine; None for one a core.
 
     Raises:
         UnknownNameError: No such launcher.
@@ -79,22 +71,17 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    made: Launcher = make(usable_cores() if workers is None else workers)
-    return made
+    return make(usable_cores() if workers is None else workers)
 
 
 class Launcher(Protocol):
     """Carries out jobs, somewhere."""
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job, whatever becomes of the others.
+        """Carry out every job, whatever becomes of the others, and return those that failed.
 
-        Args:
-            jobs: Independent of one another; each resumes by itself.
-            on_progress: Told now and then, from this process, how far each is, and at once of one that failed.
-
-        Returns:
-            The jobs that failed.
+        Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
+        process, how far each is, and at once of one that failed.
         """
 
 
@@ -104,15 +91,9 @@ def run_job(job: Job, on_progress: OnProgress) -> None:
 
 
 def carry_out(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress], None] = run_job) -> str:
-    """Carry out a job in this process, with beginning and end in its log, where all that libraries print goes too.
+    """Carry out a job in this process by ``run``; returns why it failed, or an empty string.
 
-    Args:
-        job: What to do.
-        on_progress: Told now and then how far it is.
-        run: What carries it out.
-
-    Returns:
-        Why it failed, or an empty string.
+    Beginning and end are in its log, where all that libraries print goes too.
     """
     with suppress(SetupError):  # where the log cannot be written, the run will say so
         _redirect_output(job)

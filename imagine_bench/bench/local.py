@@ -19,14 +19,7 @@ _PATIENCE_S = 5.0
 
 
 class LocalPool:
-    """Processes of this machine, each with one thread; none outlives this process, however it ends.
-
-    Args:
-        workers: Processes at a time.
-
-    Raises:
-        InvalidValueError: Fewer than one worker.
-    """
+    """``workers`` processes of this machine at a time, at least 1, each with one thread; none outlives this process."""
 
     def __init__(self, workers: int) -> None:
         require_workers(workers)

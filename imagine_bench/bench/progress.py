@@ -22,9 +22,8 @@ _LINE_EVERY_S = 15.0
 class ProgressBars(AbstractContextManager["ProgressBars"]):
     """Shows :class:`~imagine_bench.protocols.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
 
-    Args:
-        specs: The runs to come, to their ends even where they pause on the way.
-        done: How much of each run earlier sessions did, by agent and seed, as far as is known before it goes on.
+    ``specs`` are the runs to come, to their ends even where they pause on the way; ``done`` is how much of each run
+    earlier sessions did, by agent and seed, as far as is known before it goes on.
     """
 
     def __init__(
@@ -105,12 +104,9 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
 
 def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
-    """The items, and how many are done: on a terminal a bar, elsewhere a line now and then.
+    """The items, and how many of ``total`` are done: on a terminal a bar, elsewhere a line now and then.
 
-    Args:
-        items: One is done when the next is asked for.
-        what: What they are called.
-        total: How many there will be.
+    An item is done when the next is asked for; ``what`` is what they are called.
     """
     with tqdm(total=total, desc=what, leave=False, disable=not sys.stderr.isatty()) as bar:
         shown_s = time.monotonic()

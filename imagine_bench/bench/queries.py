@@ -20,11 +20,7 @@ from imagine_bench.protocols.runs import RunSpec
 
 
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
-    """Check that a learner can do what a protocol asks of it.
-
-    Raises:
-        InvalidValueError: It cannot carry anything over to the next task, cannot watch, or cannot ask.
-    """
+    """Raise InvalidValueError where a learner cannot carry over to the next task, watch or ask, as a protocol wants."""
     if protocol.demonstrations and isinstance(agent, ExternalTrainer):
         raise InvalidValueError(
             f"Agent {name!r} trains in a loop of its own and cannot watch; leave --demonstrations out, or that agent."
@@ -55,11 +51,7 @@ def as_seen(transition: Transition) -> Transition:
 
 
 class LabelOracle:
-    """Labels what actions would bring, from the rules and the true macrostate, where the rules leave no doubt.
-
-    Args:
-        rules: Of the task.
-    """
+    """Labels what actions would bring, from the rules and the true macrostate, where the rules leave no doubt."""
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
@@ -68,10 +60,8 @@ class LabelOracle:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
 
         The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
-        may happen is looked at; None where that differs in reward or end: a matter of chance has no label.
-
-        Raises:
-            InvalidValueError: No action, or one that does not exist.
+        may happen is looked at; None where that differs in reward or end: a matter of chance has no label. Raises
+        InvalidValueError: no action, or one that does not exist.
         """
         planned = [int(action) for action in actions]
         if not planned or not all(0 <= action < self._rules.n_actions for action in planned):
@@ -90,13 +80,7 @@ class LabelOracle:
 
 
 class QueryBudget:
-    """The queries of one episode: as many as are allowed, before each of the learner's macro-actions.
-
-    Args:
-        learner: The agent that asks.
-        oracle: Labels what it asks about.
-        queries: How many are allowed.
-    """
+    """The ``queries`` that ``learner`` may ask in one episode, before each of its macro-actions."""
 
     def __init__(self, learner: QueryingAgent, oracle: LabelOracle, queries: int) -> None:
         self._learner, self._oracle, self._left = learner, oracle, queries

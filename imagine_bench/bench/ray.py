@@ -27,10 +27,7 @@ _FREED_WITHIN_S = 60.0
 
 
 class RayCluster:
-    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or of one started here for the purpose.
-
-    Args:
-        workers: Tasks at a time on a cluster started here; an existing one runs as many as it has CPUs.
+    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or ``workers`` at a time of one started here for the purpose.
 
     Raises:
         InvalidValueError: Fewer than one worker.
@@ -46,10 +43,7 @@ class RayCluster:
         self._workers = workers
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job; see :class:`imagine_bench.bench.launchers.Launcher`.
-
-        Raises:
-            SetupError: There is no cluster at ``RAY_ADDRESS``, or none with the GPU that the runs ask for.
+        """Carry out every job. Raises SetupError: no cluster at ``RAY_ADDRESS``, or none with the GPU that is wanted.
         """
         import ray  # noqa: PLC0415 - as above
 

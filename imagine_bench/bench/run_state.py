@@ -40,12 +40,6 @@ def make_env(protocol: Protocol, task: str) -> Env:
 class Run:
     """A run as far as it has come: a new one, or what the newest checkpoint in its folder holds.
 
-    Args:
-        spec: What to run.
-        folder: The run's own folder.
-        on_progress: Told now and then how far it is.
-        env: The environment of its task.
-
     Raises:
         ArtefactError: The folder was begun with something else, or the encoder is not the protocol's.
         InvalidValueError: The agent cannot do what the protocol asks of it.
@@ -63,16 +57,13 @@ class Run:
         run_folder.check_config(folder, self._config())
         if self.entry.external_training_loop:
             run_folder.forget(folder)  # an earlier attempt cannot be gone on with
-        self._restore()
-        self._saved_s = self._reported_s = time.monotonic()
-
-    def _restore(self) -> None:
-        snapshot = load_newest(self.folder / "checkpoints")
+        snapshot = load_newest(folder / "checkpoints")
         if snapshot is not None:
             self.agent.restore(snapshot.agent)
             self.counters = Counters.of(snapshot)
             if self.counters.rows:  # a kill between a test's checkpoint and its table would leave the table behind
-                run_folder.write_metrics(self.folder, self.counters.rows)
+                run_folder.write_metrics(folder, self.counters.rows)
+        self._saved_s = self._reported_s = time.monotonic()
 
     def _require_its_encoder(self) -> None:
         """Refuse another file than the protocol's, such as an older one on another node, or one changed since."""
@@ -132,14 +123,8 @@ class Run:
             success: float | None = test.successes / test.episodes
         else:
             success = sum(recent) / len(recent) if recent else None
-        self._on_progress(
-            Progress(
-                agent=self.spec.agent,
-                seed=self.spec.seed,
-                phase=phase,
-                done=played + (test.episodes if test else 0),
-                work=self.spec.work,
-                episode=counters.episode,
-                success=success,
-            )
+        spec, done, episode = self.spec, played + (test.episodes if test else 0), counters.episode
+        where = Progress(
+            agent=spec.agent, seed=spec.seed, phase=phase, done=done, work=spec.work, episode=episode, success=success
         )
+        self._on_progress(where)

@@ -11,7 +11,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Protocol as Interface
 from typing import TypedDict
 
 from imagine_bench.bench import phases
@@ -39,29 +38,22 @@ class AtEnd(TypedDict, total=False):
     sampled_rollouts: tuple[ComparedRollout, ...]
 
 
-class RunObserver(Interface):
-    """Looks at a run after each test and at its end, and changes nothing in it."""
+class RunObserver:
+    """Looks at a run after each test and at its end, and changes nothing in it; this one measures nothing."""
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """Measure what was just tested."""
+        return {}
 
     def at_end(self, run: Run) -> AtEnd:
         """Measure, or record, what has been through all budgets."""
+        return {}
 
 
 def run(
     spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observers: Sequence[RunObserver] = ()
 ) -> RunResult | None:
-    """Do a run, or what is left of it, and read its result; a finished run is only read.
-
-    Args:
-        spec: What to run.
-        folder: The run's own folder.
-        on_progress: Told now and then how far it is.
-        observers: What looks at it on the way.
-
-    Returns:
-        The result, or None if the run pauses before its end.
+    """Do a run, or what is left of it, and read its result, None if it pauses before; a finished run is only read.
 
     Raises:
         BusyError: Another process is at this run.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
 from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
-from imagine_bench.cli.benches import Bench, List, Report, StudyCommand, parse_settings
+from imagine_bench.cli.benches import Bench, List, Report, Study, parse_settings
 from imagine_bench.cli.tools import Doctor, Encoder, Film, Speed, View
 from imagine_bench.errors import ImagineBenchError
 
@@ -20,20 +20,7 @@ __all__ = ["INTERRUPTED", "main", "parse_settings"]
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
-Command = (
-    Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Plan, tyro.conf.subcommand("plan")]
-    | Annotated[Generalise, tyro.conf.subcommand("generalise")]
-    | Annotated[Policy, tyro.conf.subcommand("policy")]
-    | Annotated[StudyCommand, tyro.conf.subcommand("study")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Encoder, tyro.conf.subcommand("encoder")]
-    | Annotated[Film, tyro.conf.subcommand("film")]
-    | Annotated[Speed, tyro.conf.subcommand("speed")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-)
+Command = Bench | Report | Plan | Generalise | Policy | Study | View | Encoder | Film | Speed | Doctor | List
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -60,7 +47,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader has seen enough, as `| head` does; nothing more can be said to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
-        resumes = isinstance(command, Bench | StudyCommand)
+        resumes = isinstance(command, Bench | Study)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
         print(f"imagine-bench: interrupted; the same command {then}.", file=sys.stderr)
         return INTERRUPTED

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from imagine_bench.cli.options import ANY, NEWEST
+from imagine_bench.cli.options import ANY, NEWEST, shown
 from imagine_bench.interfaces import EXECUTIONS
 
 
@@ -26,13 +26,9 @@ class Plan:
     """Plans that are recorded too; 0 for none."""
     execution: str = EXECUTIONS[0]
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
-    max_epistemic: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the agent's own filter)")
-    ] = None
+    max_epistemic: Annotated[float | None, shown("FLOAT", "(default: the agent's own filter)")] = None
     """A plan with an imagined step of more epistemic uncertainty is refused."""
-    encoder: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the run's, if bundled)")
-    ] = None
+    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the run's, if bundled)")] = None
     """The encoder the run saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
@@ -65,9 +61,7 @@ class _OfBench:
     """A bench's folder."""
     task: Annotated[str | None, ANY] = None
     """Task whose newest bench is taken."""
-    encoder: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the runs', if bundled)")
-    ] = None
+    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the runs', if bundled)")] = None
     """The encoder the runs saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""

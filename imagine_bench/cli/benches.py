@@ -13,7 +13,7 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers import LAUNCHERS, launcher
-from imagine_bench.cli.options import ANY, NEWEST, PRESETS_OWN, added_up, listed, only, require_values
+from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
@@ -41,31 +41,29 @@ class Bench:
     """Seeds; each agent has one run a seed."""
     budgets: Annotated[tuple[int, ...] | None, listed("INT")] = None
     """Real training episodes at which agents are tested, ascending."""
-    evaluation_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=PRESETS_OWN)] = None
+    evaluation_episodes: Annotated[int | None, shown("INT")] = None
     """Test episodes at each budget."""
-    execution: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: physics)")] = None
+    execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
-    appearance: Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="(default: clean)")] = None
+    appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
     """How much light, colors and poses vary: clean, mild or strong."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR")] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
-    networks: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=PRESETS_OWN)] = None
+    networks: Annotated[int | None, shown("INT")] = None
     """Of regression tasks: networks a run, each on data of its own."""
-    encoder: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME|FILE", help_behavior_hint="(default: the task's own)")
-    ] = None
+    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the task's own)")] = None
     """Another encoder: a bundled name or a .safetensors file."""
     after: Annotated[tuple[str, ...] | None, listed("STR", "(default: none)")] = None
     """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
-    after_episodes: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 100)")] = None
+    after_episodes: Annotated[int | None, shown("INT", "(default: 100)")] = None
     """Real training episodes on each of them."""
-    demonstrations: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    demonstrations: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """First training episodes that the oracle plays and learners watch; budgets count them."""
-    queries: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
     """Processes at a time."""
     launcher: str = "local"
     """Where runs are carried out: local processes, or ray (the cluster at RAY_ADDRESS, else one started here)."""
@@ -118,7 +116,7 @@ class Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyCommand:
+class Study:
     """Change one factor of a comparison at a time, on tuning seeds. The same command again goes on."""
 
     task: str
@@ -127,7 +125,7 @@ class StudyCommand:
     """Which study; 'imagine-bench list' names them."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: all)")] = ()
     """Only these variants and what they are compared with."""
-    workers: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: one a core)")] = None
+    workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
     """Processes at a time."""
     launcher: str = "local"
     """Where runs are carried out: local or ray."""
@@ -174,8 +172,7 @@ class List:
 def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
 
-    Raises:
-        InvalidValueError: A word without ``=``, or a name given twice.
+    Raises InvalidValueError: a word without ``=``, or a name given twice.
     """
     settings: dict[str, Any] = {}
     for pair in pairs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from imagine_bench.bench.run_state import Run
-from imagine_bench.bench.runner import AtBudget, AtEnd
+from imagine_bench.bench.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.capabilities import FutureSampler, Imaginer
 from imagine_bench.judge.futures import imagined_futures
 from imagine_bench.judge.imagination_quality import (
@@ -18,19 +18,7 @@ from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
 
 
-class _Observer:
-    """Measures nothing."""
-
-    def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """See :class:`imagine_bench.bench.runner.RunObserver`."""
-        return {}
-
-    def at_end(self, run: Run) -> AtEnd:
-        """See :class:`imagine_bench.bench.runner.RunObserver`."""
-        return {}
-
-
-class OpenLoopObserver(_Observer):
+class OpenLoopObserver(RunObserver):
     """Compares open-loop imagination with the rules at every budget."""
 
     def __init__(self) -> None:
@@ -54,7 +42,7 @@ class OpenLoopObserver(_Observer):
         return {"open_loop": open_loop(run.agent, self._starts, SeedTree(run.spec.seed).child("open_loop", budget))}
 
 
-class FuturesObserver(_Observer):
+class FuturesObserver(RunObserver):
     """Compares sampled futures with those that the rules allow at every budget."""
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
@@ -74,7 +62,7 @@ class FuturesObserver(_Observer):
         return {"futures": found}
 
 
-class ExamplesObserver(_Observer):
+class ExamplesObserver(RunObserver):
     """Keeps a few imagined rollouts of the agent as it is at its end."""
 
     def at_end(self, run: Run) -> AtEnd:
@@ -92,7 +80,7 @@ class ExamplesObserver(_Observer):
         }
 
 
-class RecordingObserver(_Observer):
+class RecordingObserver(RunObserver):
     """Records some greedy episodes beside the results; the file appears whole or not at all."""
 
     def at_end(self, run: Run) -> AtEnd:

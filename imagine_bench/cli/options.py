@@ -13,14 +13,19 @@ from imagine_bench.protocols.task_types import task_type
 from imagine_bench.store.bench_folder import require_either
 
 PRESETS_OWN = "(default: the preset's)"
-NONE = tyro.conf.arg(help_behavior_hint="(default: none)")
-NEWEST = tyro.conf.arg(metavar="[PATH]", help_behavior_hint="(default: the newest)")
-ANY = tyro.conf.arg(metavar="STR", help_behavior_hint="(default: any)")
+
+
+def shown(metavar: str, hint: str = PRESETS_OWN) -> Any:
+    """How an option is shown that takes a value."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
 
 
 def listed(kind: str, hint: str = PRESETS_OWN) -> Any:
     """How an option is shown that takes one or more values of a kind."""
-    return tyro.conf.arg(metavar=f"{kind} [{kind} ...]", help_behavior_hint=hint)
+    return shown(f"{kind} [{kind} ...]", hint)
+
+
+NEWEST, ANY = shown("[PATH]", "(default: the newest)"), shown("STR", "(default: any)")
 
 
 def require_values(name: str, values: Sequence[object] | None) -> None:
@@ -30,23 +35,14 @@ def require_values(name: str, values: Sequence[object] | None) -> None:
 
 
 def added_up(name: str, each: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
-    """All values of an option that may be given several times.
-
-    Raises:
-        InvalidValueError: It was given without a value.
-    """
+    """All values of an option that may be given several times, or InvalidValueError where it has none."""
     for values in each:
         require_values(name, values)
     return tuple(value for values in each for value in values)
 
 
 def only(task: str | None, given: Path | None) -> tuple[str, ...]:
-    """A task by itself, or none for any.
-
-    Raises:
-        UnknownNameError: No such task; the message lists those of every type.
-        InvalidValueError: A path was given too.
-    """
+    """A task by itself, or none for any. Raises UnknownNameError, or InvalidValueError where a path is given too."""
     require_either(given, task)
     if task is None:
         return ()

@@ -17,11 +17,9 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 from imagine_bench.regression.interfaces import Mixtures
 
-LEVELS = (0.5, 0.8, 0.95)
-"""Central intervals whose coverage is reported."""
+LEVELS = (0.5, 0.8, 0.95)  # central intervals whose coverage is reported
 _LOG_2PI = math.log(2.0 * math.pi)
-_AT_ONCE = 2**24
-"""Pairs of components, in all dimensions, that a score compares at a time: 128 MiB an array."""
+_AT_ONCE = 2**24  # pairs of components, in all dimensions, that a score compares at a time: 128 MiB an array
 
 
 def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
@@ -30,8 +28,7 @@ def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
     Mixtures of leading axes (...) and outcomes (..., D) give shape (..., D).
     """
     scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
-    below: Floats = (mixtures.weights[..., None] * special.ndtr(scaled)).sum(axis=-2)
-    return below
+    return np.asarray((mixtures.weights[..., None] * special.ndtr(scaled)).sum(axis=-2))
 
 
 def coverage(transforms: Floats, level: float) -> float:
@@ -62,10 +59,8 @@ def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
     step = max(1, _AT_ONCE // max(1, means.size))
     for start in range(0, means.shape[-2], step):
         some = slice(start, start + step)
-        between = _mean_size(
-            means[..., some, None, :] - means[..., None, :, :],
-            variances[..., some, None, :] + variances[..., None, :, :],
-        )  # [..., step, K, D]
+        apart = means[..., some, None, :] - means[..., None, :, :]  # [..., step, K, D]
+        between = _mean_size(apart, variances[..., some, None, :] + variances[..., None, :, :])
         score = score - 0.5 * np.einsum("...k,...l,...kld->...d", weights[..., some], weights, between)
     return score
 
@@ -75,21 +70,14 @@ def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
     scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas
     log_normal = (-0.5 * (scaled**2 + _LOG_2PI) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
     with np.errstate(divide="ignore"):
-        score: Floats = -special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1)
-    return score
+        return np.asarray(-special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
 
 
 def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
-    """Probability that a wrong prediction has a higher score than a right one, ties counting half.
+    """Probability, 0.5 by chance, that a wrong prediction has a higher score than a right one, ties counting half.
 
-    Area under the receiver operating characteristic (Hanley & McNeil 1982).
-
-    Args:
-        scores: Uncertainties. Shape (N,).
-        wrong: Shape (N,).
-
-    Returns:
-        In [0, 1]; 0.5 is chance. NaN where all predictions are right, or all wrong.
+    Area under the receiver operating characteristic (Hanley & McNeil 1982). Both of shape (N,); NaN where all
+    predictions are right, or all wrong.
 
     Raises:
         InvalidValueError: Shapes differ, or a score is NaN.
@@ -107,7 +95,5 @@ def _mean_size(mean: Floats, variance: Floats) -> Floats:
     """E|X| of a normal X."""
     sigma = np.sqrt(variance)
     ratio = mean / sigma
-    size: Floats = 2.0 * sigma * np.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi) + mean * (
-        2.0 * special.ndtr(ratio) - 1.0
-    )
-    return size
+    density = 2.0 * sigma * np.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi)
+    return np.asarray(density + mean * (2.0 * special.ndtr(ratio) - 1.0))

@@ -17,8 +17,7 @@ from imagine_bench.store.results import ComparedRollout
 _CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is made up
 _GAP, _SHEET_GAP, _MARGIN = 12, 14, 12
 _LABELS = 108  # width of the column that names the rows
-_HEADER, _FOOTER = 62, 92
-_ROW = _CELL + _GAP
+_HEADER, _FOOTER, _ROW = 62, 92, _CELL + _GAP
 _BOTTOM = _HEADER + 2 * _ROW
 _SHEET_HEADER, _SHEET_LINE = 36, 14
 _LINE = 20  # characters
@@ -35,15 +34,8 @@ def filmstrip(
     P(end) and epistemic uncertainty, with the true reward in brackets. A vertical line marks where the uncertainty
     filter cuts; what it discards is paler. The border of an imagined frame is blue where its macrostate is what
     the rules say and orange where it is not; the text below says the same. Where nothing real is to
-    compare with (a plan that was not carried out that far), the upper row stays empty.
-
-    Args:
-        compared: The rollout of depth D and its real counterpart, of depth D or less.
-        action_names: Names of the task's macro-actions.
-        columns: Macro-actions to make room for; None for exactly D. Deeper rollouts are shown up to there.
-
-    Returns:
-        The image. Shape (height, width, 3), uint8.
+    compare with (a plan that was not carried out that far), the upper row stays empty. There is room for ``columns``
+    macro-actions, None for all. The image has shape (height, width, 3), uint8.
     """
     depth = len(compared.rollout.actions)
     room = depth if columns is None else columns
@@ -67,14 +59,7 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
     """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
 
     Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
-    orange where not.
-
-    Args:
-        sampled_rollouts: Several rollouts from one start, at least one.
-        spec: Names macro-actions and macrostates.
-
-    Returns:
-        The image. Shape (height, width, 3), uint8.
+    orange where not. The image has shape (height, width, 3), uint8.
     """
     depth = max(len(each.rollout.actions) for each in sampled_rollouts)
     texts = [_what_changes(each, step, spec) for each in sampled_rollouts for step in range(len(each.rollout.actions))]
@@ -129,9 +114,8 @@ def is_possible(rules: Rules, before: Macrostate, action: int, now: Macrostate) 
 @functools.lru_cache
 def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which travels with matplotlib."""
-    name = f"mpl-data/fonts/ttf/DejaVuSans{'-Bold' if bold else ''}.ttf"
-    data = resources.files("matplotlib").joinpath(name).read_bytes()
-    return ImageFont.truetype(io.BytesIO(data), size)
+    file = resources.files("matplotlib") / f"mpl-data/fonts/ttf/DejaVuSans{'-Bold' if bold else ''}.ttf"
+    return ImageFont.truetype(io.BytesIO(file.read_bytes()), size)
 
 
 def _column(
@@ -156,12 +140,8 @@ def _column(
         draw.rectangle([left - 3, top - 3, left + _CELL + 2, top + _CELL + 2], outline=verdict, width=3)
     truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
     draw.text((left, _BOTTOM), words, font=font(12, bold=True), fill=verdict)
-    predictions = (
-        f"reward {_signed(rollout.rewards[index])}{truth}",
-        f"P(end) {rollout.p_terminated[index]:.2f}",
-        f"epistemic {rollout.epistemic[index]:.2g}",
-    )
-    for line, text in enumerate(predictions, start=1):
+    reward, p_end = f"reward {_signed(rollout.rewards[index])}{truth}", f"P(end) {rollout.p_terminated[index]:.2f}"
+    for line, text in enumerate((reward, p_end, f"epistemic {rollout.epistemic[index]:.2g}"), start=1):
         draw.text((left, _BOTTOM + line * 19), text, font=font(12), fill=ink)
 
 
@@ -176,8 +156,7 @@ def _sampled_cell(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, step: int, top: int, spec: TaskSpec
 ) -> None:
     rollout, left = compared.rollout, _MARGIN + (step + 1) * (_CELL + _SHEET_GAP)
-    action, now = int(rollout.actions[step]), rollout.macrostates[step]
-    before = _before(compared, step)
+    action, now, before = int(rollout.actions[step]), rollout.macrostates[step], _before(compared, step)
     title = textwrap.wrap(spec.action_names[action], width=_LINE)[:2]
     draw.multiline_text((left, top - _SHEET_HEADER), "\n".join(title), font=font(11, bold=True), fill=INK, spacing=2)
     _paste(canvas, rgb(rollout.frames[step]), (left, top))

@@ -17,34 +17,21 @@ from imagine_bench.rules import Belief, advance, by_macrostate
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import Futures
 
-DEPTH = 5
-"""Macro-actions of each future."""
-FRAMES = 4
-"""Different frames of each start among which its samples are divided."""
-MODE = 0.05
-"""Least probability of an outcome that counts as a mode."""
-MISSED = 0.2
-"""A mode is missed if it is imagined less than this times as often as it happens."""
+DEPTH = 5  # macro-actions of each future
+FRAMES = 4  # different frames of each start among which its samples are divided
+MODE = 0.05  # least probability of an outcome that counts as a mode
+MISSED = 0.2  # a mode is missed if it is imagined less than this times as often as it happens
 
 
 def imagined_futures(
-    agent: FutureSampler,
-    spec: TaskSpec,
-    *,
-    samples: int,
-    appearance: str,
-    seeds: SeedTree,
+    agent: FutureSampler, spec: TaskSpec, *, samples: int, appearance: str, seeds: SeedTree,
     purpose: Purpose = "evaluation",
-) -> Futures:
+) -> Futures:  # fmt: skip
     """Sample an agent's futures from every pair of a macrostate and a macro-action, and compare them with the rules.
 
-    Args:
-        agent: It is not changed.
-        spec: The task; its frames are the same for every agent and seed.
-        samples: Futures of each pair, at least one; rounded up to a multiple of :data:`FRAMES` where they are more.
-        appearance: Appearance level of the frames (kinematic mode).
-        seeds: Names the generator that imagination draws from.
-        purpose: What the comparison is for; tuning has frames of its own.
+    Of each pair there are ``samples`` futures, at least one; more than :data:`FRAMES` are rounded up to a multiple.
+    The frames (kinematic mode) are the same for every agent and seed; tuning has frames of its own. The agent, which
+    imagines with the generator of ``seeds``, is not changed.
     """
     rules = spec.rules
     alive = [state for state in rules.states if not rules.is_terminal(state)]
@@ -65,9 +52,7 @@ def imagined_futures(
 
 def follow_optimum(rules: Rules, macrostates: Macrostate) -> Macrostate:
     """The rules' optimal macro-action in each macrostate (N, M), or -1 where no episode goes on. Shape (N,)."""
-    known: dict[State, int] = {
-        state: rules.optimal_action(state) for state in rules.states if not rules.is_terminal(state)
-    }
+    known = {state: rules.optimal_action(state) for state in rules.states if not rules.is_terminal(state)}
     return np.array([known.get(state, -1) for state in map(tuple, macrostates.tolist())], dtype=np.int64)
 
 

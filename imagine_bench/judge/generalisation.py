@@ -23,36 +23,24 @@ from imagine_bench.seeding import Purpose, SeedTree
 
 Mask = NDArray[np.bool_]
 
-CONSEQUENCES = ("success", "failure", "the episode goes on")
-"""What may come of a transition by the rules, as far as they leave no choice between these."""
+CONSEQUENCES = ("success", "failure", "the episode goes on")  # of a transition, where the rules leave no choice
 _OFTEN = 10
+# How many real visits of a transition an agent remembers: least and most.
 VISIT_COUNTS = {
-    "never": (0, 0),
-    f"1 to {_OFTEN - 1} times": (1, _OFTEN - 1),
-    f"{_OFTEN} times or more": (_OFTEN, math.inf),
-}
-"""How many real visits of a transition an agent remembers: least and most."""
+    "never": (0, 0), f"1 to {_OFTEN - 1} times": (1, _OFTEN - 1), f"{_OFTEN} times or more": (_OFTEN, math.inf),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransitionSet:
-    """Every (macrostate, action) of a task, from one real frame each. N = macrostates x actions.
+    """Every (macrostate, action) of a task, from one real frame each. N = macrostates x actions."""
 
-    Attributes:
-        macrostates: Shape (N, M).
-        actions: Shape (N,).
-        frames: A frame of each macrostate (kinematic mode). Shape (N, 64, 64, 3).
-        terminal: Whether no episode goes on from the macrostate: the transition cannot be in any training data.
-        legal: Whether the macrostate breaks no rule. Shape (N,).
-        possible: What may come of it, by the rules. Length N.
-    """
-
-    macrostates: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    frames: Frame
-    terminal: Mask
-    legal: Mask
-    possible: tuple[tuple[Outcome, ...], ...]
+    macrostates: NDArray[np.int64]  # shape (N, M)
+    actions: NDArray[np.int64]  # shape (N,)
+    frames: Frame  # a frame of each macrostate (kinematic mode). Shape (N, 64, 64, 3).
+    terminal: Mask  # whether no episode goes on from the macrostate: the transition cannot be in any training data
+    legal: Mask  # whether the macrostate breaks no rule. Shape (N,).
+    possible: tuple[tuple[Outcome, ...], ...]  # what may come of it, by the rules. Length N.
 
     @property
     def consequences(self) -> list[str]:
@@ -67,22 +55,17 @@ class TransitionSet:
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
-    """What one agent predicts of a :class:`TransitionSet`, held against the rules. Each of shape (N,).
+    """What one agent predicts of a :class:`TransitionSet`, held against the rules. Each of shape (N,)."""
 
-    Attributes:
-        right: Whether the imagined macrostate, read by the evaluation-only probe, is one the rules allow.
-        epistemic: Epistemic uncertainty, reduced as the agent's filter does.
-        reward_error: Distance of the imagined reward from the nearest one that the rules allow, in units of reward.
-        end_right: Whether the rules allow what is imagined more likely: that the episode ends here, or that it goes on.
-        likeliest_right: As ``right``, of what the model holds likeliest instead of what it samples; None if unknown.
-        visit_count: How many real visits of the transition the agent remembers; None if unknown.
-    """
-
-    right: Mask
-    epistemic: Floats
+    right: Mask  # whether the imagined macrostate, read by the evaluation-only probe, is one the rules allow
+    epistemic: Floats  # epistemic uncertainty, reduced as the agent's filter does
+    # distance of the imagined reward from the nearest one that the rules allow, in units of reward
     reward_error: Floats
+    # whether the rules allow what is imagined more likely: that the episode ends here, or that it goes on
     end_right: Mask
+    # as ``right``, of what the model holds likeliest instead of what it samples; None if unknown
     likeliest_right: Mask | None = None
+    # how many real visits of the transition the agent remembers; None if unknown
     visit_count: NDArray[np.int64] | None = None
 
     def scores(self, part: Mask) -> Scores:
@@ -91,13 +74,8 @@ class Predictions:
         def mean(values: Mask | Floats | None) -> float:
             return math.nan if values is None or not part.any() else float(values[part].mean())
 
-        return Scores(
-            count=int(part.sum()),
-            right=mean(self.right),
-            likeliest_right=mean(self.likeliest_right),
-            end_right=mean(self.end_right),
-            reward_error=mean(self.reward_error),
-        )
+        names = ("right", "likeliest_right", "end_right", "reward_error")
+        return Scores(count=int(part.sum()), **{name: mean(getattr(self, name)) for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,23 +91,15 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class Generalisation:
-    """The scores of one agent's predictions.
+    """The scores of one agent's predictions."""
 
-    Attributes:
-        unseen: Of transitions out of terminal macrostates, which no training can contain.
-        unseen_legal: Of those of them out of legal macrostates, such as goals.
-        seen: Of all other transitions.
-        auroc: Probability that a transition out of a terminal macrostate has more epistemic uncertainty than another.
-        consequences: Of the other transitions, by those of :data:`CONSEQUENCES` that there are.
-        visit_counts: The same transitions by :data:`VISIT_COUNTS`; empty if unknown.
-    """
-
-    unseen: Scores
-    unseen_legal: Scores
-    seen: Scores
+    unseen: Scores  # of transitions out of terminal macrostates, which no training can contain
+    unseen_legal: Scores  # of those of them out of legal macrostates, such as goals
+    seen: Scores  # of all other transitions
+    # probability that a transition out of a terminal macrostate has more epistemic uncertainty than another
     auroc: float
-    consequences: dict[str, Scores]
-    visit_counts: dict[str, Scores]
+    consequences: dict[str, Scores]  # of the other transitions, by those of :data:`CONSEQUENCES` that there are
+    visit_counts: dict[str, Scores]  # the same transitions by :data:`VISIT_COUNTS`; empty if unknown
 
 
 def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> TransitionSet:
@@ -159,13 +129,7 @@ def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evalu
 
 
 def predict(agent: Imaginer, transitions: TransitionSet, seeds: SeedTree) -> Predictions:
-    """Imagine every transition, one step each, and take what else the agent can say of it.
-
-    Args:
-        agent: It is not changed.
-        transitions: What is predicted.
-        seeds: Names the generators that imagination draws from.
-    """
+    """Imagine every transition, one step each, and take what else the agent, which is not changed, can say of it."""
     pairs = enumerate(zip(transitions.frames, transitions.actions, strict=True))
     steps = [
         agent.imagine(frame, actions=np.array([action]), depth=1, rng=seeds.child(index).generator())
@@ -179,9 +143,7 @@ def predict(agent: Imaginer, transitions: TransitionSet, seeds: SeedTree) -> Pre
         right=transitions.allows([step.macrostates[0].tolist() for step in steps]),
         epistemic=np.array([float(step.epistemic[0]) for step in steps]),
         reward_error=np.array([min(abs(float(step.rewards[0]) - o.reward) for o in outs) for step, outs in imagined]),
-        end_right=np.array(
-            [bool(step.p_terminated[0] > 0.5) in {o.terminated for o in outs} for step, outs in imagined]
-        ),
+        end_right=np.array([(step.p_terminated[0] > 0.5) in {o.terminated for o in outs} for step, outs in imagined]),
         likeliest_right=None if likeliest is None else transitions.allows(likeliest),
         visit_count=_visit_count(agent, transitions),
     )

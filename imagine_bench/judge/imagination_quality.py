@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,8 @@ from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
-OPEN_LOOP_DEPTH = 10
-"""Steps of the open-loop comparison, the thesis' I_D."""
-EXAMPLES = 5
-"""Greedy imagined rollouts kept with each run, with their real counterparts."""
+OPEN_LOOP_DEPTH = 10  # steps of the open-loop comparison, the thesis' I_D
+EXAMPLES = 5  # greedy imagined rollouts kept with each run, with their real counterparts
 SAMPLED_ROLLOUTS, SAMPLED_DEPTH = 4, 5
 """Rollouts sampled from one start and kept with each run, and macro-actions of each."""
 
@@ -31,32 +30,20 @@ Alive = Callable[[frozenset[State], int], bool]
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopStart:
-    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them.
+    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them."""
 
-    Attributes:
-        frame: The real frame.
-        actions: Drawn uniformly among those that end no episode, now or by force later. Shape (D,).
-        beliefs: Probabilities of the macrostates after each action. Length D.
-        rewards: Expected reward of each action. Shape (D,).
-    """
-
-    frame: Frame
-    actions: NDArray[np.int64]
-    beliefs: tuple[dict[State, float], ...]
-    rewards: Floats
+    frame: Frame  # the real frame
+    actions: NDArray[np.int64]  # drawn uniformly among those that end no episode, now or by force later. Shape (D,).
+    beliefs: tuple[dict[State, float], ...]  # probabilities of the macrostates after each action. Length D.
+    rewards: Floats  # expected reward of each action. Shape (D,).
 
 
 def open_loop_starts(
     spec: TaskSpec, *, starts: int, depth: int, appearance: str, purpose: Purpose = "evaluation"
 ) -> tuple[OpenLoopStart, ...]:
-    """The starts of the open-loop comparison: the same for every agent and seed.
+    """The ``starts`` starts of the open-loop comparison: the same for every agent and seed; tuning has its own.
 
-    Args:
-        spec: The task.
-        starts: How many.
-        depth: Imagined steps D of each; fewer where the rules cannot be kept alive as long.
-        appearance: Appearance level of the start frames (kinematic mode).
-        purpose: What the comparison is for; tuning has starts of its own.
+    Each is imagined for ``depth`` steps D, fewer where the rules cannot be kept alive as long. Frames are kinematic.
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
     alive = _alive(spec)
@@ -75,12 +62,8 @@ def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTre
     """Imagine the macro-actions of every start in closed loop of the model and compare by depth.
 
     An imagined macrostate is correct if the rules allow it after these actions; the reward is compared with its
-    expectation. The rules keep every rollout alive: any predicted termination is wrong.
-
-    Args:
-        agent: It is not changed.
-        starts: At least one, all of the same depth D.
-        seeds: Names the generators that imagination draws from.
+    expectation. The rules keep every rollout alive: any predicted termination is wrong. There is at least one start,
+    all have the same depth D; the agent, which draws from the generators of ``seeds``, is not changed.
     """
     rollouts = [
         agent.imagine(start.frame, actions=start.actions, depth=len(start.actions), rng=seeds.child(index).generator())
@@ -126,12 +109,8 @@ def examples(
 ) -> tuple[ComparedRollout, ...]:
     """A handful of rollouts that the greedy controller chooses, each from a start of its own, beside reality.
 
-    Args:
-        agent: It is not changed.
-        spec: The task; the starts are the same for every agent and seed.
-        appearance: Appearance level of the real frames (kinematic mode).
-        seeds: Names the generators that imagination draws from.
-        purpose: What the starts are drawn for.
+    The starts are the same for every agent and seed, the real frames kinematic. The agent, which draws from the
+    generators of ``seeds``, is not changed.
     """
     starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
@@ -163,46 +142,26 @@ def sampled_rollouts_from(
 
 
 def _greedy_rollouts(
-    agent: Imaginer,
-    spec: TaskSpec,
-    frames: Iterable[Frame],
-    states: Iterable[Macrostate],
-    appearance: str,
-    seeds: SeedTree,
-    rng: np.random.Generator,
-    *,
-    depth: int,
-) -> tuple[ComparedRollout, ...]:
+    agent: Imaginer, spec: TaskSpec, frames: Iterable[Frame], states: Iterable[Macrostate], appearance: str,
+    seeds: SeedTree, rng: np.random.Generator, *, depth: int,
+) -> tuple[ComparedRollout, ...]:  # fmt: skip
     found = []
     for index, (frame, state) in enumerate(zip(frames, states, strict=True)):
         rollout = agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator())
-        found.append(
-            compare_rollout(spec, frame=frame, macrostate=state, rollout=rollout, appearance=appearance, rng=rng)
-        )
+        start: dict[str, Any] = {"frame": frame, "macrostate": state, "rollout": rollout}
+        found.append(compare_rollout(spec, **start, appearance=appearance, rng=rng))
     return tuple(found)
 
 
 def compare_rollout(
-    spec: TaskSpec,
-    *,
-    frame: Frame,
-    macrostate: Macrostate,
-    rollout: ImaginedRollout,
-    appearance: str,
+    spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, rollout: ImaginedRollout, appearance: str,
     rng: np.random.Generator,
-) -> ComparedRollout:
-    """Put the truth beside an imagined rollout: the rules give states and rewards, the kinematic mode gives frames.
+) -> ComparedRollout:  # fmt: skip
+    """Put the truth beside a rollout imagined from ``frame``, which shows ``macrostate`` (M,).
 
-    Where the rules leave several outcomes to chance, the one that was imagined is taken if it is among them.
+    The rules give states and rewards, the kinematic mode gives frames. Where the rules leave several outcomes to
+    chance, the one that was imagined is taken if it is among them, else ``rng`` draws.
     Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
-
-    Args:
-        spec: The task.
-        frame: The real frame the rollout starts from.
-        macrostate: What that frame shows. Shape (M,).
-        rollout: What the agent imagined from it, of depth D.
-        appearance: Appearance level of the real frames.
-        rng: Draws among stochastic outcomes, and the appearance.
     """
     state = tuple(int(value) for value in macrostate)
     over = spec.rules.is_terminal(state)
@@ -219,12 +178,9 @@ def compare_rollout(
 
 
 def beside_reality(
-    rollout: ImaginedRollout,
-    frame: Frame,
-    macrostate: Sequence[int] | Macrostate,
-    frames: Sequence[Frame] | Frame,
+    rollout: ImaginedRollout, frame: Frame, macrostate: Sequence[int] | Macrostate, frames: Sequence[Frame] | Frame,
     real: Sequence[tuple[State, float, bool]],
-) -> ComparedRollout:
+) -> ComparedRollout:  # fmt: skip
     """An imagined rollout from a ``frame`` that shows ``macrostate``, and what really came of it.
 
     ``frames`` and ``real`` (macrostate, reward, whether the episode has ended) have an entry for each macro-action

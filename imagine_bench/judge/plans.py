@@ -26,31 +26,18 @@ from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
-OnStep = Callable[[int], None]
-"""Told after each macro-action how many of the plan are done."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """One plan and what became of it.
+    """One plan and what became of it."""
 
-    Attributes:
-        number: Its start, from 0; the same for every agent.
-        start: The macrostate it starts from.
-        compared: What was imagined beside what the camera then saw, cut where the episode ended.
-        refused: Why it was not carried out, or an empty string.
-        solved: Whether the task was solved when the plan was done.
-        shortest: The fewest macro-actions that can solve it from there, by the rules.
-        faults: Macro-actions whose physics disagreed with the rules.
-    """
-
-    number: int
-    start: State
-    compared: ComparedRollout
-    refused: str
-    solved: bool
-    shortest: int
-    faults: int
+    number: int  # its start, from 0; the same for every agent
+    start: State  # the macrostate it starts from
+    compared: ComparedRollout  # what was imagined beside what the camera then saw, cut where the episode ended
+    refused: str  # why it was not carried out, or an empty string
+    solved: bool  # whether the task was solved when the plan was done
+    shortest: int  # the fewest macro-actions that can solve it from there, by the rules
+    faults: int  # macro-actions whose physics disagreed with the rules
 
     @property
     def length(self) -> int:
@@ -70,8 +57,8 @@ class Plan:
     @property
     def as_imagined(self) -> NDArray[np.bool_]:
         """Whether each macro-action that was carried out led where it was imagined to. Shape (done,)."""
-        read = self.compared.rollout.macrostates[: self.done]
-        return np.asarray((read == self.compared.real_macrostates[: self.done]).all(axis=-1), dtype=np.bool_)
+        read, real = self.compared.rollout.macrostates, self.compared.real_macrostates
+        return np.asarray((read[: self.done] == real[: self.done]).all(axis=-1), dtype=np.bool_)
 
     @property
     def outcome(self) -> str:
@@ -89,13 +76,8 @@ def make_plans(trained: Trained, *, count: int, execution: str, max_epistemic: f
     """Plan from ``count`` starts and carry each plan out.
 
     The starts have seeds of their own, the same for every agent: no run ever trained, tested or tuned on them.
-
-    Args:
-        trained: An agent that imagines; it is not changed.
-        count: Plans.
-        execution: ``"physics"`` or ``"kinematic"``.
-        max_epistemic: A plan with an imagined step of more epistemic uncertainty is refused, reduced as the agent's
-            filter does; None leaves the verdict to the agent's own filter, if it has one.
+    A plan with an imagined step of more epistemic uncertainty than ``max_epistemic``, reduced as the agent's filter
+    does, is refused; None leaves the verdict to that filter. The agent is not changed.
 
     Raises:
         InvalidValueError: Fewer than one plan, or an agent that does not imagine.
@@ -120,7 +102,7 @@ def carry_out(
     number: int,
     *,
     max_epistemic: float | None = None,
-    on_step: OnStep | None = None,
+    on_step: Callable[[int], None] | None = None,  # told after each macro-action how many of the plan are done
     on_plan: Callable[[Frame, ImaginedRollout], None] | None = None,
 ) -> Plan:
     """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
@@ -136,8 +118,7 @@ def carry_out(
         seen, reward, terminated, truncated, info = env.step(int(action))
         frames.append(seen)
         real.append((_state(info), float(reward), bool(terminated)))
-        faults += bool(info["fault"])
-        solved = bool(info["is_success"])
+        faults, solved = faults + bool(info["fault"]), bool(info["is_success"])
         if on_step is not None:
             on_step(step)
         if terminated or truncated:
@@ -167,11 +148,11 @@ def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
             return ""
         step = int((epistemic > max_epistemic).argmax())
         return f"epistemic uncertainty {epistemic[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
-    if not rollout.accepted.all():
-        step = int((~rollout.accepted).argmax())
-        why = f"epistemic uncertainty of the state {epistemic[step]:.2g}"
-        return f"the agent's filter discards macro-action {step + 1} ({why})"
-    return ""
+    if rollout.accepted.all():
+        return ""
+    step = int((~rollout.accepted).argmax())
+    why = f"epistemic uncertainty of the state {epistemic[step]:.2g}"
+    return f"the agent's filter discards macro-action {step + 1} ({why})"
 
 
 def _state(info: dict[str, Any]) -> State:

@@ -19,42 +19,27 @@ from imagine_bench.interfaces import Agent, Floats, Frame, Observation, TaskSpec
 from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
 from imagine_bench.seeding import Purpose, SeedTree
 
-FRAMES = 16
-"""Frames of a macrostate, F."""
-_PATIENCE = 1_000
-"""Macro-actions after which a termination is taken for one that never comes."""
+FRAMES = 16  # frames of a macrostate, F
+_PATIENCE = 1_000  # macro-actions after which a termination is taken for one that never comes
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalStates:
-    """Every macrostate of a task that is not terminal, N of them, and what it looks like.
+    """Every macrostate of a task that is not terminal, N of them, and what it looks like."""
 
-    Attributes:
-        macrostates: Shape (N, M).
-        frames: Of each of them, kinematic mode. Shape (N, F, 64, 64, 3).
-    """
-
-    macrostates: NDArray[np.int64]
-    frames: Frame
+    macrostates: NDArray[np.int64]  # shape (N, M)
+    frames: Frame  # of each of them, kinematic mode. Shape (N, F, 64, 64, 3).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Terminations:
-    """How episodes of one agent terminate by the rules, from each of the S start macrostates. Each of shape (S,).
+    """How episodes of one agent terminate by the rules, from each of the S start macrostates. Each of shape (S,)."""
 
-    Attributes:
-        success: Probability of a success within the horizon.
-        failure: Probability of another termination within the horizon.
-        late_success: Probability of a success after the horizon, if episodes went on there.
-        late_failure: Probability of another termination after it.
-        length: Expected macro-actions within the horizon.
-    """
-
-    success: Floats
-    failure: Floats
-    late_success: Floats
-    late_failure: Floats
-    length: Floats
+    success: Floats  # probability of a success within the horizon
+    failure: Floats  # probability of another termination within the horizon
+    late_success: Floats  # probability of a success after the horizon, if episodes went on there
+    late_failure: Floats  # probability of another termination after it
+    length: Floats  # expected macro-actions within the horizon
 
     @property
     def endless(self) -> Floats:
@@ -91,13 +76,7 @@ def optimal_length(spec: TaskSpec) -> Floats:
 
 
 def terminations(spec: TaskSpec, states: EvalStates, policy: Floats) -> Terminations:
-    """Follow a policy from every start, by the rules.
-
-    Args:
-        spec: The task.
-        states: All macrostates that are not terminal.
-        policy: Probability of each macro-action in each of them. Shape (A, N).
-    """
+    """Follow a policy from every start, by the rules: probabilities (A, N) in the N macrostates not terminal."""
     tables = tabulate(spec.rules)
     everywhere = np.full(tables.reward.shape, 1.0 / len(policy))  # anything, where episodes have ended
     everywhere[:, [tables.index[tuple(state)] for state in states.macrostates.tolist()]] = policy

@@ -18,49 +18,42 @@ _AFTER_EPISODES = 100
 _FIRST_STAGE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
 
+_NONE_ALLOWED = ("demonstrations", "queries", "open_loop_starts", "sampled_futures", "recorded_episodes")
+_LEAST = {"evaluation_episodes": 1, "after_episodes": 1, **dict.fromkeys(_NONE_ALLOWED, 0)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(ProtocolData):
-    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others.
+    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others."""
 
-    Attributes:
-        settings: Config group of the agents' settings, as the task names it.
-        hyperparameters: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
-        budgets: Real training episodes at which the agent is evaluated, ascending.
-        evaluation_episodes: Greedy test episodes at each budget, the same starts for every agent.
-        execution: ``"physics"`` or ``"kinematic"``.
-        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
-        open_loop_starts: Real frames from which open-loop imagination is compared with the rules at each budget.
-        sampled_futures: Futures imagined from each macrostate of play and macro-action, and compared with the rules'
-            distribution at each budget; 0 asks for none.
-        recorded_episodes: Real episodes in each recording; 0 records none.
-        encoder: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
-        codes: That of the encoder for the agents that see codes of parts; None if there is no such agent.
-        after: Tasks of the same world that learners are trained on before, in this order; what they know of the
-            world is carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
-        after_episodes: Real training episodes on each of them.
-        demonstrations: Training episodes, the first ones, that the bench's demonstrator plays while learners merely
-            observe; they are real episodes as any, and budgets count them.
-        queries: Most oracle queries of a learner in a training episode.
-    """
-
-    settings: str = "chapter_5"
+    settings: str = "chapter_5"  #: Config group of the agents' settings, as the task names it
+    #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
     seeds: tuple[int, ...] = (0, 1, 2)
+    #: Real training episodes at which the agent is evaluated, ascending.
     budgets: tuple[int, ...] = (100, 250, 500)
-    evaluation_episodes: int = 200
-    execution: str = "physics"
-    appearance: str = "clean"
+    evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
+    execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
+    appearance: str = "clean"  #: ``"clean"``, ``"mild"`` or ``"strong"``
+    #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
+    #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
+    #: budget; 0 asks for none.
     sampled_futures: int = 16
-    recorded_episodes: int = 5
+    recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
+    #: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
     encoder: str | None = None
+    #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
+    #: Tasks of the same world that learners are trained on before, in this order; what they know of the world is
+    #: carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
     after: tuple[str, ...] = ()
-    after_episodes: int = _AFTER_EPISODES
+    after_episodes: int = _AFTER_EPISODES  #: Real training episodes on each of them
+    #: Training episodes, the first ones, that the bench's demonstrator plays while learners merely observe; they are
+    #: real episodes as any, and budgets count them.
     demonstrations: int = 0
-    queries: int = 0
+    queries: int = 0  #: Most oracle queries of a learner in a training episode
 
     def __post_init__(self) -> None:
         task_entry(self.task)
@@ -72,18 +65,14 @@ class Protocol(ProtocolData):
         require_ascending("budgets", self.budgets, at_least=1)
         require_seeds(self.seeds)
         require_different("agents", self.agents)
-        if self.evaluation_episodes < 1:
-            raise InvalidValueError(f"evaluation_episodes is {self.evaluation_episodes}; give at least 1.")
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least {least}.")
         require_same_world(self.task, self.after)
-        if self.after_episodes < 1:
-            raise InvalidValueError(f"after_episodes is {self.after_episodes}; give at least 1.")
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(
                 f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
             )
-        for name in ("demonstrations", "queries", "open_loop_starts", "sampled_futures", "recorded_episodes"):
-            if getattr(self, name) < 0:
-                raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least 0.")
 
     def work(self, agent: str, until: int | None = None) -> int:
         """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
@@ -108,47 +97,28 @@ class Protocol(ProtocolData):
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
-        "hyperparameters": "minimal",
-        "seeds": (0,),
-        "budgets": (10, 20),
-        "evaluation_episodes": 20,
-        "open_loop_starts": 20,
-        "sampled_futures": 4,
-        "recorded_episodes": 2,
+        "hyperparameters": "minimal", "seeds": (0,), "budgets": (10, 20), "evaluation_episodes": 20,
+        "open_loop_starts": 20, "sampled_futures": 4, "recorded_episodes": 2,
     },
     "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
-        "hyperparameters": "published",
-        "agents": _THESIS_AGENTS,
-        "seeds": tuple(range(5)),
-        "budgets": _THESIS_BUDGETS,
-        "evaluation_episodes": 1000,
+        "hyperparameters": "published", "agents": _THESIS_AGENTS, "seeds": tuple(range(5)),
+        "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
     },
     "full": {
-        "hyperparameters": "published",
-        "agents": _ALL_AGENTS,
-        "seeds": tuple(range(20)),
-        "budgets": _THESIS_BUDGETS,
-        "evaluation_episodes": 1000,
+        "hyperparameters": "published", "agents": _ALL_AGENTS, "seeds": tuple(range(20)),
+        "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
     },
     "sample_efficiency": {
-        "agents": ("factored",),
-        "seeds": tuple(range(5)),
-        "budgets": tuple(range(20, 201, 20)),
-        "evaluation_episodes": 1000,
-        "recorded_episodes": 2,
+        "agents": ("factored",), "seeds": tuple(range(5)), "budgets": tuple(range(20, 201, 20)),
+        "evaluation_episodes": 1000, "recorded_episodes": 2,
     },
     "queries": {
-        "agents": ("factored",),
-        "seeds": tuple(range(5)),
-        "budgets": (10, 20, 30, 40, 60, 80, 100),
-        "evaluation_episodes": 100,
-        "execution": "kinematic",
-        "open_loop_starts": 0,
-        "sampled_futures": 0,
-        "recorded_episodes": 0,
+        "agents": ("factored",), "seeds": tuple(range(5)), "budgets": (10, 20, 30, 40, 60, 80, 100),
+        "evaluation_episodes": 100, "execution": "kinematic",
+        "open_loop_starts": 0, "sampled_futures": 0, "recorded_episodes": 0,
     },
-}
+}  # fmt: skip
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
 thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``queries`` does so

@@ -20,32 +20,24 @@ def digest(values: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolData:
-    """A comparison, completely specified by JSON-like values.
+    """A comparison, completely specified by JSON-like values."""
 
-    Attributes:
-        task: Registered task.
-        preset: Name of this protocol.
-        agents: Registered agents or regressors, in the order of the report.
-        seeds: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing
-            settings and are tested on starts that no reported run meets; the two kinds never mix.
-        overrides: Settings that replace those of the hyper-parameter set, as sorted (dotted name, value) pairs.
-        settings_digest: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one
-            tomorrow, and what was run with it is then another bench. Empty in a protocol that no plan made.
-        device: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it.
-    """
-
-    task: str
-    preset: str
-    agents: tuple[str, ...]
+    task: str  #: Registered task
+    preset: str  #: Name of this protocol
+    agents: tuple[str, ...]  #: Registered agents or regressors, in the order of the report
+    #: One training run a seed and agent; each in [0, 2**24). Seeds from TUNING_SEEDS on are for choosing settings and
+    #: are tested on starts that no reported run meets; the two kinds never mix.
     seeds: tuple[int, ...]
+    #: Settings that replace those of the hyper-parameter set, as sorted (dotted name, value) pairs.
     overrides: tuple[tuple[str, Any], ...] = ()
+    #: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one tomorrow, and what was
+    #: run with it is then another bench. Empty in a protocol that no plan made.
     settings_digest: str = ""
-    device: str = "cpu"
+    device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
 
     def as_dict(self) -> dict[str, Any]:
         """A JSON-serialisable copy."""
-        values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
-        return values
+        return json.loads(json.dumps(dataclasses.asdict(self)))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

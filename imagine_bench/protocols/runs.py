@@ -19,23 +19,14 @@ Phase = Literal["training", "training in the model", "testing", "imagining", "re
 
 @dataclass(frozen=True, kw_only=True)
 class RunSpec(Generic[P_co]):
-    """What one run is.
+    """What one run is."""
 
-    Attributes:
-        protocol: The comparison it belongs to.
-        agent: Registered agent or regressor.
-        seed: One of the protocol's seeds.
-        encoder: The encoder artefact, or None if the agent needs none.
-        until: Budget after which it pauses, or None to the end.
-        checkpoint_every_s: Seconds of work that a kill may cost.
-    """
-
-    protocol: P_co
-    agent: str
-    seed: int
-    encoder: Path | None = None
-    until: int | None = None
-    checkpoint_every_s: float = 20.0
+    protocol: P_co  #: The comparison it belongs to
+    agent: str  #: Registered agent or regressor
+    seed: int  #: One of the protocol's seeds
+    encoder: Path | None = None  #: The encoder artefact, or None if the agent needs none
+    until: int | None = None  #: Budget after which it pauses, or None to the end
+    checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
 
     @property
     def work(self) -> int:
@@ -61,26 +52,17 @@ class RunSpec(Generic[P_co]):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a run is.
+    """How far a run is."""
 
-    Attributes:
-        agent: Registered agent.
-        seed: The run's seed.
-        phase: What it is doing.
-        done: Episodes played, for training and for tests.
-        work: Episodes to play.
-        episode: Training episodes done.
-        success: Share of successes among recent training episodes, or in the running test; None before the first.
-        detail: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
-    """
-
-    agent: str
-    seed: int
-    phase: Phase
-    done: int
-    work: int
-    episode: int = 0
+    agent: str  #: Registered agent
+    seed: int  #: The run's seed
+    phase: Phase  #: What it is doing
+    done: int  #: Episodes played, for training and for tests
+    work: int  #: Episodes to play
+    episode: int = 0  #: Training episodes done
+    #: Share of successes among recent training episodes, or in the running test; None before the first.
     success: float | None = None
+    #: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
     detail: str | None = None
 
 

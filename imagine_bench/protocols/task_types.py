@@ -17,7 +17,7 @@ from typing import Protocol as Interface
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import OnProgress, P_co, RunSpec
+from imagine_bench.protocols.runs import OnProgress, RunSpec
 
 P = TypeVar("P", bound=ProtocolData)
 Encoders = Mapping[str, Path]
@@ -28,28 +28,12 @@ class FinishedRun(Interface):
     """What runs of every type leave."""
 
     @property
-    def agent(self) -> str:
-        """Registered agent or regressor."""
-
-    @property
-    def seed(self) -> int:
-        """The run's seed."""
-
-    @property
-    def folder(self) -> Path:
-        """Where the run's files lie."""
-
-    @property
     def recording(self) -> Path | None:
         """Its Rerun recording, or None."""
 
 
 class Result(Interface):
-    """What benches of every type measured."""
-
-    @property
-    def protocol(self) -> ProtocolData:
-        """What was compared."""
+    """What benches of every type measured: one run an agent and seed, in a folder."""
 
     @property
     def runs(self) -> Sequence[FinishedRun]:
@@ -60,40 +44,21 @@ class Result(Interface):
         """Where the bench's files lie."""
 
 
-class Plan(Interface[P_co]):
-    """Makes the protocol of a bench, with everything checked that can be before anything is run."""
-
-    def __call__(self, task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[P_co, Encoders]:
-        """The protocol of a preset, with ``changes`` to single fields, and the encoders it needs."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TaskType(Generic[P]):
-    """What a type of task brings along.
+    """What a type of task brings along."""
 
-    Attributes:
-        tasks: Its registered tasks.
-        learners: Gives its agents or regressors, by name.
-        draws: Whether its runs need OpenGL.
-        protocol: The class of its protocols.
-        presets: What each protocol preset changes, by name.
-        plan: Makes a protocol.
-        run: Carries out a run in a folder.
-        load_run: Reads a finished run folder.
-        load_so_far: Reads a bench folder, as far as it can be reported.
-        result: Class of a finished bench.
-    """
-
-    tasks: Mapping[str, object]
-    learners: Callable[[], Mapping[str, object]]
-    draws: bool
-    protocol: type[P]
-    presets: Mapping[str, Mapping[str, Any]]
-    plan: Plan[P]
-    run: Callable[[RunSpec[P], Path, OnProgress], object]
-    load_run: Callable[[Path], FinishedRun]
-    load_so_far: Callable[[Path], Result]
-    result: Callable[..., Result]
+    tasks: Mapping[str, object]  #: Its registered tasks
+    learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
+    draws: bool  #: Whether its runs need OpenGL
+    protocol: type[P]  #: The class of its protocols
+    presets: Mapping[str, Mapping[str, Any]]  #: What each protocol preset changes, by name
+    #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
+    plan: Callable[..., tuple[P, Encoders]]
+    run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
+    load_run: Callable[[Path], FinishedRun]  #: Reads a finished run folder
+    load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported
+    result: Callable[..., Result]  #: Class of a finished bench
 
 
 @functools.cache
@@ -103,11 +68,7 @@ def task_types() -> dict[str, TaskType[ProtocolData]]:
 
 
 def task_type(task: str) -> TaskType[ProtocolData]:
-    """The type of a registered task.
-
-    Raises:
-        UnknownNameError: No such task; the message lists those of every type.
-    """
+    """The type of a registered task. Raises UnknownNameError: no such task."""
     for kind in task_types().values():
         if task in kind.tasks:
             return kind

@@ -8,39 +8,27 @@ from numpy.typing import NDArray
 
 from imagine_bench.recording.scene import ROOT
 
-_CAMERA_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])
-"""Beside the human's hand, across the table from the arm: neither hides the objects."""
+_CAMERA_FROM_TARGET_M = np.array([0.62, -0.62, 0.52])  # beside the human's hand: no arm hides the objects from there
 
 
 def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
     """The 3D scene, seen from beside the human's hand."""
-    return rrb.Spatial3DView(
-        origin=ROOT,
-        name="The scene: the arm acts, a human gestures",
-        eye_controls=rrb.EyeControls3D(
-            position=target_m + _CAMERA_FROM_TARGET_M, look_target=target_m, eye_up=[0.0, 0.0, 1.0]
-        ),
-        background=[214, 222, 230],
-        line_grid=False,
-    )
+    eye = rrb.EyeControls3D(position=target_m + _CAMERA_FROM_TARGET_M, look_target=target_m, eye_up=[0.0, 0.0, 1.0])
+    name = "The scene: the arm acts, a human gestures"
+    return rrb.Spatial3DView(origin=ROOT, name=name, eye_controls=eye, background=[214, 222, 230], line_grid=False)
 
 
 def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool) -> rrb.Blueprint:
     """The layout: the scene large, beside it what the agent sees and predicts, below it what it imagines.
 
-    Args:
-        target_m: What the 3D view looks at. Shape (3,).
-        values: Whether the agent has Q-values.
-        imagines: Whether the agent imagines.
-        several: Whether it imagines several rollouts from each frame.
+    ``target_m`` (3,) is what the 3D view looks at; ``several`` rollouts may be imagined from each frame.
     """
-    scene = scene_view(target_m)
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
     text = rrb.TextDocumentView(origin="/real/text", name="What happens")
     side: list[rrb.Container | rrb.View] = [rrb.Horizontal(text, frame)]
     if values:
         side.append(rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action"))
-    top = rrb.Horizontal(scene, rrb.Vertical(*side), column_shares=[1.1, 1.0])
+    top = rrb.Horizontal(scene_view(target_m), rrb.Vertical(*side), column_shares=[1.1, 1.0])
     pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
     if imagines:
         pages = [_imagined_now(), *([_sampled_rollouts()] if several else []), *pages, _by_depth()]
@@ -59,24 +47,16 @@ def playing(layout: rrb.Container) -> rrb.Blueprint:
 
 
 def _imagined_now() -> rrb.Horizontal:
-    strip = rrb.Spatial2DView(
-        origin="/imagined/filmstrip",
-        name="The agent's own plan from here: what would really happen (above), what it imagines (below)",
-        background=[255, 255, 255],
-    )
-    bars = rrb.BarChartView(
-        origin="/imagined/uncertainty",
-        name="Uncertainty by depth: epistemic pink, aleatoric blue, modal green",
-        plot_legend=rrb.PlotLegend(visible=False),
-    )
+    name = "The agent's own plan from here: what would really happen (above), what it imagines (below)"
+    strip = rrb.Spatial2DView(origin="/imagined/filmstrip", name=name, background=[255, 255, 255])
+    name, hidden = "Uncertainty by depth: epistemic pink, aleatoric blue, modal green", rrb.PlotLegend(visible=False)
+    bars = rrb.BarChartView(origin="/imagined/uncertainty", name=name, plot_legend=hidden)
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
 
 
 def _sampled_rollouts() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
-        origin="/imagined/sampled_rollouts",
-        name="Several futures from the current frame",
-        background=[255, 255, 255],
+        origin="/imagined/sampled_rollouts", name="Several futures from the current frame", background=[255, 255, 255]
     )
 
 

@@ -29,8 +29,7 @@ from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 
 MOTION_HZ = 20.0
-IMAGINED_DEPTH = 6
-"""Macro-actions imagined at each step; as many as a strip shows legibly."""
+IMAGINED_DEPTH = 6  # macro-actions imagined at each step; as many as a strip shows legibly
 _STILL_S = 1.5
 _BAR_CELLS = 16
 _KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}
@@ -41,18 +40,8 @@ def record_run(
 ) -> Path:
     """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
 
-    Args:
-        task: Registered task.
-        agent: The agent; recording changes nothing in it.
-        name: Its registered name.
-        seed: The run's seed; the episodes' seeds follow from it and are used for nothing else.
-        execution: ``"physics"`` or ``"kinematic"``.
-        appearance: Appearance level.
-        episodes: Real episodes.
-        path: The file to write, ending in ``.rrd``. Until it is complete it is called ``<stem>.partial.rrd``.
-
-    Returns:
-        ``path``.
+    Nothing changes in the agent, registered as ``name``. The episodes' seeds follow from the run's and are used for
+    nothing else. ``path``, which is returned, ends in ``.rrd``; until complete it is called ``<stem>.partial.rrd``.
 
     Raises:
         UnknownNameError: Unknown task, agent, execution or appearance.
@@ -66,12 +55,9 @@ def record_run(
         if isinstance(scene, SceneReader):
             scene.capture_motion_hz = MOTION_HZ
         env.reset(seed=episode_seed("recording", seed, 1))
-        layout = blueprint(
-            target_m=look_target_m(scene),
-            values=isinstance(agent, ValueReader),
-            imagines=isinstance(agent, Imaginer),
-            several=isinstance(agent, Imaginer) and is_random(spec.rules),
-        )
+        values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
+        several = imagines and is_random(spec.rules)
+        layout = blueprint(target_m=look_target_m(scene), values=values, imagines=imagines, several=several)
         with recording_file(path, task, layout) as recording:
             recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
             if isinstance(scene, SceneReader):
@@ -84,12 +70,9 @@ def record_run(
 
 
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
-    """Q-values as Markdown: a monospaced row each with a bar from the lowest value to the highest.
+    """Q-values (A,) as Markdown: a monospaced row each with a bar from the lowest value to the highest.
 
-    Args:
-        names: Macro-actions. Length A.
-        values: Their values. Shape (A,).
-        chosen: The one that is carried out, marked by an arrow head.
+    The one of index ``chosen``, which is carried out, is marked by an arrow head.
     """
     low, high = float(values.min()), float(values.max())
     width = max(len(name) for name in names)
@@ -101,16 +84,7 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
 
 
 class _EpisodeRecorder:
-    """Records one episode after the other on a common clock.
-
-    Args:
-        recording: Where to.
-        spec: The task.
-        agent: Whose episodes.
-        appearance: Appearance level of the real counterparts of imagined frames.
-        privileged: Whether the agent is shown the macrostate.
-        seed: The run's seed.
-    """
+    """Records one episode after the other on a common clock; ``privileged`` agents are shown the macrostate."""
 
     def __init__(
         self, recording: Recording, spec: TaskSpec, agent: Agent, appearance: str, *, privileged: bool, seed: int
@@ -150,9 +124,7 @@ class _EpisodeRecorder:
         """A new real frame: set the clocks, show it and how the scene stands."""
         self._env_step += 1
         sequences = {"env_step": self._env_step, "episode": episode}
-        self._recording.stream.set_time("sim_time", duration=self._clock_s)
-        for name, value in sequences.items():
-            self._recording.stream.set_time(name, sequence=value)
+        self._recording.set_clocks(self._clock_s, **sequences)
         self._recording.log("/real/frame", rr.Image(frame))
         if isinstance(scene, SceneReader):
             if self._env_step == 0:
@@ -190,16 +162,13 @@ class _EpisodeRecorder:
         spec, seeds = self._spec, SeedTree(self._seed)
         rng = seeds.child("recording", episode, step).generator()
         rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
-        compared = compare_rollout(
-            spec, frame=frame, macrostate=macrostate, rollout=rollout, appearance=self._appearance, rng=rng
-        )
+        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "appearance": self._appearance}
+        compared = compare_rollout(spec, **seen, rollout=rollout, rng=rng)
         self._recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
         self._uncertainty_bars(compared)
         if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
-            sampled = sampled_rollouts_from(
-                self._agent, spec, frame=frame, macrostate=macrostate, appearance=self._appearance,
-                seeds=seeds.child("sampled_rollouts", episode, step),
-            )  # fmt: skip
+            branch = seeds.child("sampled_rollouts", episode, step)
+            sampled = sampled_rollouts_from(self._agent, spec, **seen, seeds=branch)
             self._recording.sheet("/imagined/sampled_rollouts", sampled_filmstrips(sampled, spec))
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
@@ -209,8 +178,7 @@ class _EpisodeRecorder:
         for index, (kind, color) in enumerate(_KINDS.items()):
             imagined = np.asarray(getattr(compared.rollout, kind), dtype=np.float64)
             values = np.pad(imagined, (0, IMAGINED_DEPTH - len(imagined)))
-            places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
-            widths = np.full(len(values), 0.25)
+            places, widths = 1.0 + np.arange(len(values)) + 0.27 * (index - 1), np.full(len(values), 0.25)
             bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
             self._recording.log(f"/imagined/uncertainty/{kind}", bars)
 

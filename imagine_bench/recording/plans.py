@@ -26,19 +26,13 @@ from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 from imagine_bench.store.trained import Trained
 
-_LOOK_S = 2.0
-"""How long the scene stands still while the plan is shown, before and after the arm moves."""
+_LOOK_S = 2.0  # how long the scene stands still while the plan is shown, before and after the arm moves
 
 
 def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None, path: Path) -> Path:
     """Record the first ``count`` plans of :func:`imagine_bench.judge.plans.make_plans`, carried out once more.
 
-    Args:
-        trained: An agent that imagines.
-        count: Plans.
-        execution: ``"physics"`` or ``"kinematic"``.
-        max_epistemic: As for the plans themselves.
-        path: The file to write, ending in ``.rrd``.
+    ``path``, which is returned, ends in ``.rrd``.
     """
     make_folder(path.parent)
     with closing(make_env(trained, execution)) as env:
@@ -59,13 +53,9 @@ class _PlanRecorder:
     """Records one plan after the other on a common clock."""
 
     def __init__(
-        self,
-        recording: Recording,
-        trained: Trained,
-        env: gymnasium.Env[Any, Any],
-        count: int,
+        self, recording: Recording, trained: Trained, env: gymnasium.Env[Any, Any], count: int,
         max_epistemic: float | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._recording, self._trained, self._env = recording, trained, env
         self._count, self._max_epistemic = count, max_epistemic
         self._clock_s, self._env_step, self._number = 0.0, 0, 0
@@ -91,21 +81,16 @@ class _PlanRecorder:
             self._env, self._trained, number, max_epistemic=self._max_epistemic, on_step=on_step, on_plan=on_plan
         )
         for done, (clock_s, env_step) in enumerate(moments):
-            self._set_clocks(clock_s, env_step)
+            self._recording.set_clocks(clock_s, env_step=env_step)
             self._show(plan, done)
         self._clock_s += _LOOK_S
         self._env_step += 1
 
-    def _set_clocks(self, clock_s: float, env_step: int) -> None:
-        self._recording.stream.set_time("sim_time", duration=clock_s)
-        self._recording.stream.set_time("env_step", sequence=env_step)
-
     def _arrive(self, *, only_moved: bool) -> None:
         scene: Any = self._env.unwrapped
-        self._set_clocks(self._clock_s, self._env_step)
+        self._recording.set_clocks(self._clock_s, env_step=self._env_step)
         if isinstance(scene, SceneReader):
-            sequences = {"env_step": self._env_step, "plan": self._number}
-            motion = scene.motion()
+            sequences, motion = {"env_step": self._env_step, "plan": self._number}, scene.motion()
             log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
 
     def _show(self, plan: Plan, done: int) -> None:
@@ -116,9 +101,8 @@ class _PlanRecorder:
         recording.log("/real/frame", rr.Image(real))
         recording.log("/imagined/frame", rr.Image(rgb(imagined)))
         task = self._trained.task  # room for the longest plan: the viewer takes no images of different sizes
-        recording.sheet(
-            "/imagined/filmstrip", filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
-        )
+        strip = filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
+        recording.sheet("/imagined/filmstrip", strip)
         recording.text("/real/text", self._words(plan, done))
 
     def _words(self, plan: Plan, done: int) -> str:
@@ -127,10 +111,9 @@ class _PlanRecorder:
         for step, action in enumerate(plan.compared.rollout.actions, start=1):
             mark = "done" if step <= done else ("**now**" if step == done + 1 and done < plan.done else "")
             lines.append(f"{step}. {names[int(action)]} {mark}")
-        last = done == plan.done
         if plan.refused:
             lines += ["", f"**Refused:** {plan.refused}."]
-        elif last:
+        elif done == plan.done:
             lines += ["", f"**{plan.outcome[0].upper()}{plan.outcome[1:]}.** The shortest possible: {plan.shortest}."]
         else:
             lines += ["", "The arm does this without looking again."]

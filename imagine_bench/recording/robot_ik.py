@@ -15,12 +15,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from imagine_bench.interfaces import Floats
 from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.regression.interfaces import RegressionSpec
 
-CHOICES = 6
-"""Decisions of the first network that are shown: the first ones, not the best."""
+CHOICES = 6  # decisions of the first network that are shown: the first ones, not the best
 _HZ, _STILL_S, _LOOK_S = 25.0, 1.5, 1.0
 _SURE, _UNSURE = np.array([0, 158, 115]), np.array([213, 94, 0])  # Okabe-Ito green and vermilion
 _CHOSEN, _ERROR, _OUTSIDE = (0, 90, 200), (200, 30, 60), (120, 120, 120)
@@ -32,14 +32,7 @@ def record(
 ) -> Path:
     """Record the first choices of the first network that learned from the last variant.
 
-    Args:
-        evaluations: What was measured, by variant.
-        task: The task, with its scene.
-        name: The regressor.
-        path: The file to write, ending in ``.rrd``.
-
-    Returns:
-        ``path``.
+    ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``.
     """
     assert task.scene is not None, "this recorder needs a scene"
     scene, variant = task.scene(), list(evaluations)[-1]
@@ -51,7 +44,7 @@ def record(
             number = choice + 1
             points, scores = (data[f"decision/{key}"][0, choice] for key in ("points", "epistemic"))
             chosen = int(scores.argmin())
-            _at(recording, clock_s, number)
+            recording.set_clocks(clock_s, choice=number)
             _show_candidates(recording, data, points, scores, chosen)
             _describe(recording, name, variant, data, choice, chosen, arrived=False)
             motion = scene.movement(data["decision/joints"][0, choice, chosen], _HZ)
@@ -59,7 +52,7 @@ def record(
             log_motion(recording, still, end_s=clock_s, sequences={"choice": number}, only_moved=False)
             clock_s += _LOOK_S + float(motion.time_s[-1])
             log_motion(recording, motion, end_s=clock_s, sequences={"choice": number}, only_moved=False)
-            _at(recording, clock_s, number)
+            recording.set_clocks(clock_s, choice=number)
             _show_error(recording, data["decision/reached"][0, choice, chosen], points[chosen])
             error_m = float(data["decision/error"][0, choice, chosen])
             recording.scalar("/choice/error", error_m)
@@ -81,22 +74,13 @@ def _layout(variant: str) -> rrb.Blueprint:
     return rrb.Blueprint(layout, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
 
 
-def _at(recording: Recording, clock_s: float, number: int) -> None:
-    recording.stream.set_time("sim_time", duration=clock_s)
-    recording.stream.set_time("choice", sequence=number)
-
-
-def _lifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lifted(points: Floats) -> Floats:
     """Places in the plane as places above the table."""
     return np.concatenate([points, np.full((*points.shape[:-1], 1), _HEIGHT_M)], axis=-1)
 
 
 def _show_candidates(
-    recording: Recording,
-    data: Mapping[str, NDArray[Any]],
-    points: NDArray[np.float64],
-    scores: NDArray[np.float64],
-    chosen: int,
+    recording: Recording, data: Mapping[str, NDArray[Any]], points: Floats, scores: Floats, chosen: int
 ) -> None:
     ranks = scores.argsort().argsort() / (len(scores) - 1)  # 0 the surest
     colors = (_SURE + ranks[:, None] * (_UNSURE - _SURE)).astype(np.uint8)
@@ -107,13 +91,12 @@ def _show_candidates(
     outside_m = data["map/outside_m"]
     in_view = (outside_m < 0.2) & (data["map/points"][:, 0] > 0)
     far = int(np.where(in_view, outside_m, 0).argmax())
-    label = f"unreachable: {outside_m[far]:.2f} m outside"
-    place = _lifted(data["map/points"][far])
+    label, place = f"unreachable: {outside_m[far]:.2f} m outside", _lifted(data["map/points"][far])
     recording.log("/choice/outside", rr.Points3D(place, colors=_OUTSIDE, radii=0.022, labels=label))
     recording.clear("/choice/error_line")
 
 
-def _show_error(recording: Recording, tip_m: NDArray[np.float64], target_m: NDArray[np.float64]) -> None:
+def _show_error(recording: Recording, tip_m: Floats, target_m: Floats) -> None:
     """A line from where the tip came to rest to where it should be."""
     line = _lifted(np.stack([tip_m, target_m]))
     recording.log("/choice/error_line", rr.LineStrips3D([line], colors=_ERROR, radii=0.009))
@@ -123,8 +106,7 @@ def _describe(
     recording: Recording, name: str, variant: str, data: Mapping[str, NDArray[Any]], choice: int, chosen: int,
     *, arrived: bool,
 ) -> None:  # fmt: skip
-    error = data["decision/error"][0, choice]
-    scores = data["decision/epistemic"][0, choice]
+    error, scores = data["decision/error"][0, choice], data["decision/epistemic"][0, choice]
     words = [
         f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint angles "
         "lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it reaches for "

@@ -15,10 +15,7 @@ from imagine_bench.interfaces import Motion, SceneReader, Shape3D
 from imagine_bench.recording.stream import Recording
 
 ROOT = "/scene"
-_STILL_M = 1e-6
-"""Bodies whose poses change by less (metres; quaternion components) during a macro-action get no new transforms."""
-
-
+_STILL_M = 1e-6  # bodies whose poses (metres; quaternions) change by less in a macro-action get no new transforms
 _BACKDROP_M = 2.0
 _SMALL_M = 0.07
 _KINEMATIC_STEP_S = 1.0
@@ -26,9 +23,7 @@ _KINEMATIC_STEP_S = 1.0
 
 def extent_m(shape: Shape3D) -> float:
     """Roughly how far a shape reaches from its origin along its longest axis, in metres."""
-    if shape.vertices is not None:
-        return float(np.abs(shape.vertices).max())
-    return float(shape.size.max())
+    return float(shape.size.max() if shape.vertices is None else np.abs(shape.vertices).max())
 
 
 def entity_name(words: str) -> str:
@@ -54,14 +49,10 @@ def log_shapes(recording: Recording, shapes: Sequence[Shape3D]) -> None:
 def log_motion(
     recording: Recording, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool
 ) -> None:
-    """Log the bodies' poses over one macro-action.
+    """Log the bodies' poses over one macro-action, but for those that stood still where ``only_moved``.
 
-    Args:
-        recording: Where to.
-        motion: K samples; a single one is how the scene stands, and logged whole.
-        end_s: When it was over on the timeline ``sim_time``, in seconds.
-        sequences: Values of the sequence timelines, the same for all samples.
-        only_moved: Leave out bodies that stood still.
+    A motion of one sample is how the scene stands, and logged whole. It was over at ``end_s`` on the timeline
+    ``sim_time``, in seconds; ``sequences`` are values of the sequence timelines, the same for all samples.
     """
     only_moved = only_moved and len(motion.time_s) > 1
     times = [rr.TimeColumn("sim_time", duration=end_s - motion.time_s[-1] + motion.time_s)]
@@ -76,9 +67,7 @@ def log_motion(
 
 def macro_duration_s(scene: Any) -> float:
     """How long the latest macro-action took, in simulated seconds; a kinematic one takes none and is given one."""
-    motion: Motion | None = scene.motion() if isinstance(scene, SceneReader) else None
-    length_s = 0.0 if motion is None else float(motion.time_s[-1])
-    return length_s or _KINEMATIC_STEP_S
+    return (float(scene.motion().time_s[-1]) if isinstance(scene, SceneReader) else 0.0) or _KINEMATIC_STEP_S
 
 
 def look_target_m(scene: Any) -> NDArray[np.float64]:
@@ -89,8 +78,7 @@ def look_target_m(scene: Any) -> NDArray[np.float64]:
     large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
     small = [index for index, body in enumerate(motion.body_names) if body not in large]
     chosen = small or list(range(len(motion.body_names)))
-    places: NDArray[np.float64] = motion.poses_in_world[0, chosen, :3]
-    return places.mean(axis=0)
+    return np.asarray(motion.poses_in_world[0, chosen, :3].mean(axis=0))
 
 
 def _drawable(shape: Shape3D) -> rr.AsComponents:
@@ -132,8 +120,7 @@ def _rotate(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) 
     """Rotate vectors (..., 3) by a unit quaternion (w, x, y, z)."""
     w, axis = quaternion_wxyz[0], quaternion_wxyz[1:]
     twice = 2.0 * np.cross(axis, vectors)
-    rotated: NDArray[np.float64] = vectors + w * twice + np.cross(axis, twice)
-    return rotated
+    return np.asarray(vectors + w * twice + np.cross(axis, twice))
 
 
 def _xyzw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

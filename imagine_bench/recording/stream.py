@@ -19,11 +19,7 @@ from imagine_bench.judge.filmstrips import png
 
 
 class Recording:
-    """A Rerun stream, with a short way to log what is logged often; a component that does not fit is an error.
-
-    Args:
-        stream: Where to.
-    """
+    """A Rerun stream, with a short way to log what is logged often; a component that does not fit is an error."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self.stream = stream
@@ -31,6 +27,12 @@ class Recording:
     def log(self, path: str, component: rr.AsComponents, *, static: bool = False) -> None:
         """Log a component for an entity, now or for all times."""
         self.stream.log(path, component, static=static, strict=True)
+
+    def set_clocks(self, sim_time_s: float, **sequences: int) -> None:
+        """Set the timeline ``sim_time`` in seconds, and sequence timelines."""
+        self.stream.set_time("sim_time", duration=sim_time_s)
+        for name, value in sequences.items():
+            self.stream.set_time(name, sequence=value)
 
     def scalar(self, path: str, value: float) -> None:
         """Log one value of a curve."""

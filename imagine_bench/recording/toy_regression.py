@@ -14,14 +14,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from imagine_bench.interfaces import Floats
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.regression.interfaces import RegressionSpec
 
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
 _PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (150, 150, 150), (190, 190, 196)
 _SHOWN = (-30, 40)
-_TICKS = 100
-"""Steps of the timeline per unit of x: a timeline counts whole numbers."""
+_TICKS = 100  # steps of the timeline per unit of x: a timeline counts whole numbers
 _TIMELINE = "x_hundredths"
 
 
@@ -30,27 +30,18 @@ def record(
 ) -> Path:
     """Record the first network of every variant: data, predictions, each uncertainty beside its true value.
 
-    Args:
-        evaluations: What was measured, by variant.
-        task: The task.
-        name: The regressor.
-        path: The file to write, ending in ``.rrd``.
-
-    Returns:
-        ``path``.
+    ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``.
     """
     with recording_file(path, task.id, _layout(list(evaluations), name)) as recording:
         for variant, data in evaluations.items():
-            x = data["x"]
-            order = data["training_x"].argsort()
+            x, order = data["x"], data["training_x"].argsort()
             dots = {"training": (data["training_x"][order], data["training_y"][order], _TRAINING)}
             dots["prediction"] = (x, data["prediction"][0], _PREDICTION)
             for dot, (places, values, color) in dots.items():
                 look = rr.SeriesPoints(colors=color, marker_sizes=1.5)
                 _curve(recording, f"/{variant}/y/{dot}", look, places, values)
             for kind, color in _KINDS.items():
-                known = data[f"true_{kind}"]
-                truth = known if known.ndim == 1 else known[0]
+                truth = np.atleast_2d(data[f"true_{kind}"])[0]
                 for line, variance, shade in (("estimated", data[kind][0], color), ("true", truth, _TRUE)):
                     _curve(recording, f"/{variant}/{kind}/{line}", rr.SeriesLines(colors=shade), x, np.sqrt(variance))
     return path
@@ -74,9 +65,7 @@ def _layout(variants: list[str], name: str) -> rrb.Blueprint:
     return rrb.Blueprint(rrb.Horizontal(*columns), *panels, rrb.TimePanel(state="collapsed", timeline=_TIMELINE))
 
 
-def _curve(
-    recording: Recording, path: str, look: rr.AsComponents, x: NDArray[np.float64], y: NDArray[np.float64]
-) -> None:
+def _curve(recording: Recording, path: str, look: rr.AsComponents, x: Floats, y: Floats) -> None:
     recording.log(path, look, static=True)
     times = rr.TimeColumn(_TIMELINE, sequence=np.round(x * _TICKS).astype(np.int64))
     recording.stream.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=y), strict=True)

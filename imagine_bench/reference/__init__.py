@@ -1,6 +1,7 @@
 """The results of the thesis, as data: one JSON file a task, every figure with its table or section.
 
-The files keep the thesis' own units (percent, metres); :func:`success` and :func:`gain` give shares, as the bench does.
+The files keep the thesis' own units (percent, metres); the functions give shares, as the bench does, and raise
+UnknownNameError for a task that the thesis does not have.
 """
 
 from __future__ import annotations
@@ -23,54 +24,31 @@ def load(name: str) -> dict[str, Any]:
         UnknownNameError: The thesis has no such task.
     """
     require_known("thesis reference", name, NAMES)
-    text = resources.files(__name__).joinpath(f"{name}.json").read_text(encoding="utf-8")
-    data: dict[str, Any] = json.loads(text)
-    return data
+    return dict(json.loads(resources.files(__name__).joinpath(f"{name}.json").read_text(encoding="utf-8")))
 
 
 def success(task_reference: str, agent: str) -> dict[int, tuple[float, float]]:
     """Success shares of one agent (tables 5.1 and 5.3, section 3.2.3): real episodes to (mean, standard deviation).
 
-    Shares lie in [0, 1]; a standard deviation that the thesis does not give is NaN.
-
-    Args:
-        task_reference: One of :data:`NAMES`.
-        agent: Registered agent. One that the thesis did not test gives an empty dict.
-
-    Raises:
-        UnknownNameError: The thesis has no such task.
+    Shares lie in [0, 1]; a standard deviation that the thesis does not give is NaN. An agent that it did not test gives
+    an empty dict.
     """
     rows = load(task_reference).get("success", {}).get("agents", {}).get(agent, {})
-    return {
-        int(episodes): (mean / 100.0, math.nan if std is None else std / 100.0)
-        for episodes, (mean, std) in rows.items()
-    }
+    return {int(n): (mean / 100.0, math.nan if std is None else std / 100.0) for n, (mean, std) in rows.items()}
 
 
 def success_source(task_reference: str) -> str:
-    """Where in the thesis :func:`success` stands, and over what; empty where it gives no success.
-
-    Raises:
-        UnknownNameError: The thesis has no such task.
-    """
+    """Where in the thesis :func:`success` stands, and over what; empty where it gives no success."""
     return str(load(task_reference).get("success", {}).get("source", ""))
 
 
 def gain(task_reference: str, agent: str) -> dict[int, float]:
-    """Gains over DQN in tables 5.2 and 5.4: real episodes to (P_aug - P_base) / P_base.
-
-    Raises:
-        UnknownNameError: The thesis has no such task.
-    """
+    """Gains over DQN in tables 5.2 and 5.4: real episodes to (P_aug - P_base) / P_base."""
     rows = load(task_reference).get("gain", {}).get("agents", {}).get(agent, {})
     return {int(episodes): percent / 100.0 for episodes, percent in rows.items()}
 
 
 def random_success(task_reference: str) -> float | None:
-    """The success share the thesis measured for its random agent, in [0, 1], or None where it did not.
-
-    Raises:
-        UnknownNameError: The thesis has no such task.
-    """
+    """The success share the thesis measured for its random agent, in [0, 1], or None where it did not."""
     row = load(task_reference).get("random_agent")
     return None if row is None else float(row["success"]) / 100.0

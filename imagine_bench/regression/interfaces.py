@@ -21,30 +21,19 @@ from imagine_bench.seeding import SeedTree
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """Pairs to learn from or to be tested on.
+    """Pairs to learn from or to be tested on."""
 
-    Attributes:
-        inputs: Shape (N, X).
-        targets: Shape (N, D).
-    """
-
-    inputs: Floats
-    targets: Floats
+    inputs: Floats  #: shape (N, X)
+    targets: Floats  #: shape (N, D)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixtures:
-    """Gaussian mixtures with diagonal components.
+    """Gaussian mixtures with diagonal components."""
 
-    Attributes:
-        weights: Each row sums to 1. Shape (..., K).
-        means: Shape (..., K, D).
-        sigmas: Standard deviations, above 0. Shape (..., K, D).
-    """
-
-    weights: Floats
-    means: Floats
-    sigmas: Floats
+    weights: Floats  #: each row sums to 1. Shape (..., K).
+    means: Floats  #: shape (..., K, D)
+    sigmas: Floats  #: standard deviations, above 0. Shape (..., K, D).
 
     def map(self, change: Callable[[Floats], Floats]) -> Mixtures:
         """The mixtures with each array changed alike, in their leading axes."""
@@ -53,30 +42,19 @@ class Mixtures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """What E networks predict, and how uncertain they are.
+    """What E networks predict, and how uncertain they are."""
 
-    Attributes:
-        prediction: One value sampled from the predictive mixture. Shape (E, N, D).
-        mean: Mean over the weight samples. Shape (E, N, D).
-        epistemic: Variance of the mean over weight samples (equation 4.25). Shape (E, N, D).
-        aleatoric: Mean variance of the components (equation 4.26). Shape (E, N, D).
-        modal: Mean spread of the components (equation 4.27). Shape (E, N, D).
-        stationarity: Jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
-        sampled_variance: Variance of the component that the prediction was sampled from, noise and weights together,
-            summed over the outputs. Shape (E, N).
-        nll: Negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
-        predictive: The mixture that predictions are sampled from. Leading axes (E, N).
-    """
-
-    prediction: Floats
-    mean: Floats
-    epistemic: Floats
-    aleatoric: Floats
-    modal: Floats
-    stationarity: Floats
+    prediction: Floats  #: one value sampled from the predictive mixture. Shape (E, N, D).
+    mean: Floats  #: mean over the weight samples. Shape (E, N, D).
+    epistemic: Floats  #: variance of the mean over weight samples (equation 4.25). Shape (E, N, D).
+    aleatoric: Floats  #: mean variance of the components (equation 4.26). Shape (E, N, D).
+    modal: Floats  #: mean spread of the components (equation 4.27). Shape (E, N, D).
+    stationarity: Floats  #: jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
+    #: Variance of the component that the prediction was sampled from, noise and weights together, summed over the
+    #: outputs. Shape (E, N).
     sampled_variance: Floats
-    nll: Floats
-    predictive: Mixtures
+    nll: Floats  #: negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
+    predictive: Mixtures  #: the mixture that predictions are sampled from. Leading axes (E, N).
 
 
 SCORES: dict[str, Callable[[Prediction], Floats]] = {
@@ -137,21 +115,13 @@ class Regressor(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RegressorContext:
-    """What a regressor is built from.
+    """What a regressor is built from."""
 
-    Attributes:
-        datasets: One a network, all of the same size. Length E.
-        seeds: One node of the seed tree a network. Length E.
-        hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
-        overrides: Single settings that replace the set's.
-        device: ``"cpu"`` or ``"cuda"``.
-    """
-
-    datasets: tuple[Dataset, ...]
-    seeds: tuple[SeedTree, ...]
-    hyperparameters: str = "fast"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    device: str = "cpu"
+    datasets: tuple[Dataset, ...]  #: one a network, all of the same size. Length E.
+    seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
+    hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
+    overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
+    device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``
 
 
 Predict = Callable[[Floats, str], Prediction]
@@ -184,38 +154,23 @@ class MovingScene(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionSpec:
-    """Everything the bench needs to know of a regression task. Building one is cheap.
+    """Everything the bench needs to know of a regression task. Building one is cheap."""
 
-    Attributes:
-        id: Registry name.
-        title: A few words for headings.
-        description: Two sentences for a reader of the report.
-        variants: The variants of the thesis, in its order.
-        require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
-        training: Data of a variant, drawn from a generator.
-        testing: The given number of rows of the same process, never trained on.
-        errors: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
-        error_name: What ``errors`` gives, with its unit.
-        wrong_above: Above this error a prediction counts as wrong.
-        evaluate: The task's own measurements.
-        sections: ``"module:attr"`` of the function that turns them into sections of the report.
-        recorder: ``"module:attr"`` of the function that records them, or None.
-        scene: Gives the robot that carries out predictions, where there is one.
-        reference: Name of the thesis' tables, or None.
-    """
-
-    id: str
-    title: str
-    description: str
-    variants: tuple[str, ...]
+    id: str  #: registry name
+    title: str  #: A few words for headings
+    description: str  #: two sentences for a reader of the report
+    variants: tuple[str, ...]  #: the variants of the thesis, in its order
+    #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
     require_variant: Callable[[str], None]
-    training: Callable[[str, np.random.Generator], Dataset]
+    training: Callable[[str, np.random.Generator], Dataset]  #: data of a variant, drawn from a generator
+    #: The given number of rows of the same process, never trained on.
     testing: Callable[[str, np.random.Generator, int], Dataset]
+    #: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
     errors: Callable[[str, Floats, Floats], Floats]
-    error_name: str
-    wrong_above: float
-    evaluate: Evaluate
-    sections: str
-    recorder: str | None = None
-    scene: Callable[[], MovingScene] | None = None
-    reference: str | None = None
+    error_name: str  #: what ``errors`` gives, with its unit
+    wrong_above: float  #: above this error a prediction counts as wrong
+    evaluate: Evaluate  #: the task's own measurements
+    sections: str  #: ``"module:attr"`` of the function that turns them into sections of the report
+    recorder: str | None = None  #: ``"module:attr"`` of the function that records them, or None
+    scene: Callable[[], MovingScene] | None = None  #: gives the robot that carries out predictions, where there is one
+    reference: str | None = None  #: name of the thesis' tables, or None

@@ -21,34 +21,21 @@ class RegressionProtocol(ProtocolData):
 
     A run is one regressor and one seed: it trains ``networks`` networks on every variant, each on data of its own, as
     one batched computation, and that is why they share a run.
-
-    Attributes:
-        task: Registered regression task.
-        preset: Name of this protocol.
-        hyperparameters: Set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``.
-        variants: Variants of the task, in the order of the report; the task's own where none are given.
-        agents: Registered regressors, in the order of the report.
-        seeds: One run a seed and regressor; each in [0, 2**24).
-        networks: Networks a run and variant, each on data drawn for it.
-        test_points: Unseen points of each network, for errors and calibration.
-        recorded: Whether runs leave a recording.
-        overrides: Settings that replace the preset's, as sorted (name, value) pairs.
-        settings_digest: As of :class:`imagine_bench.protocols.data.ProtocolData`.
-        device: ``"cpu"`` or ``"cuda"``.
     """
 
-    task: str
-    preset: str
-    hyperparameters: str = "fast"
+    task: str  #: registered regression task
+    preset: str  #: name of this protocol
+    hyperparameters: str = "fast"  #: set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``
+    #: Variants of the task, in the order of the report; the task's own where none are given.
     variants: tuple[str, ...] = ()
-    agents: tuple[str, ...] = ("mc_dropout", "ensemble")
-    seeds: tuple[int, ...] = (0,)
-    networks: int = 3
-    test_points: int = 500
-    recorded: bool = True
-    overrides: tuple[tuple[str, Any], ...] = ()
-    settings_digest: str = ""
-    device: str = "cpu"
+    agents: tuple[str, ...] = ("mc_dropout", "ensemble")  #: registered regressors, in the order of the report
+    seeds: tuple[int, ...] = (0,)  #: one run a seed and regressor; each in [0, 2**24)
+    networks: int = 3  #: networks a run and variant, each on data drawn for it
+    test_points: int = 500  #: unseen points of each network, for errors and calibration
+    recorded: bool = True  #: whether runs leave a recording
+    overrides: tuple[tuple[str, Any], ...] = ()  #: settings that replace the preset's, as sorted (name, value) pairs
+    settings_digest: str = ""  #: as of :class:`imagine_bench.protocols.data.ProtocolData`
+    device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``
 
     def __post_init__(self) -> None:
         spec = registry.regression(self.task)

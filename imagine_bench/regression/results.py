@@ -25,25 +25,16 @@ Row = dict[str, float | str]
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionRun:
-    """One finished run.
+    """One finished run."""
 
-    Attributes:
-        agent: Registered regressor.
-        seed: The run's seed.
-        settings: The regressor's settings as run.
-        rows: One a variant and network.
-        evaluations: The task's own measurements by variant, and under ``calibration/`` those of calibration.
-        folder: Where the run's files lie.
-        recording: Its Rerun recording, or None.
-    """
-
-    agent: str
-    seed: int
-    settings: Mapping[str, Any]
-    rows: tuple[Row, ...]
+    agent: str  #: registered regressor
+    seed: int  #: the run's seed
+    settings: Mapping[str, Any]  #: the regressor's settings as run
+    rows: tuple[Row, ...]  #: one a variant and network
+    #: The task's own measurements by variant, and under ``calibration/`` those of calibration.
     evaluations: Mapping[str, Arrays]
-    folder: Path
-    recording: Path | None
+    folder: Path  #: where the run's files lie
+    recording: Path | None  #: its Rerun recording, or None
 
     def values(self, variant: str, name: str) -> NDArray[np.float64]:
         """One measure of every network of a variant. Shape (E,)."""

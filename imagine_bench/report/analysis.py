@@ -41,9 +41,7 @@ class Measured(Generic[Value]):
 class Groups(dict[tuple[str, int], list[Value]]):
     """The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these.
 
-    Args:
-        runs: Every run.
-        name: Of the analysis; the intervals are drawn from a generator of its own.
+    Intervals are drawn from a generator of the analysis' own, by its ``name``.
     """
 
     def __init__(self, runs: Sequence[Measured[Value]], name: str) -> None:
@@ -68,13 +66,7 @@ class Groups(dict[tuple[str, int], list[Value]]):
 
 
 class Analysis(ABC, Generic[Value]):
-    """One analysis of a task's agents; a bench's folder keeps it as ``<name>/``.
-
-    Args:
-        spec: The task.
-        appearance: Appearance level of the frames (kinematic mode).
-        purpose: What it is for; tuning has frames of its own.
-    """
+    """One analysis of a task's agents, on kinematic frames; a bench's folder keeps it as ``<name>/``."""
 
     name: ClassVar[str]
     heading: ClassVar[str]
@@ -124,17 +116,8 @@ def analyse(
 ) -> str:
     """Measure every learner of a bench, and leave the analysis in its folder.
 
-    An unfinished bench will do: every run is measured as its last checkpoint left it.
-
-    Args:
-        analysis: Which one.
-        folder: A bench's folder; None for the newest.
-        root: Folder of all benches.
-        task: Whose newest bench; None for that of any task.
-        encoder: See :func:`imagine_bench.store.trained.load_trained`.
-
-    Returns:
-        What to print.
+    An unfinished bench will do: every run is measured as its last checkpoint left it. The bench is as in
+    :func:`chosen`, the ``encoder`` as in :func:`imagine_bench.store.trained.load_trained`. Returns what to print.
 
     Raises:
         ImagineBenchError: No bench, or none with an agent that can be taken up again and has something to measure.

@@ -13,8 +13,7 @@ from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
-BASE_AGENT = "dqn"
-"""What gains are measured against, as in the thesis."""
+BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 
 _SUMMARY_COLUMNS = (
     *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
@@ -25,59 +24,36 @@ _SUMMARY_COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Success of one agent at one budget, as shares in [0, 1].
+    """Success of one agent at one budget, as shares in [0, 1]."""
 
-    Attributes:
-        value: Interquartile mean over the seeds.
-        low: Lower end of the 95 % interval.
-        high: Upper end.
-        over: What the interval covers: ``"seeds"``, or ``"episodes"`` where there is one seed only.
-        by_seed: Success of each seed, in the protocol's order.
-        thesis: (mean, standard deviation) of the thesis at this budget, or None.
-    """
-
-    value: float
-    low: float
-    high: float
-    over: str
-    by_seed: tuple[float, ...]
-    thesis: tuple[float, float] | None
+    value: float  # interquartile mean over the seeds
+    low: float  # lower end of the 95 % interval
+    high: float  # upper end
+    over: str  # what the interval covers: ``"seeds"``, or ``"episodes"`` where there is one seed only
+    by_seed: tuple[float, ...]  # success of each seed, in the protocol's order
+    thesis: tuple[float, float] | None  # (mean, standard deviation) of the thesis at this budget, or None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """An agent against DQN at one budget; NaN ends where one seed allows no interval.
+    """An agent against DQN at one budget; NaN ends where one seed allows no interval."""
 
-    Attributes:
-        difference: Difference of the interquartile means of the success shares, with its 95 % interval.
-        gain: (P_aug - P_base) / P_base of the means over seeds, with its interval.
-        thesis_gain: The thesis' gain at this budget, or None.
-    """
-
+    # difference of the interquartile means of the success shares, with its 95 % interval
     difference: statistics.Estimate
-    gain: statistics.Estimate
-    thesis_gain: float | None
+    gain: statistics.Estimate  # (P_aug - P_base) / P_base of the means over seeds, with its interval
+    thesis_gain: float | None  # the thesis' gain at this budget, or None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Means over an agent's runs.
+    """Means over an agent's runs."""
 
-    Attributes:
-        train_cpu_s: CPU seconds of training in one run.
-        learner_cpu_s: Those the agent itself reports for learning and imagining; NaN where it reports none.
-        eval_cpu_s: CPU seconds of all evaluations of one run.
-        env_steps: Real training macro-actions of one run.
-        test_steps: Test macro-actions of all runs.
-        faults: Those whose physics disagreed with the rules.
-    """
-
-    train_cpu_s: float
-    learner_cpu_s: float
-    eval_cpu_s: float
-    env_steps: float
-    test_steps: int
-    faults: int
+    train_cpu_s: float  # CPU seconds of training in one run
+    learner_cpu_s: float  # those the agent itself reports for learning and imagining; NaN where it reports none
+    eval_cpu_s: float  # CPU seconds of all evaluations of one run
+    env_steps: float  # real training macro-actions of one run
+    test_steps: int  # test macro-actions of all runs
+    faults: int  # those whose physics disagreed with the rules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,32 +61,21 @@ class FuturesSummary:
     """Sampled futures against the rules, means over all pairs of macrostate and macro-action and over seeds.
 
     Arrays have shape (D,), index d for macro-action d + 1, at the last budget.
-
-    Attributes:
-        pairs: Macrostates of play times macro-actions.
-        samples: Futures of each pair.
-        total_variation: Distance of imagined and exact distributions of macrostates.
-        where_random: The same over the pairs after which several macrostates are possible; the others dilute it.
-        while_alive: The same where the episode goes on until this macro-action, weighted by how likely that is.
-        floor: What as many samples of the exact distribution would show (sampling noise).
-        missed: Possible outcomes that are not imagined, all pairs together.
-        hallucinated: Imagined outcomes that are impossible, all pairs together.
-        reward_error: Absolute error of the expected reward.
-        termination_error: Absolute error of the probability that the episode is over.
-        by_budget: Total variation at the first and at the last depth, by real episodes.
     """
 
-    pairs: int
-    samples: int
-    total_variation: np.ndarray
+    pairs: int  # macrostates of play times macro-actions
+    samples: int  # futures of each pair
+    total_variation: np.ndarray  # distance of imagined and exact distributions of macrostates
+    # the same over the pairs after which several macrostates are possible; the others dilute it
     where_random: np.ndarray
+    # the same where the episode goes on until this macro-action, weighted by how likely that is
     while_alive: np.ndarray
-    floor: np.ndarray
-    missed: np.ndarray
-    hallucinated: np.ndarray
-    reward_error: np.ndarray
-    termination_error: np.ndarray
-    by_budget: dict[int, tuple[float, float]]
+    floor: np.ndarray  # what as many samples of the exact distribution would show (sampling noise)
+    missed: np.ndarray  # possible outcomes that are not imagined, all pairs together
+    hallucinated: np.ndarray  # imagined outcomes that are impossible, all pairs together
+    reward_error: np.ndarray  # absolute error of the expected reward
+    termination_error: np.ndarray  # absolute error of the probability that the episode is over
+    by_budget: dict[int, tuple[float, float]]  # total variation at the first and at the last depth, by real episodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,13 +113,19 @@ class ReportData:
 
     @property
     def decisive_budget(self) -> int:
-        """The budget at which the learners' scores lie furthest apart; the last of several such ones."""
+        """The budget at which the learners differ most; the last of several such ones."""
         return max(reversed(self.budgets), key=self.spread)
 
     def spread(self, budget: int) -> float:
-        """How far the learners' scores lie apart at a budget, as a share."""
-        values = [self.scores[agent][budget].value for agent in self.areas]
-        return max(values, default=0.0) - min(values, default=0.0)
+        """Median distance of the learners' scores from DQN's at a budget, as a share; without DQN, their range.
+
+        A median, so that one agent far ahead of all others does not choose a budget at which the others are alike.
+        """
+        values = {agent: self.scores[agent][budget].value for agent in self.areas}
+        base = values.pop(BASE_AGENT, None)
+        if base is None:
+            return max(values.values(), default=0.0) - min(values.values(), default=0.0)
+        return float(np.median([abs(value - base) for value in values.values()])) if values else 0.0
 
 
 def collect(result: BenchResult) -> ReportData:
@@ -174,7 +145,7 @@ def collect(result: BenchResult) -> ReportData:
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
         futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
-        reached={agent: _reached(result.of(agent), spec.success_threshold) for agent in learners},
+        reached={agent: _reached(result, agent, spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
@@ -206,12 +177,8 @@ def summary_csv(data: ReportData) -> str:
         for budget, score in scores.items():
             row: list[object] = [agent, budget, len(score.by_seed), score.value, score.low, score.high, score.over]
             row += list(score.thesis or ("", ""))
-            comparison = data.comparisons.get(agent, {}).get(budget)
-            if comparison:
-                row += [*comparison.difference, *comparison.gain]
-                row.append("" if comparison.thesis_gain is None else comparison.thesis_gain)
-            else:
-                row += [""] * 7
+            versus = data.comparisons.get(agent, {}).get(budget)
+            row += [*versus.difference, *versus.gain, versus.thesis_gain] if versus else [""] * 7
             rows.append(row + list(data.areas.get(agent, {}).get(budget, [""] * 3)))
     return csv_text(rows)
 
@@ -247,20 +214,12 @@ def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, floa
     scores = {}
     for index, budget in enumerate(result.protocol.budgets):
         shares = result.success_rates(agent)[:, index]  # [seeds]
-        low, high = statistics.bootstrap_interval(shares, _rng(result, agent, budget))
-        over = "seeds"
+        (low, high), over = statistics.bootstrap_interval(shares, _rng(result, agent, budget)), "seeds"
         if len(shares) == 1:
             checkpoint = result.of(agent)[0].checkpoints[index]
-            low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
-            over = "episodes"
-        scores[budget] = Score(
-            value=statistics.iqm(shares),
-            low=low,
-            high=high,
-            over=over,
-            by_seed=tuple(float(share) for share in shares),
-            thesis=thesis.get(budget),
-        )
+            (low, high), over = statistics.wilson(checkpoint.successes, checkpoint.test_episodes), "episodes"
+        value, by_seed = statistics.iqm(shares), tuple(shares.tolist())
+        scores[budget] = Score(value=value, low=low, high=high, over=over, by_seed=by_seed, thesis=thesis.get(budget))
     return scores
 
 
@@ -269,10 +228,9 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
     agents = result.protocol.agents
     if BASE_AGENT not in agents:
         return {}
-    learners = [agent for agent in agents if agent != BASE_AGENT and registry.agent_entry(agent).learns]
     base = result.success_rates(BASE_AGENT)
     comparisons: dict[str, dict[int, Comparison]] = {}
-    for agent in learners:
+    for agent in (each for each in agents if each != BASE_AGENT and registry.agent_entry(each).learns):
         treated = result.success_rates(agent)
         comparisons[agent] = {}
         for index, budget in enumerate(result.protocol.budgets):
@@ -348,20 +306,13 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
 def _nan_mean(table: np.ndarray) -> np.ndarray:
     """Mean over the first axis of what is known, boundless uncertainty included; NaN where nothing is."""
     known = ~np.isnan(table)
-    count = known.sum(axis=0)
-    total = np.where(known, table, 0.0).sum(axis=0)
-    mean: np.ndarray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return mean
+    count, total = known.sum(axis=0), np.where(known, table, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _reached(runs: tuple[RunResult, ...], success_threshold: float) -> tuple[int | None, ...]:
-    def first(run: RunResult) -> int | None:
-        rows = run.checkpoints
-        return statistics.first_lasting(
-            [row.episodes for row in rows], [row.success_rate for row in rows], success_threshold
-        )
-
-    return tuple(first(run) for run in runs)
+def _reached(result: BenchResult, agent: str, threshold: float) -> tuple[int | None, ...]:
+    budgets = result.protocol.budgets
+    return tuple(statistics.first_lasting(budgets, rates, threshold) for rates in result.success_rates(agent))
 
 
 def _areas(result: BenchResult, agent: str, chance_level: float) -> dict[int, statistics.Estimate]:

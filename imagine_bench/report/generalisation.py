@@ -11,13 +11,7 @@ from typing import Any
 from imagine_bench import reference
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.generalisation import (
-    Generalisation,
-    Predictions,
-    generalisation,
-    predict,
-    transition_set,
-)
+from imagine_bench.judge.generalisation import Generalisation, Predictions, generalisation, predict, transition_set
 from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.trained import Trained
@@ -111,8 +105,7 @@ class GeneralisationAnalysis(Analysis[Found]):
         """The figures of the table."""
         _, found = value
         figures = {name: attrgetter(figure)(found) for name, (figure, _) in _ROWS.items()}
-        parts = asdict(found)
-        return {**figures, "consequences": parts["consequences"], "visit_counts": parts["visit_counts"]}
+        return {**figures, **{name: asdict(found)[name] for name in ("consequences", "visit_counts")}}
 
 
 def _by_consequence(groups: Groups[Found]) -> list[str]:

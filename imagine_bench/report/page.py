@@ -22,9 +22,7 @@ def write_report(result: BenchResult) -> Path:
     """Write ``result.folder / "report"``: index.html, report.md, the CSV files and the images.
 
     Everything comes from ``result`` (and the bundled encoder's card), so writing it again gives the same report.
-
-    Returns:
-        The path of index.html.
+    Returns the path of index.html.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -52,21 +50,15 @@ def write_report(result: BenchResult) -> Path:
 
 def _sections(data: ReportData) -> list[Section]:
     parts = [success.compared(data), success.success(data, _interval_words(data))]
-    if data.areas:
-        parts.append(success.area(data))
-    if data.comparisons:
-        parts.append(success.gain(data))
+    parts += [success.area(data)] if data.areas else []
+    parts += [success.gain(data)] if data.comparisons else []
     parts += imagination.sections(data)
-    if data.reached:
-        parts.append(success.threshold(data))
+    parts += [success.threshold(data)] if data.reached else []
     return [*parts, success.cost(data)]
 
 
 def write_page(folder: Path, page: Page) -> Path:
-    """Write a report: index.html, report.md, the page's CSV files and images.
-
-    Returns:
-        The path of index.html.
+    """Write a report: index.html, whose path is returned, report.md, the page's CSV files and images.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -74,12 +66,9 @@ def write_page(folder: Path, page: Page) -> Path:
     files = {name: content.encode() for name, content in page.files.items()}
     files |= {f"{image.name}.png": image.png for section in page.sections for image in section.images}
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("imagine_bench.report"),
-        autoescape=lambda name: str(name).endswith(".html.j2"),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
+        loader=jinja2.PackageLoader("imagine_bench.report"), autoescape=lambda name: str(name).endswith(".html.j2"),
+        trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
+    )  # fmt: skip
     environment.filters["md"] = markdown_text
     for name, template in (("report.md", "page.md.j2"), ("index.html", "page.html.j2")):
         files[name] = environment.get_template(template).render(page=page).encode()
@@ -116,11 +105,8 @@ def summary_table(result: BenchResult) -> str:
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
-    cells = [
-        success.thesis_text(data.thesis[agent][budget]) if budget in data.thesis.get(agent, {}) else ""
-        for agent in data.result.protocol.agents
-    ]
-    return [name, "", *cells, ""]
+    printed = [data.thesis.get(agent, {}).get(budget) for agent in data.result.protocol.agents]
+    return [name, "", *(success.thesis_text(each) if each else "" for each in printed), ""]
 
 
 def aligned(rows: list[list[str]]) -> list[str]:
@@ -142,9 +128,7 @@ def _interval_words(data: ReportData) -> str:
 def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
     """How a result of any kind was made: the fields ``facts``, ``settings``, ``protocol`` and ``recordings`` of a Page.
 
-    Args:
-        result: What a bench measured.
-        titles: Title of each of its learners. All seeds of one have the same settings.
+    ``titles`` are those of its learners. All seeds of one have the same settings.
     """
     protocol, environment = result.protocol, result.environment
     where = f"git checkout {str(environment['commit']).split('+')[0]} && " if environment.get("commit") else ""

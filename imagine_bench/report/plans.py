@@ -29,41 +29,22 @@ _COLUMNS = (
     *("max_epistemic", "actions"),
 )
 RECORDING = "recording.rrd"
-_FILMSTRIPS = 6
-"""Plans in plans.png, of as many lengths as there are."""
+_FILMSTRIPS = 6  # plans in plans.png, of as many lengths as there are
 _SHOWN_FAILURES = 12
 
-Record = Callable[..., Path]
-"""Records plans: :func:`imagine_bench.recording.plans.record_plans`."""
+Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.plans.record_plans`
 
 
 def plan_report(
-    run: Path | None,
-    *,
-    root: Path,
-    task: str | None,
-    count: int,
-    execution: str,
-    max_epistemic: float | None,
-    encoder: str | None,
-    recorded: int = 0,
-    record: Record | None = None,
-) -> str:
+    run: Path | None, *, root: Path, task: str | None, count: int, execution: str, max_epistemic: float | None,
+    encoder: str | None, recorded: int = 0, record: Record | None = None,
+) -> str:  # fmt: skip
     """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
 
-    Args:
-        run: A run's folder, or a bench's, whose best imagining run is taken; None for the newest bench.
-        root: Folder of all benches.
-        task: Whose newest bench; None for that of any task.
-        count: Plans.
-        execution: How macro-actions happen.
-        max_epistemic: See :func:`imagine_bench.judge.plans.make_plans`.
-        encoder: See :func:`imagine_bench.store.trained.load_trained`.
-        recorded: Plans that are recorded.
-        record: Records them.
-
-    Returns:
-        What to print.
+    ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
+    or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
+    :func:`imagine_bench.store.trained.load_trained`. The first ``recorded`` plans go to ``record``.
+    Returns what to print.
 
     Raises:
         ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
@@ -168,14 +149,8 @@ def write_plans(
 ) -> PlanSummary:
     """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
 
-    What an earlier call left there, its recording included, goes.
-
-    Args:
-        folder: Where to; it is made.
-        plans: What became of them.
-        task: Their task.
-        provenance: How they were made, for ``summary.json``.
-        filmstrips: Plans in ``plans.png``, of as many lengths as there are.
+    What an earlier call left there, its recording included, goes. ``plans.png`` shows as many ``filmstrips``, of plans
+    of different lengths; ``summary.json`` says the ``provenance`` too.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -188,7 +163,7 @@ def write_plans(
     write_bytes(folder / "plans.csv", _csv(plans).encode())
     write_json(folder / "summary.json", {**provenance, **with_null(dataclasses.asdict(summary))})
     failures = [plan for plan in plans if not plan.solved]
-    write_bytes(folder / "plans.md", (_page(summary, failures, task)).encode())
+    write_bytes(folder / "plans.md", _page(summary, failures, task).encode())
     write_bytes(folder / "plans.png", png(_stack(_varied(plans, filmstrips), task)))
     for plan in failures[:_SHOWN_FAILURES]:
         write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))

@@ -14,9 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import AGENTS
-from imagine_bench.report.data import ReportData
+from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import Image
 from imagine_bench.report.text import agent_words
+from imagine_bench.statistics import Estimate
 
 _INK = "#2b2b2f"  # in the SVG this becomes the page's own text color
 # Okabe and Ito's palette, grays and Tol's muted colors, in the order in which agents are registered.
@@ -31,27 +32,19 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "imagine_bench",
     "font.family": "DejaVu Sans",
     "font.size": 10.5,
-    "text.color": _INK,
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
-    "axes.titlecolor": _INK,
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "axes.titlecolor"), _INK),
+    **dict.fromkeys(("xtick.color", "ytick.color"), _INK),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     "axes.titlesize": 11,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
     "axes.linewidth": 0.8,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
     "axes.grid": True,
     "grid.color": "#8c8c8c",
     "grid.alpha": 0.25,
     "grid.linewidth": 0.6,
     "lines.linewidth": 2.0,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-    "legend.frameon": False,
 }
 
 
@@ -60,28 +53,16 @@ _THESIS_LINE: dict[str, Any] = {
     "marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0,
 }  # fmt: skip
 _LEADER: dict[str, Any] = {
-    "arrowstyle": "-",
-    "linewidth": 0.6,
-    "color": "#8c8c8c",
-    "shrinkA": 2,
-    "shrinkB": 0,
-    "relpos": (0, 0.5),
-}
-_THESIS_REACH = 2.0
-"""The thesis' points are drawn up to so many times the last budget: farther ones would leave the run's own no room."""
+    "arrowstyle": "-", "linewidth": 0.6, "color": "#8c8c8c", "shrinkA": 2, "shrinkB": 0, "relpos": (0, 0.5),
+}  # fmt: skip
+_THESIS_REACH = 2.0  # its points beyond so many times the last budget would leave the run's own no room
 _REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
 
 
 def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg: bool = False, dpi: int = 150) -> Image:
-    """Draw a figure in the style of all reports, once for each format.
+    """Draw a figure in the style of all reports; as :class:`Image` says, with ``svg`` as inline SVG too.
 
-    Args:
-        name: File name without ending.
-        draw: Makes the figure.
-        alt: What a reader who does not see it should know.
-        caption: The text below it.
-        svg: Whether the page shows it as inline SVG, which takes the page's color; without, as PNG.
-        dpi: Pixels an inch of the PNG.
+    ``dpi`` is pixels an inch of the PNG.
     """
     with mpl.rc_context(STYLE):
         figure = draw()
@@ -105,13 +86,10 @@ def success_figure(data: ReportData) -> Figure:
     """Success (%) against real training episodes, with 95 % intervals, chance level, optimum and the thesis' points."""
     figure = Figure(figsize=(9.2, 4.9), layout="constrained")
     axes = figure.add_subplot()
-    budgets = np.array(data.budgets)
     for share in (data.facts.optimum, data.facts.chance_level):
         axes.axhline(100.0 * share, **_REFERENCE_LINE)
     for agent, scores in data.scores.items():
-        values = np.array([[scores[b].value, scores[b].low, scores[b].high] for b in data.budgets]) * 100.0
-        axes.plot(budgets, values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
-        axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
+        _band(axes, agent, {budget: scores[budget] for budget in data.budgets})
     _success_legend(axes, data, thesis=_thesis_points(axes, data))
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
     last = {agent: 100.0 * scores[data.budgets[-1]].value for agent, scores in data.scores.items()}
@@ -133,10 +111,8 @@ def gain_figure(data: ReportData) -> Figure:
         axes.plot(list(printed), 100.0 * np.array(list(printed.values())), color=color(agent), **_THESIS_LINE)
         gains = {budget: row.gain for budget, row in data.comparisons[agent].items() if np.isfinite(row.gain.value)}
         if gains:
-            values = 100.0 * np.array([(gain.value, gain.low, gain.high) for gain in gains.values()])
-            axes.plot(list(gains), values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
-            axes.fill_between(list(gains), values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
-            last[agent] = values[-1, 0]
+            _band(axes, agent, gains)
+            last[agent] = 100.0 * gains[max(gains)].value
     axes.set(ylabel="gain over DQN (%)")
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     axes.plot([], [], color=_INK, label="thesis", **_THESIS_LINE)
@@ -145,14 +121,21 @@ def gain_figure(data: ReportData) -> Figure:
     return figure
 
 
+def _band(axes: Axes, agent: str, by_budget: Mapping[int, Score | Estimate]) -> None:
+    """An agent's values (%) with their intervals."""
+    budgets = list(by_budget)
+    values = 100.0 * np.array([(one.value, one.low, one.high) for one in by_budget.values()])
+    axes.plot(budgets, values[:, 0], color=color(agent), marker="o", markersize=4.5, zorder=3)
+    axes.fill_between(budgets, values[:, 1], values[:, 2], color=color(agent), alpha=0.18, linewidth=0)
+
+
 def acceptance_figure(data: ReportData) -> Figure:
     """Share of imagined transitions kept (%) while training up to each budget."""
     figure = Figure(figsize=(9.2, 2.9), layout="constrained")
     axes = figure.add_subplot()
     for agent, rates in data.acceptance.items():
-        axes.plot(
-            list(rates), [100.0 * rate for rate in rates.values()], color=color(agent), marker="o", markersize=4.5
-        )
+        percentages = [100.0 * rate for rate in rates.values()]
+        axes.plot(list(rates), percentages, color=color(agent), marker="o", markersize=4.5)
     axes.set(xlabel="real training episodes", ylabel="transitions kept (%)", ylim=(-3, 106))
     last = {agent: 100.0 * rates[max(rates)] for agent, rates in data.acceptance.items()}
     _end_labels(axes, last, max(max(rates) for rates in data.acceptance.values()))

@@ -16,16 +16,11 @@ from imagine_bench.seeding import Purpose
 from imagine_bench.store.trained import Trained
 
 _SHARES = {
-    "success": "solved",
-    "failure": "ends otherwise",
-    "late_success": "out of time, then solved",
-    "late_failure": "out of time, then ends otherwise",
-    "endless": "never ends",
-}
-_SURE = 0.999
-"""From here on a start counts as always solved: rules may leave something to chance."""
-_LISTED = 12
-"""Starts that the page lists; starts.csv has all."""
+    "success": "solved", "failure": "ends otherwise", "late_success": "out of time, then solved",
+    "late_failure": "out of time, then ends otherwise", "endless": "never ends",
+}  # fmt: skip
+_SURE = 0.999  # from here on a start counts as always solved: rules may leave something to chance
+_LISTED = 12  # starts that the page lists; starts.csv has all
 
 
 def policy_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
@@ -100,10 +95,9 @@ class PolicyAnalysis(Analysis[Terminations]):
         order = [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]
         if not order:
             return ["Every run solves every start."]
-        rows = [
-            [self._words(states[index]), f"{self._optimal[index]:.2f}", *map(percent, solved[:, index])]
-            for index in order[:_LISTED]
-        ]
+        rows = []
+        for index in order[:_LISTED]:
+            rows.append([self._words(states[index]), f"{self._optimal[index]:.2f}", *map(percent, solved[:, index])])
         return [
             f"Starts that some run does not always solve: {len(order)} of {len(self._optimal)}. Solved least:",
             "",

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench import statistics
-from imagine_bench.report.plots import STYLE
+from imagine_bench.report.analysis import markdown
+from imagine_bench.report.plots import image
 from imagine_bench.report.text import estimate_text, few_words, percent
 from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.studies.study import Line, Study
@@ -25,19 +23,14 @@ _HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's pa
 def study_table(study: Study, lines: Sequence[Line]) -> str:
     """Success (%) of every variant at every budget, and its difference in points from what it is compared with."""
     budgets = [f"{budget:,}" for budget in study.budgets]
-    rows = [
-        f"| factor | variant | agent | {' | '.join(budgets)} | against | {' | '.join(budgets)} | CPU s |",
-        f"|---|---|---|{'---|' * len(budgets)}---|{'---|' * len(budgets)}---|",
-    ]
+    rows = []
     for line in lines:
         reached = [percent(statistics.iqm(column)) for column in line.success.T]
         moved = [estimate_text(one) for one in line.difference] if line.difference else ["–"] * len(budgets)
-        variant = line.variant
-        rows.append(
-            f"| {variant.factor} | {variant.name} | {variant.agent} | {' | '.join(reached)} | "
-            f"{variant.against or '–'} | {' | '.join(moved)} | {line.train_cpu_s:.0f} |"
-        )
-    return "\n".join(rows)
+        one = line.variant
+        head = (one.factor, one.name, one.agent)
+        rows.append([*head, *reached, one.against or "–", *moved, f"{line.train_cpu_s:.0f}"])
+    return "\n".join(markdown(["factor", "variant", "agent", *budgets, "against", *budgets, "CPU s"], rows))
 
 
 def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
@@ -55,7 +48,7 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
     compared = [line for line in lines if line.difference]
     if compared:
         head += "![Differences](study.png)\n\n"
-        write_bytes(folder / "study.png", _plot(study, compared))
+        write_bytes(folder / "study.png", image("study", lambda: _figure(study, compared), alt="", caption="").png)
     write_bytes(folder / "study.md", f"{head}{study_table(study, lines)}\n".encode())
     write_bytes(folder / "seeds.csv", _seeds(study, lines).encode())
     write_bytes(folder / "summary.csv", _summary(study, lines).encode())
@@ -94,28 +87,24 @@ def _summary(study: Study, lines: Sequence[Line]) -> str:
     return csv_text(rows)
 
 
-def _plot(study: Study, compared: Sequence[Line]) -> bytes:
+def _figure(study: Study, compared: Sequence[Line]) -> Figure:
     """Differences in points with their intervals, a panel a budget, a row a variant."""
     usual = Counter(line.variant.against for line in compared).most_common(1)[0][0]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 1.6 + 0.27 * len(compared)), layout="constrained")
-        panels = np.atleast_1d(figure.subplots(1, len(study.budgets), sharey=True))
-        for index, (axes, budget) in enumerate(zip(panels, study.budgets, strict=True)):
-            axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)
-            for row, line in enumerate(compared):
-                assert line.difference is not None
-                value, low, high = (100.0 * number for number in line.difference[index])
-                color = _HELPS if low > 0 else _HURTS if high < 0 else _UNCLEAR
-                axes.plot([low, high], [row, row], color=color)
-                axes.plot([value], [row], marker="o", markersize=5, color=color)
-            axes.set_title(f"{budget:,} episodes")
-        panels[0].set_yticks(range(len(compared)), [_label(line, usual) for line in compared])
-        panels[0].invert_yaxis()
-        figure.supxlabel(f"points of success, against {usual} where nothing else is named", fontsize="medium")
-        FigureCanvasAgg(figure).draw()
-        png = io.BytesIO()
-        figure.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
-    return png.getvalue()
+    figure = Figure(figsize=(10.0, 1.6 + 0.27 * len(compared)), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(study.budgets), sharey=True))
+    for index, (axes, budget) in enumerate(zip(panels, study.budgets, strict=True)):
+        axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)
+        for row, line in enumerate(compared):
+            assert line.difference is not None
+            value, low, high = (100.0 * number for number in line.difference[index])
+            color = _HELPS if low > 0 else _HURTS if high < 0 else _UNCLEAR
+            axes.plot([low, high], [row, row], color=color)
+            axes.plot([value], [row], marker="o", markersize=5, color=color)
+        axes.set_title(f"{budget:,} episodes")
+    panels[0].set_yticks(range(len(compared)), [_label(line, usual) for line in compared])
+    panels[0].invert_yaxis()
+    figure.supxlabel(f"points of success, against {usual} where nothing else is named", fontsize="medium")
+    return figure
 
 
 def _label(line: Line, usual: str | None) -> str:

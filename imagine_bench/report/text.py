@@ -13,10 +13,8 @@ from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate
 
-FEW_SEEDS = 5
-"""Below this the bootstrap interval is hardly more than the range of the seeds, and the report says so."""
-_NAMED = 4
-"""Missing runs that are named; the others are counted."""
+FEW_SEEDS = 5  # below this the bootstrap interval is hardly more than the range of the seeds, and the report says so
+_NAMED = 4  # missing runs that are named; the others are counted
 
 
 class AgentWords(NamedTuple):
@@ -124,15 +122,11 @@ def few_words(count: int, noun: str = "seeds") -> list[str]:
 
 def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
-    areas = {agent: data.areas[agent][budget] for agent in data.areas}
+    areas = {agent: by_budget[budget] for agent, by_budget in data.areas.items()}
     named = {agent: f"“{agent_words(agent).title}” ({score_text(area)} %)" for agent, area in areas.items()}
     ranked = sorted(areas, key=lambda agent: areas[agent].value, reverse=True)
     first = [named[agent] for agent in ranked if areas[agent].value == areas[ranked[0]].value]
-    who = (
-        f"{', '.join(first[:-1])} and {first[-1]} alike"
-        if len(first) > 1
-        else f"{first[0]}; next is {named[ranked[1]]}"
-    )
+    who = f"{_listing(first)} alike" if len(first) > 1 else f"{first[0]}; next is {named[ranked[1]]}"
     return f"Over all episodes up to {budget:,} the mean success is highest for {who}."
 
 
@@ -157,12 +151,9 @@ def _verdict(data: ReportData, agent: str) -> str:
     if math.isnan(difference.low):
         return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
-    if difference.low > 0:
-        verdict = "so at this budget it is ahead"
-    elif difference.high < 0:
-        verdict = "so at this budget it is behind"
-    else:
-        verdict = "which includes zero, so at this budget no difference is shown"
+    verdict = "which includes zero, so at this budget no difference is shown"
+    if difference.low > 0 or difference.high < 0:
+        verdict = f"so at this budget it is {'ahead' if difference.low > 0 else 'behind'}"
     return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons, len(data.result.protocol.seeds))}"
 
 
@@ -189,8 +180,8 @@ def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
 def _points(difference: Estimate) -> str:
     if difference.value == 0:
         return "exactly as much as DQN"
-    points = f"{abs(100.0 * difference.value):.1f}"
-    return f"{points} percentage points {'less' if difference.value < 0 else 'more'} than DQN"
+    which = "less" if difference.value < 0 else "more"
+    return f"{abs(100.0 * difference.value):.1f} percentage points {which} than DQN"
 
 
 def _listing(words: list[str]) -> str:

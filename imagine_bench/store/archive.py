@@ -68,7 +68,7 @@ def load_archive(folder: Path) -> BenchResult:
     """Read such a folder.
 
     Raises:
-        ArtefactError: It is damaged; the message names the file.
+        ArtefactError: It is damaged.
         InvalidValueError: It is of a task that is learned from data.
     """
     path, whole = folder / _RESULTS, read_protocol(folder)
@@ -98,20 +98,12 @@ def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
     numbers |= {name: int(row[name]) for name in (*_COUNTS, _COSTS[0])}
     known = ("agent", "seed", *numbers, *_DERIVED)
     return Checkpoint(
-        **numbers,
-        diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},
+        **numbers, diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""}
     )
 
 
 def _run(folder: Path, agent: str, seed: int, checkpoints: tuple[Checkpoint, ...]) -> RunResult:
     return RunResult(
-        agent=agent,
-        seed=seed,
-        checkpoints=checkpoints,
-        settings={},
-        training_success=np.zeros(0, dtype=np.bool_),
-        training_length=np.zeros(0, dtype=np.int64),
-        imagined=(),
-        folder=folder,
-        recording=None,
-    )
+        agent=agent, seed=seed, checkpoints=checkpoints, settings={}, folder=folder,
+        training_success=np.zeros(0, dtype=np.bool_), training_length=np.zeros(0, dtype=np.int64),
+    )  # fmt: skip

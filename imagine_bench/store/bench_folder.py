@@ -28,12 +28,7 @@ _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 
 
 class BenchStore:
-    """The folder of one protocol.
-
-    Args:
-        folder: The folder itself: that of :func:`bench_folder`, or wherever somebody has moved it to.
-        protocol: What is compared.
-    """
+    """The folder of one protocol: that of :func:`bench_folder`, or wherever somebody has moved it to."""
 
     def __init__(self, folder: Path, protocol: ProtocolData) -> None:
         self.protocol, self.folder = protocol, folder
@@ -41,12 +36,7 @@ class BenchStore:
         self._sessions: list[dict[str, Any]] = []
 
     def open(self) -> None:
-        """Make the folder, or see that the one there is of this protocol.
-
-        Raises:
-            SetupError: It cannot be written.
-            ArtefactError: It holds something else, which is left untouched.
-        """
+        """Make the folder, or raise ArtefactError where it is of another protocol, SetupError where it is read-only."""
         make_folder(self.folder)
         path = self.folder / _PROTOCOL
         if not path.exists():
@@ -55,16 +45,12 @@ class BenchStore:
             raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
 
     def lock(self) -> AbstractContextManager[None]:
-        """Hold the folder for this process.
-
-        Raises:
-            BusyError: Another bench works there.
-        """
+        """Hold the folder for this process. Raises BusyError: another bench works there."""
         return lock(self.folder / ".lock", f"The bench folder {self.folder}")
 
     def run_folder(self, agent: str, seed: int) -> Path:
         """The folder of one run."""
-        return _run_folder(self.folder, agent, seed)
+        return self.folder / agent / f"seed_{seed}"
 
     def missing(self, until: int | None = None) -> list[tuple[str, int]]:
         """Agents and seeds that are not finished, or have not come to the budget ``until``, seed by seed."""
@@ -73,14 +59,7 @@ class BenchStore:
         return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
     def begin_session(self, environment: dict[str, Any]) -> list[str]:
-        """Note that work starts now.
-
-        Args:
-            environment: What :func:`imagine_bench.machine.describe_environment` says.
-
-        Returns:
-            Names of facts that decide the bits and are not as in the first session.
-        """
+        """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`."""
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
         if begun:
@@ -117,29 +96,20 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
 
 
 def load_bench(folder: Path) -> Result:
-    """Read a finished bench, as the result class of its task's type.
-
-    Raises:
-        ArtefactError: It is not a bench, runs are missing, or a file is damaged; the message names it.
-    """
+    """Read a finished bench. Raises ArtefactError: it is no bench, runs are missing, or a file is damaged."""
     protocol = read_protocol(folder)
-    folders = [_run_folder(folder, agent, seed) for agent in protocol.agents for seed in protocol.seeds]
-    kind = task_type(protocol.task)
+    kind, store = task_type(protocol.task), BenchStore(folder, protocol)
+    folders = [store.run_folder(agent, seed) for agent in protocol.agents for seed in protocol.seeds]
     runs = tuple(kind.load_run(run) for run in folders if run_folder.is_done(run))
     return kind.result(protocol=protocol, runs=runs, **bench_facts(folder))
 
 
 def bench_facts(folder: Path) -> dict[str, Any]:
-    """``environment``, ``folder`` and ``wall_s`` of a bench's result.
-
-    Raises:
-        ArtefactError: A file is missing or damaged; the message names it.
-    """
+    """``environment``, ``folder`` and ``wall_s`` of a bench's result, or ArtefactError for a missing, damaged file."""
     if (folder / KEPT).exists():
         kept = read_json(folder / KEPT, "a kept bench")
         with reading(folder / KEPT, "a kept bench"):
-            facts, sessions = kept["environment"], kept["sessions"]
-            sessions = [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
+            facts, sessions = kept["environment"], _with_times(kept["sessions"])
     else:
         facts, sessions = read_json(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
     environment = {**facts, "sessions": sessions}
@@ -153,11 +123,7 @@ def require_either(given: Path | None, task: str | None) -> None:
 
 
 def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
-    """The bench folder below ``root`` that was worked on last, of any task or of some.
-
-    Raises:
-        ArtefactError: There is none.
-    """
+    """The bench folder below ``root`` that was worked on last, of any task or of some, or ArtefactError."""
     found = [path for path in root.glob(f"*/*/{_SESSIONS}") if not tasks or path.parts[-3] in tasks]
     if not found:
         some = next(iter(tasks), "arrow_puzzle")
@@ -170,11 +136,7 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
 
 
 def newest_recording(root: Path, task: str | None = None) -> Path:
-    """The recording below ``root`` that was written last, of a run or of a plan, of any task or of one.
-
-    Raises:
-        ArtefactError: There is none.
-    """
+    """The recording below ``root`` that was written last, of any task or of one, or ArtefactError."""
     where = root / (task or "")
     found = sorted(where.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
     if not found:
@@ -192,21 +154,17 @@ def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_sessions(folder: Path) -> list[dict[str, Any]]:
     path, what = folder / _SESSIONS, "a bench's sessions"
-    sessions: list[dict[str, Any]] = read_json(path, what, holds=list)
+    sessions = read_json(path, what, holds=list)
     with reading(path, what):
-        return [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
+        return _with_times(sessions)
 
 
-def _run_folder(folder: Path, agent: str, seed: int) -> Path:
-    return folder / agent / f"seed_{seed}"
+def _with_times(sessions: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{**session, "wall_s": float(session["wall_s"])} for session in sessions]
 
 
 def read_protocol(folder: Path) -> ProtocolData:
-    """The protocol of a bench folder.
-
-    Raises:
-        ArtefactError: It is missing or damaged; the message names it.
-    """
+    """The protocol of a bench folder. Raises ArtefactError: it is missing or damaged."""
     kept = (folder / KEPT).exists()
     path, what = folder / (KEPT if kept else _PROTOCOL), "a bench's protocol"
     data = read_json(path, what)
@@ -216,11 +174,7 @@ def read_protocol(folder: Path) -> ProtocolData:
 
 
 def read_control(folder: Path) -> Protocol:
-    """The protocol of a bench folder of agents that act.
-
-    Raises:
-        ArtefactError: It is of a regression task, missing or damaged; the message names it.
-    """
+    """The protocol of a bench folder of agents that act. Raises ArtefactError: it is another's, missing or damaged."""
     protocol = read_protocol(folder)
     if not isinstance(protocol, Protocol):
         raise ArtefactError(f"{folder} is of a regression task, in which no agent acts; give one of agents.")

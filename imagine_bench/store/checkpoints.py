@@ -29,29 +29,18 @@ _NAME, _PARTIAL = "checkpoint_", ".partial_"
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """An agent and the runner around it, after a whole number of episodes.
+    """An agent and the runner around it, after a whole number of episodes."""
 
-    Attributes:
-        episode: Training episodes done.
-        agent: The agent's own state.
-        arrays: The runner's arrays.
-        values: The runner's JSON-serialisable values.
-    """
-
-    episode: int
-    agent: AgentState
-    arrays: Mapping[str, NDArray[Any]]
-    values: Mapping[str, Any]
+    episode: int  #: Training episodes done
+    agent: AgentState  #: The agent's own state
+    arrays: Mapping[str, NDArray[Any]]  #: The runner's arrays
+    values: Mapping[str, Any]  #: The runner's JSON-serialisable values
 
 
 def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
-    """Write a snapshot below ``folder`` and remove the ones it replaces.
+    """Write a snapshot as a folder below ``folder``, remove the ones it replaces, and return where it lies.
 
-    Returns:
-        The checkpoint's own folder.
-
-    Raises:
-        SetupError: It cannot be written; the earlier checkpoint is untouched.
+    Raises SetupError: it cannot be written; the earlier checkpoint is untouched.
     """
     make_folder(folder)
     earlier = _checkpoints(folder)
@@ -80,11 +69,7 @@ def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
 
 
 def load_newest(folder: Path) -> Snapshot | None:
-    """The newest checkpoint below ``folder``, or None where there is none yet; the run may go on meanwhile.
-
-    Raises:
-        ArtefactError: It is damaged or not a checkpoint; the message names the file, which is left untouched.
-    """
+    """The newest checkpoint below ``folder``, or None; the run may go on meanwhile. ArtefactError: it is damaged."""
     while found := _checkpoints(folder):
         try:
             return load_snapshot(found[-1])
@@ -100,11 +85,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def load_snapshot(checkpoint: Path) -> Snapshot:
-    """Read one checkpoint folder.
-
-    Raises:
-        ArtefactError: It is damaged or not a checkpoint; the message names the file, which is left untouched.
-    """
+    """Read one checkpoint folder. Raises ArtefactError: it is damaged or not a checkpoint."""
     path = checkpoint / "state.json"
     state = read_json(path, "a checkpoint's state")
     if state.get("format") != FORMAT:

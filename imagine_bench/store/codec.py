@@ -13,7 +13,7 @@ import types
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,13 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError
 from imagine_bench.store.files import csv_text, write_bytes
 
-T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 
 
 def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
-    """A dataclass, or a sequence of them, as JSON-like values and arrays.
+    """A dataclass, or a sequence of them, as JSON-like values and arrays that lie at ``path`` among others.
 
-    Args:
-        value: Its fields are dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None.
-        path: Where its arrays lie among others.
+    Its fields are dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None.
     """
     if isinstance(value, np.ndarray | np.generic):
         return None, {path: np.asarray(value)}
@@ -45,38 +42,28 @@ def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
     return (dict(value) if isinstance(value, Mapping) else list(value) if isinstance(value, tuple) else value), {}
 
 
-def unpack(kind: type[T], values: Any, arrays: Mapping[str, NDArray[Any]], path: str = "") -> T:
-    """The inverse of :func:`pack`.
-
-    Args:
-        kind: The type that was packed.
-        values: Its values; None where it has none beside arrays.
-        arrays: Those that were packed, and maybe others.
-        path: Where they lie.
+def unpack(kind: Any, values: Any, arrays: Mapping[str, NDArray[Any]], path: str = "") -> Any:
+    """The inverse of :func:`pack`, of type ``kind``; ``values`` is None where there are none beside arrays.
 
     Raises:
         KeyError: A value or an array is missing.
         TypeError: A value is of another type.
     """
-    found: T = _unpack(kind, values, arrays, path)
-    return found
-
-
-def _unpack(kind: Any, values: Any, arrays: Mapping[str, NDArray[Any]], path: str) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is np.ndarray:
         return arrays[path]
     if origin in (Union, types.UnionType):
         absent = values is None and not any(name.startswith(f"{path}/") for name in arrays)
         (kept,) = (argument for argument in arguments if argument is not type(None))
-        return None if absent else _unpack(kept, values, arrays, path)
+        return None if absent else unpack(kept, values, arrays, path)
     if dataclasses.is_dataclass(kind):
         hints, given = get_type_hints(kind), values or {}
         names = [field.name for field in dataclasses.fields(kind) if field.init]
-        return kind(**{name: _unpack(hints[name], given.get(name), arrays, _join(path, name)) for name in names})  # type: ignore[operator]
+        fields = {name: unpack(hints[name], given.get(name), arrays, _join(path, name)) for name in names}
+        return kind(**fields)  # type: ignore[operator]
     if origin in (list, tuple) and dataclasses.is_dataclass(arguments[0]):
         parts = _indexed(arrays, path) * [None] if values is None else values
-        return origin(_unpack(arguments[0], part, arrays, _join(path, index)) for index, part in enumerate(parts))
+        return origin(unpack(arguments[0], part, arrays, _join(path, index)) for index, part in enumerate(parts))
     if values is None:
         raise KeyError(path)
     return origin(values) if origin in (list, tuple) else values
@@ -105,22 +92,14 @@ def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays, atomically.
-
-    Raises:
-        SetupError: They cannot be written.
-    """
+    """Write named arrays, atomically. Raises SetupError: they cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
 
 def read_arrays(path: Path) -> Arrays:
-    """The inverse of :func:`write_arrays`.
-
-    Raises:
-        ArtefactError: The file is missing or damaged.
-    """
+    """The inverse of :func:`write_arrays`. Raises ArtefactError: the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -138,15 +117,7 @@ def table_text(rows: Sequence[Row]) -> str:
 
 
 def table_rows(text: str, texts: Iterable[str] = ()) -> list[dict[str, Any]]:
-    """The inverse of :func:`table_text`.
-
-    Args:
-        text: CSV.
-        texts: Columns that hold text; all others hold numbers.
-
-    Raises:
-        ValueError: A number is none.
-    """
+    """The inverse of :func:`table_text`: all columns but ``texts`` hold numbers, or ValueError is raised."""
     words = set(texts)
     rows = csv.DictReader(io.StringIO(text))
     return [{name: cell if name in words else _number(cell) for name, cell in row.items() if cell} for row in rows]

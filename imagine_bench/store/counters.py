@@ -16,52 +16,30 @@ from imagine_bench.store.results import Checkpoint
 
 @dataclass
 class EvaluationCounts:
-    """Counts over test episodes; a checkpoint may carry them half way.
+    """Counts over test episodes; a checkpoint may carry them half way."""
 
-    Attributes:
-        episodes: Test episodes done.
-        successes: Those that ended in success.
-        env_steps: Macro-actions in them.
-        return_sum: Sum of their undiscounted returns.
-        faults: Macro-actions whose physics disagreed with the rules.
-        cpu_s: CPU seconds spent.
-        diagnostics: The agent's own means at the moment the test began.
-    """
-
-    episodes: int = 0
-    successes: int = 0
-    env_steps: int = 0
-    return_sum: float = 0.0
-    faults: int = 0
-    cpu_s: float = 0.0
-    diagnostics: dict[str, float] = field(default_factory=dict)
+    episodes: int = 0  #: Test episodes done
+    successes: int = 0  #: Those that ended in success
+    env_steps: int = 0  #: Macro-actions in them
+    return_sum: float = 0.0  #: Sum of their undiscounted returns
+    faults: int = 0  #: Macro-actions whose physics disagreed with the rules
+    cpu_s: float = 0.0  #: CPU seconds spent
+    diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
 
 
 @dataclass
 class Counters:
-    """The runner's own state.
+    """The runner's own state."""
 
-    Attributes:
-        before: Training episodes on earlier tasks done.
-        episode: Training episodes done.
-        env_steps: Macro-actions in them.
-        train_cpu_s: CPU seconds of training.
-        rows: One a budget done.
-        success: Whether each training episode succeeded.
-        length: Macro-actions of each training episode.
-        queries: Oracle queries in each training episode.
-        test: The test that is going on, if one is.
-    """
-
-    before: int = 0
-    episode: int = 0
-    env_steps: int = 0
-    train_cpu_s: float = 0.0
-    rows: list[Checkpoint] = field(default_factory=list)
-    success: list[bool] = field(default_factory=list)
-    length: list[int] = field(default_factory=list)
-    queries: list[int] = field(default_factory=list)
-    test: EvaluationCounts | None = None
+    before: int = 0  #: Training episodes on earlier tasks done
+    episode: int = 0  #: Training episodes done
+    env_steps: int = 0  #: Macro-actions in them
+    train_cpu_s: float = 0.0  #: CPU seconds of training
+    rows: list[Checkpoint] = field(default_factory=list)  #: One a budget done
+    success: list[bool] = field(default_factory=list)  #: Whether each training episode succeeded
+    length: list[int] = field(default_factory=list)  #: Macro-actions of each training episode
+    queries: list[int] = field(default_factory=list)  #: Oracle queries in each training episode
+    test: EvaluationCounts | None = None  #: The test that is going on, if one is
 
     def add_episode(self, success: bool, length: int, queries: int = 0) -> None:
         """Count a training episode of so many macro-actions, and queries in it."""

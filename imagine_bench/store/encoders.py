@@ -20,17 +20,11 @@ def bundled() -> dict[str, Path]:
 
 
 def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str = "latents") -> Path:
-    """The encoder file to use.
-
-    Args:
-        spec: The task.
-        appearance: Its appearance level; each has its own bundled encoders.
-        given: A bundled name or a path instead; None for the task's own.
-        kind: Which of the task's own: ``"latents"``, continuous, or ``"codes"``, one-hot, of factors.
+    """The encoder file to use: ``given``, a bundled name or a path, or the task's own of a kind (latents or codes).
 
     Raises:
-        UnknownNameError: ``given`` is neither; the message lists the bundled names.
-        ArtefactError: The task has no bundled encoder at this level.
+        UnknownNameError: ``given`` is neither.
+        ArtefactError: The task has no bundled encoder at this appearance level.
     """
     known = bundled()
     if given is None:
@@ -51,19 +45,11 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 
 
 def kind(path: Path) -> str:
-    """Whether an encoder gives ``"latents"`` or ``"codes"``, by the card beside it.
-
-    Raises:
-        ArtefactError: The card is damaged.
-    """
+    """Whether an encoder gives ``"latents"`` or ``"codes"``, by its card. Raises ArtefactError: the card is damaged."""
     card = path.with_suffix(".json")
     return "codes" if card.is_file() and read_json(card, "an encoder's card").get("code_sizes") else "latents"
 
 
 def identity(path: Path) -> str:
-    """What stands for an encoder in a protocol: its name and the beginning of its digest.
-
-    Raises:
-        ArtefactError: The file cannot be read.
-    """
+    """What stands for an encoder in a protocol: its name and 12 digits of its digest, or ArtefactError."""
     return f"{path.stem}@{sha256(path)[:12]}"

@@ -35,11 +35,7 @@ _REASONS = {
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the operating system's refusal to write at ``path`` into one sentence.
-
-    Raises:
-        SetupError: The folder is not writable, the disk is full, or the like.
-    """
+    """Turn the operating system's refusal to write at ``path`` into a SetupError of one sentence."""
     try:
         yield
     except OSError as error:
@@ -48,30 +44,20 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> Path:
-    """Create ``folder`` with its parents if need be.
-
-    Raises:
-        SetupError: It cannot be made.
-    """
+    """Create ``folder`` with its parents if need be. Raises SetupError: it cannot be made."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def require_writable(folder: Path) -> None:
-    """Make sure, before long work whose result is to lie in ``folder``, that it can; the folder is made if need be.
-
-    Raises:
-        SetupError: It cannot be made or written to.
-    """
+    """Raise SetupError, before long work, where its result cannot be written to ``folder``; made if need be."""
     with writing(make_folder(folder)), TemporaryFile(dir=folder):
         pass
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in ``folder`` survive a power cut, where the system can be asked to."""
-    if os.name == "nt":  # a folder cannot be opened there
-        return
+    """Make the names in ``folder`` survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -80,11 +66,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a whole file at once: to a temporary neighbour, to the disk, then into place.
-
-    Raises:
-        SetupError: It cannot be written; an earlier file at ``path`` is untouched.
-    """
+    """Write a whole file at once, by a temporary neighbour, or raise SetupError and leave an earlier one untouched."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
         try:
@@ -113,11 +95,7 @@ def json_text(value: Any) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON, atomically.
-
-    Raises:
-        SetupError: It cannot be written.
-    """
+    """Write ``value`` as JSON, atomically. Raises SetupError: it cannot be written."""
     write_bytes(path, json_text(value).encode())
 
 
@@ -129,16 +107,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def read_json(path: Path, what: str, holds: type = dict) -> Any:
-    """What a JSON file holds.
-
-    Args:
-        path: The file.
-        what: What it should be, for the error.
-        holds: The type of what it should hold.
-
-    Raises:
-        ArtefactError: It is missing or damaged; it is left untouched.
-    """
+    """What a JSON file holds, of type ``holds``. Raises ArtefactError: it is missing, damaged or not ``what``."""
     with reading(path, what):
         found = json.loads(path.read_bytes())
         if not isinstance(found, holds):
@@ -148,11 +117,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one sentence.
-
-    Raises:
-        ArtefactError: It is missing or damaged; it is left untouched.
-    """
+    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one ArtefactError."""
     try:
         yield
     except FileNotFoundError as error:
@@ -180,11 +145,7 @@ def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file.
-
-    Raises:
-        ArtefactError: It cannot be read.
-    """
+    """Hex digest of a file. Raises ArtefactError: it cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -196,13 +157,10 @@ def sha256(path: Path) -> str:
 def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
     """Hold the lock file ``path``; the system lets go of it when this process ends, however it ends.
 
-    Args:
-        path: The lock file, which stays behind, as does the name of its last holder beside it.
-        busy: Where another process works, for the error.
-        patience_s: How long to wait for the holder, in seconds.
+    It stays behind, as does the name of its last holder beside it. ``busy`` says where another process works.
 
     Raises:
-        BusyError: Another live process holds it; the message says which.
+        BusyError: Another live process holds it for longer than ``patience_s`` seconds; the message says which.
         SetupError: The folder cannot be written or locked.
     """
     held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")

@@ -31,10 +31,8 @@ def load_so_far(folder: Path) -> BenchResult:
     """Read a bench of agents, finished or not.
 
     Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
-    and no agent has more seeds or episodes than another.
-
-    Raises:
-        ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
+    and no agent has more seeds or episodes than another. Raises ArtefactError: it is not a bench, no seed has brought
+    every agent to the first budget, or a file is damaged.
     """
     whole = read_control(folder)
     store = BenchStore(folder, whole)
@@ -55,15 +53,9 @@ def largest_part(
 ) -> BenchResult:
     """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
 
-    Args:
-        whole: Its protocol.
-        reached: The last budget with results of every agent and seed; 0 where there are none.
-        load: Reads the run of an agent and seed.
-        folder: Where the bench's files lie.
-        made_with: See :class:`BenchResult`.
+    ``reached`` is the last budget with results of every agent and seed, 0 where there are none.
 
-    Raises:
-        ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
+    Raises ArtefactError: no seed has brought every agent to the first budget, or a file is damaged.
     """
     part = _largest_table(whole, reached)
     missing = tuple(
@@ -110,11 +102,10 @@ def _load(folder: Path) -> RunResult:
 
 def cut(result: RunResult, part: Protocol) -> RunResult:
     """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
-    kept = _as_if_untested(result.checkpoints, part.budgets)
     episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
     return dataclasses.replace(
         result,
-        checkpoints=kept,
+        checkpoints=_as_if_untested(result.checkpoints, part.budgets),
         training_success=result.training_success[:episodes],
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),
@@ -148,14 +139,10 @@ def _over(rows: Sequence[Checkpoint], before: int) -> Checkpoint:
 
 
 def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
-    """Several benches, or parts of them, that differ only in agents or in seeds, as one.
+    """Several benches, or parts of them, that differ only in agents or in seeds, as one in a new folder below ``root``.
 
-    Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that
-    any has. Budgets are those of all.
-
-    Args:
-        results: Theirs.
-        root: Folder of all benches; the result's own is a new one in it, named by what was compared.
+    Of benches of different agents, seeds are those that all of them have; of benches of the same agents, those that any
+    has. Budgets are those of all.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no seed or budget is in all.

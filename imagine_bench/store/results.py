@@ -21,122 +21,76 @@ class OpenLoop:
     """How right the imagination is by depth, against the rules, over rollouts that the rules keep alive.
 
     All arrays have shape (D,), index d for imagined step d + 1.
-
-    Attributes:
-        count: Imagined transitions compared.
-        correct: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
-        correct_accepted: The same among those the uncertainty filter keeps (NaN where it keeps none).
-        accepted: Share the filter keeps.
-        reward_mae: Mean absolute error of the predicted reward.
-        termination_error: Share with the wrong side of 0.5 for P(terminal).
-        epistemic: Mean epistemic uncertainty.
-        aleatoric: Mean aleatoric uncertainty.
-        modal: Mean modal uncertainty.
-        judged: Imagined transitions that began in the right macrostate, so that they can be wrong by themselves.
-        auroc_epistemic: How well epistemic uncertainty finds the wrong ones among those: the probability that a wrong
-            one has the higher uncertainty of two; 0.5 is chance, NaN where none or all are wrong.
-        auroc_aleatoric: The same for aleatoric uncertainty.
-        auroc_modal: The same for modal uncertainty.
     """
 
-    count: NDArray[np.int64]
+    count: NDArray[np.int64]  #: Imagined transitions compared
+    #: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
     correct: NDArray[np.float64]
+    #: The same among those the uncertainty filter keeps (NaN where it keeps none).
     correct_accepted: NDArray[np.float64]
-    accepted: NDArray[np.float64]
-    reward_mae: NDArray[np.float64]
-    termination_error: NDArray[np.float64]
-    epistemic: NDArray[np.float64]
-    aleatoric: NDArray[np.float64]
-    modal: NDArray[np.float64]
+    accepted: NDArray[np.float64]  #: Share the filter keeps
+    reward_mae: NDArray[np.float64]  #: Mean absolute error of the predicted reward
+    termination_error: NDArray[np.float64]  #: Share with the wrong side of 0.5 for P(terminal)
+    epistemic: NDArray[np.float64]  #: Mean epistemic uncertainty
+    aleatoric: NDArray[np.float64]  #: Mean aleatoric uncertainty
+    modal: NDArray[np.float64]  #: Mean modal uncertainty
+    #: Imagined transitions that began in the right macrostate, so that they can be wrong by themselves.
     judged: NDArray[np.float64]
+    #: How well epistemic uncertainty finds the wrong ones among those: the probability that a wrong one has the higher
+    #: uncertainty of two; 0.5 is chance, NaN where none or all are wrong.
     auroc_epistemic: NDArray[np.float64]
-    auroc_aleatoric: NDArray[np.float64]
-    auroc_modal: NDArray[np.float64]
+    auroc_aleatoric: NDArray[np.float64]  #: The same for aleatoric uncertainty
+    auroc_modal: NDArray[np.float64]  #: The same for modal uncertainty
 
 
 @dataclass(frozen=True, kw_only=True)
 class Futures:
-    """Sampled futures against the exact ones, from every macrostate and macro-action: P pairs, depths 1 to D.
+    """Sampled futures against the exact ones, from every macrostate and macro-action: P pairs, depths 1 to D."""
 
-    Attributes:
-        macrostates: Where each begins. Shape (P, M).
-        actions: Its first macro-action. Shape (P,).
-        samples: Futures of each pair. Shape ().
-        total_variation: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
-        sampling_noise_floor: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
-        missed: Possible outcomes that are not imagined. Shape (D, P).
-        hallucinated: Imagined outcomes that are impossible. Shape (D, P).
-        reward_error: Absolute error of the expected reward of this macro-action. Shape (D, P).
-        termination_error: Absolute error of the probability that the episode is over. Shape (D, P).
-        survival_probability: Exact probability that the episode went on until this macro-action. Shape (D, P).
-    """
-
-    macrostates: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    samples: NDArray[np.int64]
-    total_variation: NDArray[np.float64]
+    macrostates: NDArray[np.int64]  #: Where each begins. Shape (P, M).
+    actions: NDArray[np.int64]  #: Its first macro-action. Shape (P,).
+    samples: NDArray[np.int64]  #: Futures of each pair. Shape ().
+    total_variation: NDArray[np.float64]  #: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
+    #: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
     sampling_noise_floor: NDArray[np.float64]
-    missed: NDArray[np.float64]
-    hallucinated: NDArray[np.float64]
-    reward_error: NDArray[np.float64]
-    termination_error: NDArray[np.float64]
+    missed: NDArray[np.float64]  #: Possible outcomes that are not imagined. Shape (D, P).
+    hallucinated: NDArray[np.float64]  #: Imagined outcomes that are impossible. Shape (D, P).
+    reward_error: NDArray[np.float64]  #: Absolute error of the expected reward of this macro-action. Shape (D, P).
+    termination_error: NDArray[np.float64]  #: Absolute error of the probability that the episode is over. Shape (D, P).
+    #: Exact probability that the episode went on until this macro-action. Shape (D, P).
     survival_probability: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedRollout:
-    """An imagined rollout beside what the real environment shows for the same start and actions.
+    """An imagined rollout beside what the real environment shows for the same start and actions."""
 
-    Attributes:
-        start_frame: The real frame it starts from. Shape (64, 64, 3), uint8.
-        start_macrostate: What that frame shows. Shape (M,).
-        rollout: What the agent imagined.
-        real_frames: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
-        real_macrostates: What the rules say. Shape (D, M).
-        real_rewards: What the rules say. Shape (D,).
-        real_terminated: Shape (D,).
-    """
-
-    start_frame: NDArray[np.uint8]
-    start_macrostate: NDArray[np.int64]
-    rollout: ImaginedRollout
-    real_frames: NDArray[np.uint8]
-    real_macrostates: NDArray[np.int64]
-    real_rewards: NDArray[np.float64]
-    real_terminated: NDArray[np.bool_]
+    start_frame: NDArray[np.uint8]  #: The real frame it starts from. Shape (64, 64, 3), uint8.
+    start_macrostate: NDArray[np.int64]  #: What that frame shows. Shape (M,).
+    rollout: ImaginedRollout  #: What the agent imagined
+    real_frames: NDArray[np.uint8]  #: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
+    real_macrostates: NDArray[np.int64]  #: What the rules say. Shape (D, M).
+    real_rewards: NDArray[np.float64]  #: What the rules say. Shape (D,).
+    real_terminated: NDArray[np.bool_]  #: Shape (D,)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """One evaluated budget of one run.
+    """One evaluated budget of one run."""
 
-    Attributes:
-        episodes: Real training episodes so far.
-        env_steps: Real training macro-actions so far.
-        test_episodes: Greedy test episodes.
-        successes: Test episodes that ended in success.
-        mean_return: Mean undiscounted return of the test episodes.
-        mean_length: Mean macro-actions of the test episodes.
-        faults: Macro-actions of the test episodes whose physics disagreed with the rules.
-        train_cpu_s: CPU seconds of training (environment and learning) since the run began.
-        eval_cpu_s: CPU seconds of this evaluation.
-        diagnostics: The agent's own means since the previous checkpoint.
-        open_loop: Imagination against the rules, for agents that imagine.
-        futures: Sampled futures against the rules, for agents that can be asked for many.
-    """
-
-    episodes: int
-    env_steps: int
-    test_episodes: int
-    successes: int
-    mean_return: float
-    mean_length: float
-    faults: int
-    train_cpu_s: float
-    eval_cpu_s: float
+    episodes: int  #: Real training episodes so far
+    env_steps: int  #: Real training macro-actions so far
+    test_episodes: int  #: Greedy test episodes
+    successes: int  #: Test episodes that ended in success
+    mean_return: float  #: Mean undiscounted return of the test episodes
+    mean_length: float  #: Mean macro-actions of the test episodes
+    faults: int  #: Macro-actions of the test episodes whose physics disagreed with the rules
+    train_cpu_s: float  #: CPU seconds of training (environment and learning) since the run began
+    eval_cpu_s: float  #: CPU seconds of this evaluation
+    #: The agent's own means since the previous checkpoint.
     diagnostics: Mapping[str, float] = field(default_factory=dict)
-    open_loop: OpenLoop | None = None
-    futures: Futures | None = None
+    open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
+    futures: Futures | None = None  #: Sampled futures against the rules, for agents that can be asked for many
 
     @property
     def success_rate(self) -> float:
@@ -146,39 +100,23 @@ class Checkpoint:
 
 @dataclass(frozen=True, kw_only=True)
 class RunResult:
-    """One finished run.
+    """One finished run."""
 
-    Attributes:
-        agent: Registered agent.
-        seed: The run's seed.
-        checkpoints: One a budget, in the protocol's order.
-        settings: The agent's settings as run.
-        training_success: Whether each training episode succeeded. Shape (episodes,).
-        training_length: Macro-actions of each training episode. Shape (episodes,).
-        imagined: Example rollouts at the last budget, for agents that imagine.
-        sampled_rollouts: Several from one beginning at the last budget, where the rules leave something to chance.
-        folder: Where the run's files lie.
-        recording: Its Rerun recording, or None.
-    """
-
-    agent: str
-    seed: int
-    checkpoints: tuple[Checkpoint, ...]
-    settings: Mapping[str, Any]
-    training_success: NDArray[np.bool_]
-    training_length: NDArray[np.int64]
-    imagined: tuple[ComparedRollout, ...]
-    folder: Path
-    recording: Path | None
+    agent: str  #: Registered agent
+    seed: int  #: The run's seed
+    checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
+    settings: Mapping[str, Any]  #: The agent's settings as run
+    training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
+    training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
+    folder: Path  #: Where the run's files lie
+    recording: Path | None = None  #: Its Rerun recording, or None
+    imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
+    #: Several from one beginning at the last budget, where the rules leave something to chance.
     sampled_rollouts: tuple[ComparedRollout, ...] = ()
 
 
 def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
-    """Refuse runs of one agent, by folder, with different settings; kept results, which have none, are passed over.
-
-    Raises:
-        ArtefactError: Two runs differ; the message says where and in what.
-    """
+    """Raise ArtefactError for runs of an agent, by folder, of different settings; kept results have none and pass."""
     known = [(folder, settings) for folder, settings in runs if settings]
     for folder, settings in known[1:]:
         difference = first_difference(known[0][1], settings)
@@ -195,28 +133,18 @@ def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
 class BenchResult:
     """All runs of a protocol. Every agent and seed is there, or this cannot be built.
 
-    Attributes:
-        protocol: What was compared.
-        runs: One an agent and seed.
-        environment: Command, commit, versions, machine, GL renderer, threads; JSON-like.
-        folder: Where the bench's files lie.
-        wall_s: Wall seconds of the bench, over all its sessions.
-        whole: The protocol of which this is a part; None if it is all of it.
-        missing: What a part lacks, one sentence a run.
-        made_with: Of kept results, the hash that their protocol had then; names may have changed since.
-
     Raises:
         ArtefactError: A run of the protocol is missing, doubled or has other budgets, or other settings than another.
     """
 
-    protocol: Protocol
-    runs: tuple[RunResult, ...]
-    environment: Mapping[str, Any]
-    folder: Path
-    wall_s: float
-    whole: Protocol | None = None
-    missing: tuple[str, ...] = ()
-    made_with: str = ""
+    protocol: Protocol  #: What was compared
+    runs: tuple[RunResult, ...]  #: One an agent and seed
+    environment: Mapping[str, Any]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
+    folder: Path  #: Where the bench's files lie
+    wall_s: float  #: Wall seconds of the bench, over all its sessions
+    whole: Protocol | None = None  #: The protocol of which this is a part; None if it is all of it
+    missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
+    made_with: str = ""  #: Of kept results, the hash that their protocol had then; names may have changed since
 
     def __post_init__(self) -> None:
         wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}

@@ -50,31 +50,25 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Write what is run into a new run folder, or see that an old one holds the same.
 
     Raises:
-        ArtefactError: The folder was begun with something else; the message names the first difference.
+        ArtefactError: The folder was begun with something else.
         SetupError: It cannot be written.
     """
     path, now = folder / _CONFIG, json.loads(json.dumps({"format": FORMAT, **config}))
     if not path.exists():
         write_json(path, now)
         return
-    then = read_json(path, "a run's configuration")
-    difference = first_difference(then, now)
-    if difference is None:
-        return
-    name, was, would_be = difference
-    raise ArtefactError(
-        f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was left "
-        "untouched. Finish it with the version and on the kind of machine that began it, or choose another folder with "
-        "--out."
-    )
+    difference = first_difference(read_json(path, "a run's configuration"), now)
+    if difference is not None:
+        name, was, would_be = difference
+        raise ArtefactError(
+            f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was "
+            "left untouched. Finish it with the version and on the kind of machine that began it, or choose another "
+            "folder with --out."
+        )
 
 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
-    """Write one row a budget done so far, atomically.
-
-    Raises:
-        SetupError: It cannot be written.
-    """
+    """Write one row a budget done so far, atomically. Raises SetupError: it cannot be written."""
     rows = []
     for values in pack(list(checkpoints))[0]:
         diagnostics = {_DIAGNOSTIC + name: value for name, value in sorted(values["diagnostics"].items())}
@@ -95,17 +89,7 @@ def finish(
     imagined: Sequence[ComparedRollout] = (),
     sampled_rollouts: Sequence[ComparedRollout] = (),
 ) -> None:
-    """Write the results of a run and mark it as done.
-
-    Args:
-        folder: The run's folder, with its ``config.json``.
-        counters: With a row a budget.
-        imagined: Example rollouts.
-        sampled_rollouts: Several rollouts from one beginning.
-
-    Raises:
-        SetupError: Something cannot be written; the run is then not marked.
-    """
+    """Write the results of a run and mark it as done, or raise SetupError and leave it unmarked."""
     write_metrics(folder, counters.rows)
     write_arrays(folder / _MEASURED, pack(counters.rows)[1])
     write_arrays(folder / _TRAINING, counters.training())
@@ -115,20 +99,12 @@ def finish(
 
 
 def mark_done(folder: Path, names: Sequence[str]) -> None:
-    """Mark a run as done: from now on these files of it never change.
-
-    Raises:
-        SetupError: The mark cannot be written.
-    """
+    """Mark a run as done: from now on these files of it never change. Raises SetupError: the mark cannot be written."""
     write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
 
 
 def require_done(folder: Path) -> dict[str, Any]:
-    """What was run in a finished folder, whose files are all as the run left them.
-
-    Raises:
-        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
-    """
+    """The configuration of a finished run. Raises ArtefactError: it is unfinished, damaged or of another format."""
     done = read_json(folder / _DONE, "the mark of a finished run")
     if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
@@ -138,16 +114,11 @@ def require_done(folder: Path) -> dict[str, Any]:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    config: dict[str, Any] = read_json(folder / _CONFIG, "a run's configuration")
-    return config
+    return read_json(folder / _CONFIG, "a run's configuration")
 
 
 def load_run(folder: Path) -> RunResult:
-    """Read a finished run.
-
-    Raises:
-        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
-    """
+    """Read a finished run. Raises ArtefactError: it is unfinished, damaged or made by something else."""
     config = require_done(folder)
     training, rollouts = read_arrays(folder / _TRAINING), read_arrays(folder / _IMAGINED)
     recording = recording_path(folder)
@@ -166,11 +137,7 @@ def load_run(folder: Path) -> RunResult:
 
 
 def load_unfinished(folder: Path) -> RunResult:
-    """Read a run as far as its newest checkpoint has come.
-
-    Raises:
-        ArtefactError: There is no checkpoint, or a file is damaged; the message names it.
-    """
+    """Read a run as far as its newest checkpoint has come. Raises ArtefactError: none is there, or it is damaged."""
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:  # it had one a moment ago
         raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
@@ -186,9 +153,7 @@ def load_unfinished(folder: Path) -> RunResult:
             settings=config["settings"],
             training_success=training["success"],
             training_length=training["length"],
-            imagined=(),
             folder=folder,
-            recording=None,
         )
 
 

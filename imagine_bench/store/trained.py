@@ -25,29 +25,17 @@ from imagine_bench.store.results import BenchResult, RunResult
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
-    """An agent as its run left it.
+    """An agent as its run left it."""
 
-    Attributes:
-        agent: The agent itself.
-        spec: What its run was.
-        task: The task it was trained on.
-        episodes: Real training episodes it has had on its task, without those on tasks before.
-        folder: Its run's folder.
-    """
-
-    agent: Agent
-    spec: RunSpec[Protocol]
-    task: TaskSpec
-    episodes: int
-    folder: Path
+    agent: Agent  #: The agent itself
+    spec: RunSpec[Protocol]  #: What its run was
+    task: TaskSpec  #: The task it was trained on
+    episodes: int  #: Real training episodes it has had on its task, without those on tasks before
+    folder: Path  #: Its run's folder
 
     @property
     def imaginer(self) -> Imaginer:
-        """The same agent, as one that imagines.
-
-        Raises:
-            InvalidValueError: It does not imagine.
-        """
+        """The same agent, as one that imagines. Raises InvalidValueError: it does not imagine."""
         if not isinstance(self.agent, Imaginer):
             raise InvalidValueError(
                 f"The agent {self.spec.agent!r} of {self.folder} does not imagine; give the run of one that does."
@@ -58,9 +46,8 @@ class Trained:
 def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
 
-    Args:
-        folder: A run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``.
-        encoder: Bundled name or path, where the run used an encoder that is not bundled.
+    ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
+    path, where the run used an encoder that is not bundled.
 
     Raises:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
@@ -94,11 +81,7 @@ def require_control(task: str, what: str) -> None:
 
 
 def protocol_of_agents(bench: Path) -> Protocol:
-    """The protocol of a bench whose agents can be taken up again.
-
-    Raises:
-        ArtefactError: There is none, or it is of a regression task, or its results were kept without the agents.
-    """
+    """The protocol of a bench whose agents can be taken up again. Raises ArtefactError: there is none such."""
     protocol = read_control(bench)
     if is_archive(bench):
         raise ArtefactError(
@@ -108,11 +91,7 @@ def protocol_of_agents(bench: Path) -> Protocol:
 
 
 def learners(bench: Path) -> tuple[Path, ...]:
-    """The run folders of a bench, finished or not, whose agents have learned and can be taken up again.
-
-    Raises:
-        ArtefactError: There are none.
-    """
+    """The run folders of a bench, finished or not, whose agents have learned and are at hand, or ArtefactError."""
     protocol = read_control(bench)
     store = BenchStore(bench, protocol)
     entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
@@ -134,11 +113,7 @@ def _has_learned(run: Path) -> bool:
 
 
 def best_run(result: Result) -> RunResult:
-    """The imagining run of a bench that solves most of its last test; of equals, most of the one before, and so on.
-
-    Raises:
-        ArtefactError: There is none.
-    """
+    """The imagining run that solves most of its last test, of equals most of the one before, or ArtefactError."""
     runs = [run for run in result.runs if run.imagined] if isinstance(result, BenchResult) else []
     if not runs:
         raise ArtefactError(f"No agent of {result.folder} imagines; give a bench with one that does.")

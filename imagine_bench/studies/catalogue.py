@@ -94,13 +94,8 @@ def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
 
 
 _SMOKE = Study(
-    name="smoke",
-    question="Does every part of a study work?",
-    budgets=(5,),
-    seeds=(1000, 1001),
-    evaluation_episodes=5,
-    appearance="clean",
-    execution="kinematic",
+    name="smoke", question="Does every part of a study work?", budgets=(5,), seeds=(1000, 1001),
+    evaluation_episodes=5, appearance="clean", execution="kinematic",
     variants=(
         Variant(name="dqn", factor=BASE, agent=_DQN),
         Variant(

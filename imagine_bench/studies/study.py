@@ -32,51 +32,28 @@ BASE = "base"
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One line of a study.
+    """One line of a study."""
 
-    Attributes:
-        name: Unique within the study.
-        factor: What it varies, :data:`BASE` for a reference.
-        agent: Registered agent.
-        against: Name of the variant whose success its own is compared with, or None.
-        settings: Agent settings, by dotted name.
-        appearance: Appearance level, or None for the study's.
-    """
-
-    name: str
-    factor: str
-    agent: str
-    against: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    appearance: str | None = None
+    name: str  #: Unique within the study
+    factor: str  #: What it varies, :data:`BASE` for a reference
+    agent: str  #: Registered agent
+    against: str | None = None  #: Name of the variant whose success its own is compared with, or None
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: Agent settings, by dotted name
+    appearance: str | None = None  #: Appearance level, or None for the study's
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What a study runs.
+    """What a study runs. Raises InvalidValueError: a name given twice, a comparison with nothing, a reported seed."""
 
-    Attributes:
-        name: Its name on the command line.
-        question: One sentence for the reader of its page.
-        budgets: Real training episodes, ascending.
-        seeds: Tuning seeds.
-        evaluation_episodes: Test episodes at each budget.
-        appearance: Appearance level.
-        execution: ``"physics"`` or ``"kinematic"``.
-        variants: What is compared.
-
-    Raises:
-        InvalidValueError: A name given twice, a comparison with nothing, or a seed that reports results.
-    """
-
-    name: str
-    question: str
-    budgets: tuple[int, ...]
-    seeds: tuple[int, ...]
-    evaluation_episodes: int
-    appearance: str
-    execution: str
-    variants: tuple[Variant, ...]
+    name: str  #: Its name on the command line
+    question: str  #: One sentence for the reader of its page
+    budgets: tuple[int, ...]  #: Real training episodes, ascending
+    seeds: tuple[int, ...]  #: Tuning seeds
+    evaluation_episodes: int  #: Test episodes at each budget
+    appearance: str  #: Appearance level
+    execution: str  #: ``"physics"`` or ``"kinematic"``
+    variants: tuple[Variant, ...]  #: What is compared
 
     def __post_init__(self) -> None:
         names = [variant.name for variant in self.variants]
@@ -95,11 +72,7 @@ class Study:
             )
 
     def only(self, names: tuple[str, ...]) -> Study:
-        """The same study with the named variants and those they are compared with; all of them where none is named.
-
-        Raises:
-            UnknownNameError: A variant that the study lacks; the message lists those it has.
-        """
+        """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
         known = {variant.name: variant for variant in self.variants}
         wanted = {require_known("variant", name, known) for name in names} or set(known)
         while True:
@@ -112,37 +85,19 @@ class Study:
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """What a variant reached.
+    """What a variant reached."""
 
-    Attributes:
-        variant: Which.
-        success: Success shares. Shape (seeds, budgets).
-        train_cpu_s: Mean CPU seconds of training a run.
-        difference: Against the variant it is compared with, one a budget; None where it is compared with nothing.
-        folder: Where its runs lie.
-        environment: Command, commit, versions and machine of its first session; JSON-like.
-    """
-
-    variant: Variant
-    success: NDArray[np.float64]
-    train_cpu_s: float
+    variant: Variant  #: Which
+    success: NDArray[np.float64]  #: Success shares. Shape (seeds, budgets).
+    train_cpu_s: float  #: Mean CPU seconds of training a run
+    #: Against the variant it is compared with, one a budget; None where it is compared with nothing.
     difference: tuple[Estimate, ...] | None
-    folder: Path
-    environment: Mapping[str, Any]
+    folder: Path  #: Where its runs lie
+    environment: Mapping[str, Any]  #: Command, commit, versions and machine of its first session; JSON-like
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
-    """Run what is missing of every variant, in order, and compare; the same call goes on where it stopped.
-
-    Args:
-        study: What to run.
-        task: Registered task.
-        root: Folder of all benches.
-        launcher: Carries out the runs.
-
-    Raises:
-        ImagineBenchError: As for :func:`imagine_bench.bench.bench.bench`; what was finished is kept.
-    """
+    """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
     if task not in TASKS:
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
@@ -168,18 +123,11 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
     return plan(
-        task,
-        "quick",
-        agents=(variant.agent,),
-        seeds=study.seeds,
-        budgets=study.budgets,
-        evaluation_episodes=study.evaluation_episodes,
-        appearance=variant.appearance or study.appearance,
-        execution=study.execution,
-        overrides=tuple(sorted(variant.settings.items())),
-        open_loop_starts=0,
-        recorded_episodes=0,
-    )
+        task, "quick", agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,
+        evaluation_episodes=study.evaluation_episodes, execution=study.execution,
+        appearance=variant.appearance or study.appearance, overrides=tuple(sorted(variant.settings.items())),
+        open_loop_starts=0, recorded_episodes=0,
+    )  # fmt: skip
 
 
 def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
@@ -188,9 +136,7 @@ def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[n
     ours, theirs = success[variant.name], success[str(variant.against)]
     return tuple(
         difference(
-            ours[:, index],
-            theirs[:, index],
-            SeedTree(0).child("study", study.name, variant.name, budget).generator(),
+            ours[:, index], theirs[:, index], SeedTree(0).child("study", study.name, variant.name, budget).generator()
         )
         for index, budget in enumerate(study.budgets)
     )

@@ -30,17 +30,11 @@ _REASONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        facts: Names and values, in order.
-        complaints: Sentences about what will not work, each with what to do.
-        notes: Sentences about what works, but could be better.
-    """
-
-    facts: tuple[tuple[str, str], ...]
-    complaints: tuple[str, ...]
-    notes: tuple[str, ...]
+    facts: tuple[tuple[str, str], ...]  #: names and values, in order
+    complaints: tuple[str, ...]  #: sentences about what will not work, each with what to do
+    notes: tuple[str, ...]  #: sentences about what works, but could be better
 
     def __str__(self) -> str:
         width = max((len(name) for name, _ in self.facts), default=0) + 2

@@ -22,25 +22,17 @@ _QUARTER_RAD = np.pi / 2
 
 @dataclass
 class Fidelity:
-    """What a walk showed.
+    """What a walk showed."""
 
-    Attributes:
-        actions: Macro-actions done.
-        as_ruled: How many ended as the rules say, without a fault.
-        faults: Reasons of the others.
-        other_objects_mm: The furthest that an object moved which the action should leave where it stood.
-        error_mm: Of each object acted on, its distance from where a perfect execution leaves it.
-        error_deg: Its yaw from there, to the nearest quarter turn, since objects have no marked side.
-        cpu_s: CPU seconds of each macro-action, frame included.
-    """
-
-    actions: int = 0
-    as_ruled: int = 0
-    faults: list[str] = field(default_factory=list)
-    other_objects_mm: float = 0.0
+    actions: int = 0  #: macro-actions done
+    as_ruled: int = 0  #: how many ended as the rules say, without a fault
+    faults: list[str] = field(default_factory=list)  #: reasons of the others
+    other_objects_mm: float = 0.0  #: the furthest that an object moved which the action should leave where it stood
+    #: Of each object acted on, its distance from where a perfect execution leaves it.
     error_mm: list[float] = field(default_factory=list)
+    #: Its yaw from there, to the nearest quarter turn, since objects have no marked side.
     error_deg: list[float] = field(default_factory=list)
-    cpu_s: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)  #: CPU seconds of each macro-action, frame included
 
 
 def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int) -> Fidelity:

@@ -38,15 +38,10 @@ TURNS = tuple(Turn(cube, clockwise) for cube in range(N_CUBES) for clockwise in 
 
 @dataclass(frozen=True)
 class Goal:
-    """A condition on legal macrostates.
+    """A condition on legal macrostates."""
 
-    Attributes:
-        pointed: Direction of the arrow of the cube that the human points at.
-        absent: Direction that no arrow may have, or None.
-    """
-
-    pointed: int
-    absent: int | None = None
+    pointed: int  #: direction of the arrow of the cube that the human points at
+    absent: int | None = None  #: direction that no arrow may have, or None
 
     def holds(self, macrostate: tuple[int, ...]) -> bool:
         """Whether a legal macrostate is a goal."""

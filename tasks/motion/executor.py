@@ -55,21 +55,13 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class MacroResult:
-    """What became of one macro-action.
+    """What became of one macro-action."""
 
-    Attributes:
-        sim_time_s: Simulated seconds.
-        ik_error_m: Largest distance between a solved waypoint and its target.
-        fault: Why the action failed physically, in words, or None.
-        time_s: When the samples of the motion were taken, from 0. Shape (K,), K = 0 without capture.
-        qpos: The samples, whole scene. Shape (K, nq).
-    """
-
-    sim_time_s: float
-    ik_error_m: float
-    fault: str | None
-    time_s: Floats
-    qpos: Floats
+    sim_time_s: float  #: simulated seconds
+    ik_error_m: float  #: largest distance between a solved waypoint and its target
+    fault: str | None  #: why the action failed physically, in words, or None
+    time_s: Floats  #: when the samples of the motion were taken, from 0. Shape (K,), K = 0 without capture.
+    qpos: Floats  #: the samples, whole scene. Shape (K, nq).
 
 
 class MacroExecutor:

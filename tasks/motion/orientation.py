@@ -26,17 +26,11 @@ def about_vertical(yaw_rad: float) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectPose:
-    """An object as measured.
+    """An object as measured."""
 
-    Attributes:
-        position_m: Of its origin in the world. Shape (3,).
-        yaw_rad: Heading of its x axis.
-        tilt_rad: Of its z axis from the vertical.
-    """
-
-    position_m: NDArray[np.float64]
-    yaw_rad: float
-    tilt_rad: float
+    position_m: NDArray[np.float64]  #: of its origin in the world. Shape (3,).
+    yaw_rad: float  #: heading of its x axis
+    tilt_rad: float  #: of its z axis from the vertical
 
     @classmethod
     def of(cls, qpos: NDArray[np.float64]) -> ObjectPose:

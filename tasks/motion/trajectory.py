@@ -39,19 +39,12 @@ class Waypoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """A motion sampled once a timestep; row k is what holds at the end of step k.
+    """A motion sampled once a timestep; row k is what holds at the end of step k."""
 
-    Attributes:
-        qpos_rad: Planned arm joints. Shape (N, 7).
-        arm_command_rad: Commands to the arm's position servos. Shape (N, 7).
-        opening_m: Command to each finger. Shape (N,).
-        last_step: Index of the last step of each waypoint's motion, by name.
-    """
-
-    qpos_rad: Floats
-    arm_command_rad: Floats
-    opening_m: Floats
-    last_step: dict[str, int]
+    qpos_rad: Floats  #: planned arm joints. Shape (N, 7).
+    arm_command_rad: Floats  #: commands to the arm's position servos. Shape (N, 7).
+    opening_m: Floats  #: command to each finger. Shape (N,).
+    last_step: dict[str, int]  #: index of the last step of each waypoint's motion, by name
 
 
 @lru_cache(maxsize=512)

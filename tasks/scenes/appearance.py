@@ -16,29 +16,17 @@ _CHANNELS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Appearance:
-    """Half-widths of uniform variation about the nominal scene; 0 means fixed.
+    """Half-widths of uniform variation about the nominal scene; 0 means fixed."""
 
-    Attributes:
-        name: The level's name.
-        object_offset_m: Of every loose object's start, along x and along y.
-        object_yaw_rad: Of every loose object's start.
-        hand_offset_m: Of the human's hand, along each axis, every frame until an object lies in its palm.
-        hand_yaw_rad: Of the human's hand about the vertical through its fingertip, every frame.
-        light_fraction: Of the brightness of all lights together, every frame.
-        color_fraction: Of each color channel of each material, every frame.
-        camera_offset_m: Of the agent's camera, along each axis, every frame.
-        camera_angle_rad: Of the agent's camera, about each axis, every frame.
-    """
-
-    name: str
-    object_offset_m: float
-    object_yaw_rad: float
-    hand_offset_m: float = 0.0
-    hand_yaw_rad: float = 0.0
-    light_fraction: float = 0.0
-    color_fraction: float = 0.0
-    camera_offset_m: float = 0.0
-    camera_angle_rad: float = 0.0
+    name: str  #: the level's name
+    object_offset_m: float  #: of every loose object's start, along x and along y
+    object_yaw_rad: float  #: of every loose object's start
+    hand_offset_m: float = 0.0  #: of the human's hand, along each axis, every frame until an object lies in its palm
+    hand_yaw_rad: float = 0.0  #: of the human's hand about the vertical through its fingertip, every frame
+    light_fraction: float = 0.0  #: of the brightness of all lights together, every frame
+    color_fraction: float = 0.0  #: of each color channel of each material, every frame
+    camera_offset_m: float = 0.0  #: of the agent's camera, along each axis, every frame
+    camera_angle_rad: float = 0.0  #: of the agent's camera, about each axis, every frame
 
     @property
     def varies_every_frame(self) -> bool:

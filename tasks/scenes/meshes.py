@@ -17,15 +17,10 @@ _CAP_RAD = np.pi / 4
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes:
-        vertices: Shape (V, 3), metres.
-        faces: Vertex indices. Shape (F, 3).
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: NDArray[np.float64]  #: shape (V, 3), metres
+    faces: NDArray[np.int64]  #: vertex indices. Shape (F, 3).
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:

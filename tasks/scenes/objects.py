@@ -30,19 +30,12 @@ _MASS_KG, _SQUEEZE_M = 0.10, 0.004
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSpec:
-    """One object as planning and reading see it.
+    """One object as planning and reading see it."""
 
-    Attributes:
-        name: Of its body; ``<name>_joint`` is its free joint.
-        grip_height_m: The body's origin above what it stands on.
-        grip_opening_m: Each finger's distance from the grip's middle when its tips touch the object.
-        upright: Whether it has a right way up and a heading; a ball has neither.
-    """
-
-    name: str
-    grip_height_m: float
-    grip_opening_m: float
-    upright: bool = True
+    name: str  #: of its body; ``<name>_joint`` is its free joint
+    grip_height_m: float  #: the body's origin above what it stands on
+    grip_opening_m: float  #: each finger's distance from the grip's middle when its tips touch the object
+    upright: bool = True  #: whether it has a right way up and a heading; a ball has neither
 
     @property
     def squeeze_m(self) -> float:

@@ -48,6 +48,15 @@ def test_the_answer_is_about_the_budget_that_tells_most(tmp_path: Path) -> None:
     assert answers[1].startswith("“imagination” solves 90.0\u00a0%, 50.0 percentage points more than DQN")
 
 
+def test_one_agent_far_ahead_does_not_choose_the_budget(tmp_path: Path) -> None:
+    agents = ("dqn", "imagination", "imagination_uncertainty", "imagination_only")
+    result = make(tmp_path, agents, (100, 200), (0, 1, 2))
+    levels = {"dqn": (20, 100), "imagination": (20, 160), "imagination_uncertainty": (20, 150)}
+    data = collect(with_successes(result, {**levels, "imagination_only": (200, 200)}))
+    assert data.spread(100) == 0.0
+    assert data.decisive_budget == 200
+
+
 def test_without_any_difference_it_is_about_the_last_budget(tmp_path: Path) -> None:
     result = make(tmp_path, ("dqn", "imagination"), (100, 200), (0, 1))
     data = collect(with_successes(result, {"dqn": (90, 100), "imagination": (90, 100)}))

@@ -10,27 +10,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-DASH = "–"
-"""Printed where there is no number; the table's caption says why."""
+DASH = "–"  # printed where there is no number; the table's caption says why
 
 
 @dataclass(frozen=True, kw_only=True)
 class Image:
-    """A finished image or figure.
+    """A finished image or figure."""
 
-    Attributes:
-        name: File name without ending.
-        png: The image, on white.
-        alt: What a reader who does not see it should know.
-        caption: The text below it.
-        svg: The same as inline SVG whose text takes the page's color; empty where there is none.
-    """
-
-    name: str
-    png: bytes
-    alt: str
-    caption: str
-    svg: str = ""
+    name: str  # file name without ending
+    png: bytes  # the image, on white
+    alt: str  # what a reader who does not see it should know
+    caption: str  # the text below it
+    svg: str = ""  # the same as inline SVG whose text takes the page's color; empty where there is none
 
     @property
     def base64(self) -> str:
@@ -40,18 +31,12 @@ class Image:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A cell of a table.
+    """A cell of a table."""
 
-    Attributes:
-        text: Its value.
-        interval: An interval, in brackets.
-        note: A second value to compare with.
-        data: Names and values of ``data-`` attributes in the page, for whoever reads it by program.
-    """
-
-    text: str
-    interval: str = ""
-    note: str = ""
+    text: str  # its value
+    interval: str = ""  # an interval, in brackets
+    note: str = ""  # a second value to compare with
+    # names and values of ``data-`` attributes in the page, for whoever reads it by program
     data: Mapping[str, object] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -61,25 +46,15 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of finished texts.
+    """A table of finished texts."""
 
-    Attributes:
-        name: Its id in the page, and the name of its CSV file where it has one.
-        header: Names of the columns.
-        rows: As many cells each.
-        caption: The text below it.
-        why_dash: Why a cell may hold a dash instead of a number; shown where one does.
-        folded: Words to unfold it by; empty for a table that is always shown.
-        prose: Whether its cells hold sentences, which are aligned to the left.
-    """
-
-    name: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str | Cell]]
-    caption: str = ""
-    why_dash: str = ""
-    folded: str = ""
-    prose: bool = False
+    name: str  # its id in the page, and the name of its CSV file where it has one
+    header: Sequence[str]  # names of the columns
+    rows: Sequence[Sequence[str | Cell]]  # as many cells each
+    caption: str = ""  # the text below it
+    why_dash: str = ""  # why a cell may hold a dash instead of a number; shown where one does
+    folded: str = ""  # words to unfold it by; empty for a table that is always shown
+    prose: bool = False  # whether its cells hold sentences, which are aligned to the left
 
     @property
     def cells(self) -> list[list[Cell]]:
@@ -95,52 +70,30 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a report.
+    """A part of a report."""
 
-    Attributes:
-        title: Its heading.
-        words: Paragraphs.
-        images: In their order.
-        tables: In their order.
-        answers: Sentences of it that belong into the short answer at the top.
-    """
-
-    title: str
-    words: Sequence[str] = ()
-    images: Sequence[Image] = ()
-    tables: Sequence[Table] = ()
-    answers: Sequence[str] = ()
+    title: str  # its heading
+    words: Sequence[str] = ()  # paragraphs
+    images: Sequence[Image] = ()  # in their order
+    tables: Sequence[Table] = ()  # in their order
+    answers: Sequence[str] = ()  # sentences of it that belong into the short answer at the top
 
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """A whole report.
+    """A whole report."""
 
-    Attributes:
-        title: Its heading.
-        subtitle: Preset, execution and the like, in one line.
-        question: What was asked.
-        answers: The short answer, a sentence each.
-        sections: In their order.
-        facts: How it was made: name and value.
-        settings: Settings of each learner as run, by title: name and value.
-        protocol: The complete protocol: name and value.
-        recordings: Paths of the recordings, below the bench.
-        files: The CSV files beside the page, by name.
-        colors: Colors of the learners, by title.
-    """
-
-    title: str
-    subtitle: str
-    question: str
-    answers: Sequence[str]
-    sections: Sequence[Section]
-    facts: Sequence[tuple[str, str]]
-    settings: Mapping[str, Sequence[tuple[str, str]]]
-    protocol: Sequence[tuple[str, str]]
-    recordings: Sequence[str]
-    files: Mapping[str, str]
-    colors: Mapping[str, str] = field(default_factory=dict)
+    title: str  # its heading
+    subtitle: str  # preset, execution and the like, in one line
+    question: str  # what was asked
+    answers: Sequence[str]  # the short answer, a sentence each
+    sections: Sequence[Section]  # in their order
+    facts: Sequence[tuple[str, str]]  # how it was made: name and value
+    settings: Mapping[str, Sequence[tuple[str, str]]]  # settings of each learner as run, by title: name and value
+    protocol: Sequence[tuple[str, str]]  # the complete protocol: name and value
+    recordings: Sequence[str]  # paths of the recordings, below the bench
+    files: Mapping[str, str]  # the CSV files beside the page, by name
+    colors: Mapping[str, str] = field(default_factory=dict)  # colors of the learners, by title
 
 
 def seconds(value: float) -> str:

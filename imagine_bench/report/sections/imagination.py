@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, reading
 from imagine_bench.store.results import BenchResult, ComparedRollout
 
-SHOWN_ROLLOUTS = 3
-"""Rollouts shown of each imagining agent: the first ones of its first seed."""
+SHOWN_ROLLOUTS = 3  # rollouts shown of each imagining agent: the first ones of its first seed
 _LOOP_ROWS = (
     ("count", "transitions compared", "{:.0f}"),
     ("correct", "macrostate right (%)", "%"),
@@ -59,19 +59,12 @@ _CARD_HIDDEN = {"format", "cardinalities"}
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderView:
-    """What the report knows of an encoder.
+    """What the report knows of an encoder."""
 
-    Attributes:
-        agents: Those that see through it.
-        identity: As in the protocol: name and beginning of the digest.
-        card: The card's contents; empty where the file is not among the bundled ones.
-        image: Real and reconstructed frames, a PNG file, or None.
-    """
-
-    agents: tuple[str, ...]
-    identity: str
-    card: dict[str, Any]
-    image: Path | None
+    agents: tuple[str, ...]  # those that see through it
+    identity: str  # as in the protocol: name and beginning of the digest
+    card: dict[str, Any]  # the card's contents; empty where the file is not among the bundled ones
+    image: Path | None  # real and reconstructed frames, a PNG file, or None
 
 
 def sections(data: ReportData) -> Iterator[Section]:
@@ -113,6 +106,8 @@ def _acceptance(data: ReportData) -> Section:
         "imagined transitions. Mean over seeds."
     )
     alt = "Share of imagined transitions that the uncertainty filter kept while training."
+    draw = functools.partial(plots.acceptance_figure, data)
+    figure = plots.image("acceptance", draw, alt=alt, caption=caption, svg=True, dpi=180)
     return Section(
         title="How much imagination is kept",
         words=(
@@ -121,11 +116,7 @@ def _acceptance(data: ReportData) -> Section:
             "whose epistemic uncertainty (what the model does not know for want of data) is too high. Two other kinds "
             "are shown beside it: aleatoric (noise) and modal (several outcomes are possible).",
         ),
-        images=[
-            plots.image(
-                "acceptance", lambda: plots.acceptance_figure(data), alt=alt, caption=caption, svg=True, dpi=180
-            )
-        ],
+        images=[figure],
     )
 
 
@@ -259,14 +250,9 @@ def encoder_views(result: BenchResult) -> list[EncoderView]:
     for identity, agents in readers.items():
         path = bundled.get(identity)
         card, image = (path.with_suffix(".json"), path.with_suffix(".png")) if path else (None, None)
-        views.append(
-            EncoderView(
-                agents=tuple(agents),
-                identity=identity,
-                card=read_json(card, "an encoder's card") if card and card.is_file() else {},
-                image=image if image and image.is_file() else None,
-            )
-        )
+        facts = read_json(card, "an encoder's card") if card and card.is_file() else {}
+        shown = image if image and image.is_file() else None
+        views.append(EncoderView(agents=tuple(agents), identity=identity, card=facts, image=shown))
     return views
 
 
@@ -281,11 +267,8 @@ def _encoders(views: Sequence[EncoderView]) -> Section:
             caption = f"{heading}: real frames the encoder never saw in training, and what it makes of them."
             alt = "Real frames and what the encoder keeps of them"
             images.append(Image(name=f"encoder-{name}", png=content, alt=alt, caption=caption))
-        rows = [
-            [_CARD_NAMES.get(key, key), _card_text(key, value)]
-            for key, value in view.card.items()
-            if key not in _CARD_HIDDEN
-        ]
+        shown = {key: value for key, value in view.card.items() if key not in _CARD_HIDDEN}
+        rows = [[_CARD_NAMES.get(key, key), _card_text(key, value)] for key, value in shown.items()]
         missing = "" if rows else "It is not one of the bundled encoders, so its card is beside its file and not here."
         tables.append(Table(name=f"card-{name}", header=[heading, "its card"], rows=rows, caption=missing, prose=True))
     return Section(

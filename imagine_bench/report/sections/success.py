@@ -9,13 +9,7 @@ from imagine_bench import statistics
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
-from imagine_bench.report.text import (
-    agent_words,
-    interval_text,
-    lasting,
-    percent,
-    signed_percent,
-)
+from imagine_bench.report.text import agent_words, interval_text, lasting, percent, signed_percent
 
 
 def compared(data: ReportData) -> Section:
@@ -27,6 +21,7 @@ def compared(data: ReportData) -> Section:
         if data.result.protocol.execution == "physics"
         else "In kinematic execution the outcome of a macro-action is set directly, without contact physics."
     )
+    rows = [agent_words(agent) for agent in data.scores]
     return Section(
         title="What was compared",
         words=(
@@ -37,11 +32,7 @@ def compared(data: ReportData) -> Section:
             f"{facts.mean_plan_length:.2f} macro-actions on average; the chance level ({percent(facts.chance_level)} "
             "%) is what blind choice reaches. Both are computed exactly from the rules.",
         ),
-        tables=(
-            Table(
-                name="agents", header=["agent", "what it does"], rows=[agent_words(a) for a in data.scores], prose=True
-            ),
-        ),
+        tables=(Table(name="agents", header=["agent", "what it does"], rows=rows, prose=True),),
     )
 
 
@@ -158,12 +149,8 @@ def area(data: ReportData) -> Section:
 def _estimate(
     estimate: statistics.Estimate, words: Callable[[float], str], data: dict[str, object], note: str = ""
 ) -> Cell:
-    return Cell(
-        text=words(estimate.value),
-        interval=interval_text(estimate.low, estimate.high, words),
-        note=note,
-        data=data,
-    )
+    interval = interval_text(estimate.low, estimate.high, words)
+    return Cell(text=words(estimate.value), interval=interval, note=note, data=data)
 
 
 def _heads(first: str, data: ReportData) -> list[str]:
@@ -179,6 +166,7 @@ def gain(data: ReportData) -> Section:
         caption="Gain of the means over seeds; bands: 95 % interval over seeds (bootstrap). Diamonds: the thesis (its "
         "means alone).",
     ) if near else None  # fmt: skip
+    why_dash = "DQN solved nothing to compare with"
     differences: list[list[str | Cell]] = [[agent_words(agent).title] for agent in data.comparisons]
     gains: list[list[str | Cell]] = [[agent_words(agent).title] for agent in data.comparisons]
     for difference, relative, (agent, rows) in zip(differences, gains, data.comparisons.items(), strict=True):
@@ -196,12 +184,7 @@ def gain(data: ReportData) -> Section:
         images=[figure] if figure else [],
         tables=(
             Table(name="differences", header=_heads("difference (points) after", data), rows=differences),
-            Table(
-                name="gains",
-                header=_heads("gain (%) after", data),
-                rows=gains,
-                why_dash="DQN solved nothing to compare with",
-            ),
+            Table(name="gains", header=_heads("gain (%) after", data), rows=gains, why_dash=why_dash),
         ),
     )
 
