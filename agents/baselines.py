@@ -10,61 +10,8 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 
 
-class RandomAgent:
-    """Uniformly random macro-actions, when it is tested too.
-
-    Args:
-        n_actions: A.
-        rng: Draws them.
-    """
-
-    def __init__(self, n_actions: int, rng: np.random.Generator) -> None:
-        self._n_actions, self._rng = n_actions, rng
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        """Any action, each equally likely."""
-        return int(self._rng.integers(self._n_actions))
-
-    def observe(self, transition: Transition, *, episode: int) -> None:
-        """Learn nothing."""
-
-    def diagnostics(self) -> dict[str, float]:
-        """Nothing is measured."""
-        return {}
-
-    def state(self) -> AgentState:
-        """The generator's state."""
-        return AgentState(arrays={}, values={"generator": self._rng.bit_generator.state})
-
-    def restore(self, state: AgentState) -> None:
-        """Take up a generator's state.
-
-        Raises:
-            ArtefactError: The snapshot is of another agent.
-        """
-        _require_only(state, {"generator"})
-        self._rng.bit_generator.state = state.values["generator"]
-
-
-class OracleAgent:
-    """An optimal action of the rules in the true macrostate.
-
-    Args:
-        optimal_action: The rules' optimal policy.
-    """
-
-    def __init__(self, optimal_action: Callable[[tuple[int, ...]], int]) -> None:
-        self._optimal_action = optimal_action
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        """The optimal action.
-
-        Raises:
-            InvalidValueError: The observation does not show the macrostate.
-        """
-        if observation.macrostate is None:
-            raise InvalidValueError("The oracle was shown no macrostate; give it privileged observations.")
-        return self._optimal_action(tuple(int(value) for value in observation.macrostate))
+class _FixedPolicy:
+    """An agent that learns nothing and measures nothing."""
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Learn nothing."""
@@ -78,17 +25,44 @@ class OracleAgent:
         return AgentState(arrays={}, values={})
 
     def restore(self, state: AgentState) -> None:
-        """Take up nothing.
+        """Take up a snapshot; ArtefactError if it is of another agent."""
+        for name in sorted((set(state.values) ^ set(self.state().values)) | set(state.arrays)):
+            raise ArtefactError(
+                f"The snapshot differs from this agent's in {name!r}; it is of another agent or damaged."
+            )
 
-        Raises:
-            ArtefactError: The snapshot is of another agent.
-        """
-        _require_only(state, set())
+
+class RandomAgent(_FixedPolicy):
+    """Uniformly random macro-actions, when it is tested too."""
+
+    def __init__(self, n_actions: int, rng: np.random.Generator) -> None:
+        self._n_actions, self._rng = n_actions, rng
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Any action, each equally likely."""
+        return int(self._rng.integers(self._n_actions))
+
+    def state(self) -> AgentState:
+        """The generator's state."""
+        return AgentState(arrays={}, values={"generator": self._rng.bit_generator.state})
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a generator's state; ArtefactError if the snapshot is of another agent."""
+        super().restore(state)
+        self._rng.bit_generator.state = state.values["generator"]
 
 
-def _require_only(state: AgentState, values: set[str]) -> None:
-    for name in sorted((set(state.values) ^ values) | set(state.arrays)):
-        raise ArtefactError(f"The snapshot differs from this agent's in {name!r}; it is of another agent or damaged.")
+class OracleAgent(_FixedPolicy):
+    """An optimal action of the rules in the true macrostate."""
+
+    def __init__(self, optimal_action: Callable[[tuple[int, ...]], int]) -> None:
+        self._optimal_action = optimal_action
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """The optimal action; InvalidValueError if the observation does not show the macrostate."""
+        if observation.macrostate is None:
+            raise InvalidValueError("The oracle was shown no macrostate; give it privileged observations.")
+        return self._optimal_action(tuple(int(value) for value in observation.macrostate))
 
 
 def make_random(context: AgentContext) -> RandomAgent:
@@ -97,11 +71,7 @@ def make_random(context: AgentContext) -> RandomAgent:
 
 
 def make_oracle(context: AgentContext) -> OracleAgent:
-    """The ``oracle`` agent.
-
-    Raises:
-        InvalidValueError: The context has no rules to ask.
-    """
+    """The ``oracle`` agent; InvalidValueError if the context has no rules to ask."""
     if context.optimal_action is None:
         raise InvalidValueError("The oracle needs the rules' optimal action in its context.")
     return OracleAgent(context.optimal_action)

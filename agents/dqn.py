@@ -31,7 +31,7 @@ def epsilon(step: int, settings: ControllerSettings) -> float:
 
 
 def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: float) -> Tensor:
-    """One-step targets ``r + gamma max_a Q(z', a)`` of rewards (B,), ends (B,) and next values (B, A). Shape (B,).
+    """One-step targets ``r + gamma max_a Q(z', a)`` (B,) of rewards (B,), ends (B,) and next values (B, A).
 
     Termination stops bootstrapping; truncation does not, since ``terminated`` is 0 there.
     """
@@ -41,11 +41,7 @@ def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: floa
 class Controller(nn.Module):
     """Action values of latents: a network, a slowly updated target network, and Adam.
 
-    Args:
-        latent_size: Z.
-        n_actions: A.
-        settings: Sizes and rates.
-        generator: Draws the initial weights; its device is the controller's.
+    The generator draws the initial weights; its device is the controller's.
     """
 
     def __init__(
@@ -61,8 +57,7 @@ class Controller(nn.Module):
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:
         """Action values of latents (N, Z). Shape (N, A)."""
-        q: Tensor = self.network(z)
-        return q
+        return self.network(z)
 
     def loss(self, batch: Batch) -> Tensor:
         """Mean squared Bellman error; no gradient flows through the targets."""
@@ -73,11 +68,7 @@ class Controller(nn.Module):
         return functional.mse_loss(q, target)
 
     def update(self, batch: Batch) -> float:
-        """One step of Adam on a batch; returns the loss before it.
-
-        Raises:
-            DivergedError: The loss is NaN or infinite; the weights are left as they were.
-        """
+        """One step of Adam; the loss before it. DivergedError, and weights as they were, if that is not finite."""
         loss = self.loss(batch)
         value = loss.item()
         if not math.isfinite(value):
@@ -94,12 +85,7 @@ class Controller(nn.Module):
 class DQN:
     """Acts epsilon-greedily on mean latents, learns from replay; each consumer of randomness has its own generator.
 
-    Args:
-        perception: Frames to posteriors of latents.
-        n_actions: A.
-        settings: All hyperparameters.
-        seeds: This agent's node of the seed tree.
-        device: Where networks and memories lie.
+    ``seeds`` is this agent's node of the seed tree, ``device`` where networks and memories lie.
     """
 
     def __init__(
@@ -134,11 +120,7 @@ class DQN:
         return int(self._values(self.controller if explore else self.tested, observation).argmax())
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Store the transition, learn from replayed ones N_R times, and from what else a subclass has.
-
-        Raises:
-            DivergedError: A loss is no longer finite.
-        """
+        """Store the transition, and learn from replayed ones N_R times; DivergedError if a loss is not finite."""
         now = self.perception.posterior(transition.observation.frame)
         then = self.perception.posterior(transition.next_observation.frame)
         self.real.add(now, transition.action, transition.reward, then, transition.terminated)
@@ -174,11 +156,7 @@ class DQN:
         return AgentState(arrays=arrays, values=values)
 
     def restore(self, state: AgentState) -> None:
-        """Take up a snapshot.
-
-        Raises:
-            ArtefactError: It does not fit this agent; nothing was changed.
-        """
+        """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         snapshot.require_fit(state, self.state())
         arrays, values = state.arrays, state.values
         snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))

@@ -23,22 +23,16 @@ from .settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSettings:
-    """The action-value network, its updates and its exploration (thesis 5.2.2).
+    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise: InvalidValueError.
 
     Attributes:
-        hidden: Units a hidden layer.
-        learning_rate: Of Adam.
         batch_size: Transitions an update, real or imagined.
         updates_per_step: Updates on real transitions a real step, N_R.
-        discount: Discount a macro-action, gamma in [0, 1]. The thesis gives none; see docs/explanation/deviations.md.
+        discount: Gamma in [0, 1], a macro-action. The thesis gives none; see docs/explanation/deviations.md.
         target_rate: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no
             target network (thesis).
-        epsilon_min: Exploration probability in the limit.
-        epsilon_max: Exploration probability at step 0.
+        epsilon_min: Exploration probability in the limit; ``epsilon_max`` that at step 0.
         epsilon_decay: Decay rate lambda, a real step.
-
-    Raises:
-        InvalidValueError: Exploration would rise.
     """
 
     hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
@@ -61,11 +55,7 @@ class ControllerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings:
-    """How many transitions are kept; the oldest go first (thesis 5.2.2).
-
-    Attributes:
-        real: Transitions that happened.
-    """
+    """How many real transitions are kept; the oldest go first (thesis 5.2.2)."""
 
     real: int = setting(50_000, COUNT)
 
@@ -84,14 +74,10 @@ CONTROLLER_3 = ControllerSettings(hidden=(512, 256), learning_rate=2.5e-4)
 FAST_3: dict[str, Override] = {
     "controller.learning_rate": Override(1e-3, "model-only training is short: a new controller learns on 3,000 steps"),
     "controller.target_rate": Override(0.02, "without a target network the values of a long chat with a human swing"),
-    "controller.epsilon_decay": Override(
-        0.001, "0.03 ends exploration after 100 steps, and the model never sees most of the 36 wrong macro-actions"
-    ),
+    "controller.epsilon_decay": Override(0.001, "at 0.03 most of the 36 wrong macro-actions stay unseen"),
 }
 FAST_5: dict[str, Override] = {
-    "controller.epsilon_decay": Override(
-        0.003, "0.03 ends exploration after 100 episodes; 13 points less with imagination (study factors)"
-    ),
+    "controller.epsilon_decay": Override(0.003, "0.03 ends exploration after 100 episodes: 13 points less (factors)"),
 }
 
 HYPERPARAMETERS = Hyperparameters(

@@ -16,17 +16,15 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 
+Posterior = tuple[Tensor, Tensor]
+"""Mean and standard deviation of latents."""
+
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """B transitions between latents.
+    """B transitions between latents ``z`` and ``next_z`` (B, Z) by ``action`` (B,), int64, with ``reward`` (B,).
 
-    Attributes:
-        z: Shape (B, Z).
-        action: Shape (B,), int64.
-        reward: Shape (B,).
-        next_z: Shape (B, Z).
-        terminated: 1 where the episode ended in a terminal state, else 0; truncation is 0. Shape (B,).
+    ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0.
     """
 
     z: Tensor
@@ -48,12 +46,17 @@ class Batch:
 
 
 class _Ring:
-    """Named columns of a fixed number of rows; a full ring overwrites its oldest ones."""
+    """Named columns of a fixed number of rows, the capacity; a full ring overwrites its oldest ones."""
 
-    def __init__(self, capacity: int, columns: dict[str, Tensor]) -> None:
-        self.capacity = capacity
-        self.added = 0
-        self._columns = columns
+    _latents: tuple[str, ...]
+    _has_outcomes = True
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
+        self.capacity, self.added = capacity, 0
+        self._columns = {name: torch.zeros(capacity, latent_size, device=device) for name in self._latents}
+        if self._has_outcomes:
+            self._columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
+            self._columns |= {name: torch.zeros(capacity, device=device) for name in ("reward", "terminated")}
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -61,15 +64,6 @@ class _Ring:
     def clear(self) -> None:
         """Forget all rows."""
         self.added = 0
-
-    def _write(self, rows: dict[str, Tensor]) -> None:
-        count = len(next(iter(rows.values())))
-        kept = min(count, self.capacity)
-        device = next(iter(self._columns.values())).device
-        index = torch.arange(self.added + count - kept, self.added + count, device=device) % self.capacity
-        for name, values in rows.items():
-            self._columns[name][index] = values[-kept:]
-        self.added += count
 
     def _draw(self, count: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
         if self.added == 0:
@@ -92,29 +86,12 @@ class _Ring:
 
 
 class RealMemory(_Ring):
-    """Transitions that happened, as posteriors of their latents.
+    """Transitions that happened, as posteriors of their latents."""
 
-    Args:
-        capacity: Largest number of transitions.
-        latent_size: Z.
-        device: Where the rows lie.
-    """
-
-    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
-        latents = ("mu", "sigma", "next_mu", "next_sigma")
-        columns = {name: torch.zeros(capacity, latent_size, device=device) for name in latents}
-        columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
-        columns["reward"] = torch.zeros(capacity, device=device)
-        columns["terminated"] = torch.zeros(capacity, device=device)
-        super().__init__(capacity, columns)
+    _latents = ("mu", "sigma", "next_mu", "next_sigma")
 
     def add(
-        self,
-        posterior: tuple[Tensor, Tensor],
-        action: int,
-        reward: float,
-        next_posterior: tuple[Tensor, Tensor],
-        terminated: bool,
+        self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool
     ) -> None:
         """Store one transition between posteriors (mu, sigma), each of shape (Z,)."""
         row, columns = self.added % self.capacity, self._columns
@@ -124,24 +101,16 @@ class RealMemory(_Ring):
         self.added += 1
 
     def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
-        """Draw transitions with replacement, and latents from their posteriors.
+        """Draw transitions with replacement, and latents with ``spread`` times their posteriors' standard deviation.
 
-        Args:
-            count: B.
-            generator: Draws rows and latents.
-            spread: Latents are sampled with this many times the posterior's standard deviation.
-            balance: A transition's probability is proportional to n ** -balance, with n the number of those of the same
-                reward and end: 0 makes all transitions equally likely, 1 all outcomes.
+        A transition's probability is proportional to n ** -balance, with n the number of those of the same reward and
+        end: 0 makes all transitions equally likely, 1 all outcomes.
         """
         rows = self._draw(count, generator, self._weights(balance) if balance else None)
         noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * spread
-        return Batch(
-            z=torch.addcmul(rows["mu"], rows["sigma"], noise[0]),
-            action=rows["action"],
-            reward=rows["reward"],
-            next_z=torch.addcmul(rows["next_mu"], rows["next_sigma"], noise[1]),
-            terminated=rows["terminated"],
-        )
+        z = torch.addcmul(rows["mu"], rows["sigma"], noise[0])
+        next_z = torch.addcmul(rows["next_mu"], rows["next_sigma"], noise[1])
+        return Batch(z, rows["action"], rows["reward"], next_z, rows["terminated"])
 
     def _weights(self, balance: float) -> Tensor:
         """Unnormalised probabilities of the filled rows. Shape (N,)."""
@@ -155,20 +124,11 @@ class RealMemory(_Ring):
 
 
 class StartMemory(_Ring):
-    """Posteriors of the latents that real episodes began with.
+    """Posteriors of the latents that real episodes began with."""
 
-    Args:
-        capacity: Largest number of starts.
-        latent_size: Z.
-        device: Where the rows lie.
-    """
+    _latents, _has_outcomes = ("mu", "sigma"), False
 
-    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
-        super().__init__(
-            capacity, {name: torch.zeros(capacity, latent_size, device=device) for name in ("mu", "sigma")}
-        )
-
-    def add(self, posterior: tuple[Tensor, Tensor]) -> None:
+    def add(self, posterior: Posterior) -> None:
         """Store the posterior (mu, sigma) of one start, each of shape (Z,)."""
         row = self.added % self.capacity
         self._columns["mu"][row], self._columns["sigma"][row] = posterior
@@ -182,24 +142,17 @@ class StartMemory(_Ring):
 
 
 class ImaginedMemory(_Ring):
-    """Transitions that were imagined.
+    """Transitions that were imagined."""
 
-    Args:
-        capacity: Largest number of transitions.
-        latent_size: Z.
-        device: Where the rows lie.
-    """
-
-    def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
-        columns = {name: torch.zeros(capacity, latent_size, device=device) for name in ("z", "next_z")}
-        columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
-        columns["reward"] = torch.zeros(capacity, device=device)
-        columns["terminated"] = torch.zeros(capacity, device=device)
-        super().__init__(capacity, columns)
+    _latents = ("z", "next_z")
 
     def add(self, batch: Batch) -> None:
         """Store every transition of a batch."""
-        self._write({name: getattr(batch, name) for name in self._columns})
+        end, kept = self.added + len(batch.z), min(len(batch.z), self.capacity)
+        index = torch.arange(end - kept, end, device=self._columns["z"].device) % self.capacity
+        for name, column in self._columns.items():
+            column[index] = getattr(batch, name)[-kept:]
+        self.added = end
 
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """Draw transitions with replacement."""

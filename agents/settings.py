@@ -73,7 +73,6 @@ class ConfigGroup(Generic[S]):
     """The settings of one chapter of the thesis, or of one kind of agent.
 
     Attributes:
-        published: The values of the publication.
         sets: By name of a set, what it changes of them, by dotted name.
         unused: Settings that this group does without: an override of one is checked and left out.
     """
@@ -85,11 +84,7 @@ class ConfigGroup(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Hyperparameters(Generic[S]):
-    """All settings that an agent can have, which the registry names and the bench reads.
-
-    Attributes:
-        groups: Config groups by name.
-    """
+    """All settings that an agent can have, by config group, which the registry names and the bench reads."""
 
     groups: Mapping[str, ConfigGroup[S]]
 
@@ -145,16 +140,12 @@ def checked(settings: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         if name not in declared:
             raise UnknownNameError("setting", name, declared)
         hint, allowed = declared[name]
-        found[name] = _typed(name, hint, value)
-        _require_allowed(name, allowed, found[name])
+        found[name] = typed = _typed(name, hint, value)
+        if isinstance(allowed, tuple):
+            require_known(f"value of setting {name}:", typed, allowed)
+        elif typed is not None and not allowed.holds(typed):
+            raise InvalidValueError(f"Setting {name} is {typed}; it {allowed.words}.")
     return found
-
-
-def _require_allowed(name: str, allowed: Range | tuple[str, ...], value: Any) -> None:
-    if isinstance(allowed, tuple):
-        require_known(f"value of setting {name}:", value, allowed)
-    elif value is not None and not allowed.holds(value):
-        raise InvalidValueError(f"Setting {name} is {value}; it {allowed.words}.")
 
 
 def _walk(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any, Any]]:

@@ -62,8 +62,7 @@ def load_generator(generator: torch.Generator, array: NDArray[np.uint8]) -> None
 
 def jsonable(values: dict[str, Any]) -> dict[str, Any]:
     """The values as JSON would give them back."""
-    result: dict[str, Any] = json.loads(json.dumps(values))
-    return result
+    return json.loads(json.dumps(values))
 
 
 _ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/")
@@ -72,13 +71,7 @@ _ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "
 def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = ("filtered", "settings")) -> None:
     """Check a snapshot against the agent's own: settings, names of values, and names, types and shapes of arrays.
 
-    Args:
-        given: The snapshot.
-        own: The agent's present state.
-        equal: Values that must be the same in both, where there are such.
-
-    Raises:
-        ArtefactError: It does not fit; the message names the first difference.
+    Values named in ``equal`` must be the same where there are such. ArtefactError names the first difference.
     """
     _require_same_names(given.values, own.values)
     for part in (name for name in equal if name in own.values):

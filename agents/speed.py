@@ -66,9 +66,7 @@ class _PlainMLP(nn.Module):
 class PlainWorldModel:
     """The world model in the plain torch that an expert would write: autograd, a member axis, fused Adam, float32.
 
-    Args:
-        settings: Sizes and rates; the reward and termination networks must read the next state, and share no layers.
-        draws: Draws the initial weights and the dropout masks.
+    The reward and termination networks must read the next state, and share no layers.
     """
 
     def __init__(self, latents: int, actions: int, settings: WorldModelSettings, draws: torch.Generator) -> None:
@@ -112,15 +110,9 @@ class PlainWorldModel:
                     weight.mul_((self.settings.max_norm / norm).clamp_max(1.0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ModelSpeed:
-    """CPU time of one update of the world model.
-
-    Attributes:
-        plain_ms: By :class:`PlainWorldModel`.
-        own_ms: By the suite's model.
-        precision: In which the hidden layers of that train.
-    """
+    """CPU ms of one update of :class:`PlainWorldModel` and of the suite's model, and the precision of the latter."""
 
     plain_ms: float
     own_ms: float
@@ -143,17 +135,13 @@ def model_update(hyperparameters: str, rounds: int = 25) -> ModelSpeed:
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
     own = WorldModel(LATENTS, ACTIONS, settings, draws)
     best = least_cpu_s({"plain": lambda: plain.update(batch), "own": lambda: own.update(batch, draws)}, rounds)
-    precision = settle(settings.precision, device.type)
-    return ModelSpeed(plain_ms=1e3 * best["plain"], own_ms=1e3 * best["own"], precision=precision)
+    return ModelSpeed(1e3 * best["plain"], 1e3 * best["own"], settle(settings.precision, device.type))
 
 
 def weight_samples(rows: int, samples: int, rounds: int) -> tuple[float, float]:
-    """CPU seconds of T weight samples of a regressor for a batch: in one pass, and in a loop of forward passes.
+    """CPU seconds of T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes.
 
-    Args:
-        rows: Batch size, N.
-        samples: T.
-        rounds: Readings of both, taken in turn; the least counts.
+    The two are taken in turn ``rounds`` times; the least reading counts.
     """
     prepare_torch("cpu")
     draws = torch.Generator().manual_seed(0)

@@ -30,14 +30,7 @@ _TIE = 1e-9
 
 
 class FactoredAgent:
-    """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory.
-
-    Args:
-        encoder: Frames to codes of factors.
-        n_actions: A.
-        settings: All hyperparameters.
-        seeds: This agent's node of the seed tree.
-    """
+    """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
     def __init__(self, encoder: Encoder, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
         self.n_actions, self.settings = n_actions, settings
@@ -88,13 +81,9 @@ class FactoredAgent:
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
         with self.meters.cpu_time("time/model_s"):
-            row = CodeTransition(
-                code=self.perception.code(transition.observation.frame),
-                action=transition.action,
-                following=self.perception.code(transition.next_observation.frame),
-                reward=transition.reward,
-                terminated=transition.terminated,
-            )
+            code = self.perception.code(transition.observation.frame)
+            following = self.perception.code(transition.next_observation.frame)
+            row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
             probability, unknown = self.model.probability(row)
             unexpected = probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold
             self.replay.add(row)
@@ -132,10 +121,8 @@ class FactoredAgent:
         """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no label."""
         code, action, following = last_step(self.model, self.perception.code(observation.frame), actions)
         reward, terminated = (0.0, False) if label is None else (label.reward, label.terminated)
-        labelled = label is not None
-        self.replay.add(
-            CodeTransition(code, action, following, reward, terminated, has_dynamics=False, has_reward=labelled)
-        )
+        asked = CodeTransition(code, action, following, reward, terminated, has_dynamics=False)
+        self.replay.add(asked._replace(has_reward=label is not None))
         with self.meters.cpu_time("time/model_s"):
             self.learn()
 
@@ -150,9 +137,7 @@ class FactoredAgent:
 
         ``epistemic`` is the probability that something untested decides the transition, ``modal`` that it does not
         lead where it most probably leads; a categorical model knows no Gaussian noise, so ``aleatoric`` is 0.
-
-        Raises:
-            InvalidValueError: No depth to imagine, or actions that are none.
+        InvalidValueError if there is no depth to imagine, or actions are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
         start = code = self.perception.code(frame)
@@ -169,19 +154,10 @@ class FactoredAgent:
         values = self._values(code)
         chosen = int(values.argmax()) if action is None else action
         if not self._ready:
-            return ImaginedStep(
-                action=chosen, code=code, reward=0.0, p_terminated=0.0, values=values, unknown=1.0, p_other=0.0
-            )
+            return ImaginedStep(chosen, code, reward=0.0, p_terminated=0.0, values=values, unknown=1.0, p_other=0.0)
         following, p_likeliest = self.model.sample(code, chosen, rng)
-        return ImaginedStep(
-            action=chosen,
-            code=following,
-            reward=float(self.planner.reward(code)[chosen]),
-            p_terminated=float(self.planner.p_terminated(code)[chosen]),
-            values=values,
-            unknown=float(self.planner.unknown(code)[chosen]),
-            p_other=1.0 - p_likeliest,
-        )
+        reward, p_terminated, unknown = (float(each[chosen]) for each in self.planner.outcome(code))
+        return ImaginedStep(chosen, following, reward, p_terminated, values, unknown, 1.0 - p_likeliest)
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """What it did, labels of an oracle not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""
@@ -192,31 +168,24 @@ class FactoredAgent:
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         began = self.tasks[-1] if self.tasks else 0
-        counters = {
-            "real_transitions": self.replay.count_real(began),
-            "oracle/labels": self.replay.count_labels(began),
-            "model/outcomes": len(self.model.outcomes.outcomes),
-        }
+        real, labels = self.replay.count_real(began), self.replay.count_labels(began)
+        outcomes = len(self.model.outcomes.outcomes)
+        counters = {"real_transitions": real, "oracle/labels": labels, "model/outcomes": outcomes}
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
     def state(self) -> AgentState:
         """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
         values = {
-            "learned": self.learned,
-            "tasks": list(self.tasks),
-            "exploration": self.rng.bit_generator.state,
-            "meters": self.meters.state(),
-            "settings": snapshot.jsonable(flatten(self.settings)),
-            "code_sizes": list(self.perception.sizes),
-            "n_actions": self.n_actions,
-        }
+            "learned": self.learned, "tasks": list(self.tasks), "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
+            "code_sizes": list(self.perception.sizes), "n_actions": self.n_actions,
+        }  # fmt: skip
         return AgentState(arrays=snapshot.prefixed("replay", self.replay.arrays()), values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot by learning from all that is replayed once more.
 
-        Raises:
-            ArtefactError: It does not fit this agent; nothing was changed.
+        ArtefactError if it does not fit this agent, and then nothing was changed.
         """
         snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
         self.replay.load(snapshot.below("replay", state.arrays))
@@ -231,11 +200,7 @@ class FactoredAgent:
 
 
 def make(context: AgentContext) -> FactoredAgent:
-    """The ``factored`` agent.
-
-    Raises:
-        InvalidValueError: The context's encoder gives no codes.
-    """
+    """The ``factored`` agent; InvalidValueError if the context's encoder gives no codes."""
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     prepare_torch(context.device)
     encoder = load_perception(context).encoder

@@ -29,8 +29,7 @@ class FactorPrediction:
 
     Attributes:
         expected: Predictive probability of each value. Shape (N, A, K).
-        seen: The same from observations alone: that the action leaves the factor as it is, if it was ever tried, and
-            frequencies; zeros where nothing was observed. Shape (N, A, K).
+        seen: From observations alone: staying, if ever tried, and frequencies; 0 where there are none. Shape (N, A, K).
         unknown: Weight of the prior in ``expected``. Shape (N, A).
     """
 
@@ -40,14 +39,7 @@ class FactorPrediction:
 
 
 class Table:
-    """A Dirichlet table: counts of a factor's next values for every action and every setting of its parents.
-
-    Args:
-        parents: Indices of the parents.
-        sizes: Values of every factor.
-        n_actions: A.
-        values: Values K of the factor itself.
-    """
+    """A Dirichlet table: counts of a factor's next values for every action and every setting of its parents."""
 
     def __init__(self, parents: tuple[int, ...], sizes: tuple[int, ...], n_actions: int, values: int) -> None:
         self.parents = list(parents)
@@ -56,19 +48,11 @@ class Table:
 
     def row(self, codes: Codes) -> NDArray[np.int64]:
         """The row of each code (N, P). Shape (N,)."""
-        rows: NDArray[np.int64] = codes[:, self.parents] @ self.strides
-        return rows
+        return codes[:, self.parents] @ self.strides
 
 
 class FactorDynamics:
-    """How one factor changes.
-
-    Args:
-        factor: Its index.
-        sizes: Values of every factor.
-        n_actions: A.
-        settings: Priors.
-    """
+    """How one factor changes; ``sizes`` are the numbers of values of every factor."""
 
     def __init__(self, factor: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
         self.factor, self.values, self.settings = factor, sizes[factor], settings
@@ -100,8 +84,7 @@ class FactorDynamics:
     def weights(self) -> Floats:
         """Posterior probability of each structure, an action. Shape (A, 1 + tables)."""
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
-        normalised: Floats = weight / weight.sum(axis=1, keepdims=True)
-        return normalised
+        return weight / weight.sum(axis=1, keepdims=True)
 
     def predict(self, codes: Codes) -> FactorPrediction:
         """What every action would lead to in ``codes`` (N, P)."""
@@ -119,13 +102,7 @@ class FactorDynamics:
 
 
 class Dynamics:
-    """How every factor changes.
-
-    Args:
-        sizes: Values of each of the P factors.
-        n_actions: A.
-        settings: Priors.
-    """
+    """How every factor changes; ``sizes`` are their numbers of values."""
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
         self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in range(len(sizes))]

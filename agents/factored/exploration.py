@@ -25,16 +25,9 @@ _ROUNDING = 1e-9
 def query(
     model: FactoredModel, start: Code, settings: PlanningSettings, without: Collection[tuple[Code, int]]
 ) -> NDArray[np.int64] | None:
-    """The macro-actions whose last one has the most uncertain outcome; the fewest among equals.
+    """The macro-actions (D,) whose last one has the most uncertain outcome; the fewest among equals.
 
-    Args:
-        model: Imagines.
-        start: The code seen.
-        settings: Most macro-actions, most codes that are looked at, and the uncertainty from which one asks.
-        without: Codes and actions that are not asked about.
-
-    Returns:
-        Shape (D,), or None where nothing is uncertain enough.
+    Codes and actions in ``without`` are not asked about. None where nothing is uncertain enough.
     """
     if model.outcomes.causes is None:
         return None

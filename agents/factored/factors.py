@@ -35,14 +35,8 @@ def strides(factors: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.int6
 class CodeTransition(NamedTuple):
     """One transition between codes.
 
-    Attributes:
-        code: Before.
-        action: The macro-action.
-        following: After.
-        reward: Of this task.
-        terminated: Whether the episode ended.
-        has_dynamics: Whether it happened, and so shows what follows what; False if it was only asked about.
-        has_reward: Whether reward and end are known; False if a query about it got no label.
+    ``has_dynamics``: it happened, and so shows what follows what; False if it was only asked about.
+    ``has_reward``: reward and end are known; False if a query about it got no label.
     """
 
     code: Code
@@ -55,11 +49,7 @@ class CodeTransition(NamedTuple):
 
 
 class CodeReplay:
-    """Every transition that happened or was asked about, in that order; a few integers each, so none is dropped.
-
-    Args:
-        factors: P.
-    """
+    """Every transition that happened or was asked about, in that order; a few integers each, so none is dropped."""
 
     def __init__(self, factors: int) -> None:
         self._factors = factors
@@ -91,14 +81,11 @@ class CodeReplay:
 
     def arrays(self) -> Arrays:
         """Copies of all rows, by column."""
-        shapes: dict[str, tuple[int, ...]] = {"code": (-1, self._factors), "following": (-1, self._factors)}
         types = {"code": np.int64, "action": np.int64, "following": np.int64, "reward": np.float64}
-        return {
-            name: np.array([getattr(row, name) for row in self._rows], dtype=types.get(name, np.bool_)).reshape(
-                shapes.get(name, (-1,))
-            )
-            for name in CodeTransition._fields
-        }
+        columns: Arrays = {}
+        for name in CodeTransition._fields:
+            columns[name] = np.array([getattr(row, name) for row in self._rows], dtype=types.get(name, np.bool_))
+        return columns | {name: columns[name].reshape(-1, self._factors) for name in ("code", "following")}
 
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""

@@ -21,9 +21,9 @@ class Successors:
     Attributes:
         following: Next codes. Shape (N, A, B, P).
         p_continues: Probability that this branch comes about and the episode goes on. Shape (N, A, B).
-        reward: Expected reward. Shape (N, A).
-        p_terminated: Probability that the episode ends. Shape (N, A).
-        unknown: Probability that something untested decides what happens. Shape (N, A).
+        reward: Expected reward. Shape (N, A), as of all that follow.
+        p_terminated: Probability that the episode ends.
+        unknown: Probability that something untested decides what happens.
     """
 
     following: Codes
@@ -34,13 +34,7 @@ class Successors:
 
 
 class FactoredModel:
-    """Learns from transitions between codes and predicts them.
-
-    Args:
-        sizes: Values of each of the P factors.
-        n_actions: A.
-        settings: Priors, and how many branches are followed.
-    """
+    """Learns from transitions between codes and predicts them; ``sizes`` are the numbers of values of the P factors."""
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings) -> None:
         self.n_actions, self._planning = n_actions, settings.planning
@@ -89,8 +83,7 @@ class FactoredModel:
     def sample(self, code: Code, action: int, rng: np.random.Generator) -> tuple[Code, float]:
         """Draw one next code of ``action`` in ``code`` as it was seen to happen; as expected where it never was.
 
-        Returns:
-            The code, and the probability of the likeliest one.
+        Returns the code, and the probability of the likeliest one.
         """
         following, p_likeliest = [], 1.0
         for factor in self.dynamics.predict(as_codes(code)[None]):

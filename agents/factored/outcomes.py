@@ -42,12 +42,7 @@ class _Template:
 
 
 class Conjunctions:
-    """All candidate conjunctions, numbered.
-
-    Args:
-        sizes: Values of each factor.
-        n_actions: A.
-        settings: Largest order and priors.
+    """All candidate conjunctions, numbered, of factors with so many values each.
 
     Attributes:
         group: Group of each conjunction; a group has one order, with or without the action. Shape (J,).
@@ -115,16 +110,7 @@ class Causes:
 
 
 class OutcomeModel:
-    """Predicts outcomes and says what is untested.
-
-    Args:
-        sizes: Values of each factor.
-        n_actions: A.
-        settings: Priors.
-
-    Attributes:
-        outcomes: Those seen so far.
-    """
+    """Predicts outcomes, of those seen so far, and says what is untested."""
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: OutcomeSettings) -> None:
         self.settings = settings
@@ -183,11 +169,7 @@ class OutcomeModel:
         return np.array([float(terminated) for _, terminated in self.causes.outcomes] if self.causes else [])
 
     def predict(self, codes: Codes, actions: NDArray[np.int64], following: Codes) -> tuple[Floats, Floats]:
-        """Outcome probabilities of N transitions, and the probability that something untested decides.
-
-        Returns:
-            Shapes (N, O) and (N,).
-        """
+        """Outcome probabilities (N, O) of N transitions, and the probability that something untested decides (N,)."""
         causes = self.causes
         assert causes is not None, "fit before predicting"
         active, settings = self.conjunctions.active(codes, actions, following), self.settings

@@ -20,15 +20,11 @@ ACCEPTED = 0.5
 """A transition of which more than this is unknown is not accepted, and neither is what follows from it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ImaginedStep:
-    """One imagined transition.
+    """One imagined transition to ``code``, with expected reward and the probability that the episode ends.
 
     Attributes:
-        action: The macro-action.
-        code: The code it leads to.
-        reward: Expected reward.
-        p_terminated: Probability that the episode ends.
         values: Value of every action before it. Shape (A,).
         unknown: Probability that something untested decides.
         p_other: Probability that it leads elsewhere than to the likeliest code.
@@ -44,14 +40,9 @@ class ImaginedStep:
 
 
 class CodePerception:
-    """Frames to codes as the model takes them, and back.
+    """Frames to codes as the model takes them, and back; ``sizes`` are the numbers of values of the P factors.
 
-    Args:
-        encoder: A discrete encoder.
-        factored: Whether a code has one value a factor of the encoder; otherwise the whole code is one factor.
-
-    Attributes:
-        sizes: Values of each factor of a code. Length P.
+    Where it is not ``factored``, the encoder's whole code is one factor.
     """
 
     def __init__(self, encoder: Encoder, *, factored: bool) -> None:

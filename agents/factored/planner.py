@@ -27,12 +27,7 @@ Objective = Literal["value", "optimistic", "novelty"]
 
 
 class Planner:
-    """Plans with one model; :meth:`clear` what was predicted whenever the model has learned.
-
-    Args:
-        model: Predicts.
-        settings: How far and how broadly.
-    """
+    """Plans with one model; :meth:`clear` what was predicted whenever the model has learned."""
 
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
         self._model, self._settings = model, settings
@@ -54,33 +49,20 @@ class Planner:
         return len(self._reward)
 
     def values(self, code: Code, objective: Objective = "value") -> Floats:
-        """What each action is worth. Shape (A,).
+        """What each action in ``code`` is worth. Shape (A,).
 
-        Args:
-            code: Where it would be done.
-            objective: ``"value"``, the expected discounted reward; ``"optimistic"``, the same if whatever is unknown
-                brought the largest reward seen; or ``"novelty"``, the largest discounted chance of meeting something
-                unknown.
+        ``"value"`` is the expected discounted reward; ``"optimistic"`` the same if whatever is unknown brought the
+        largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown.
         """
         row = self._row(code)
         if objective not in self._planned:
             self._planned[objective] = self._back_up(objective)
         return np.asarray(self._planned[objective][row])
 
-    def unknown(self, code: Code) -> Floats:
-        """How much of what each action does at once is unknown. Shape (A,)."""
+    def outcome(self, code: Code) -> tuple[Floats, Floats, Floats]:
+        """Expected reward of each action, P(it ends the episode), and how much it does is unknown: three (A,)."""
         row = self._row(code)
-        return np.asarray(self._unknown[row])
-
-    def reward(self, code: Code) -> Floats:
-        """Expected reward of each action. Shape (A,)."""
-        row = self._row(code)
-        return np.asarray(self._reward[row])
-
-    def p_terminated(self, code: Code) -> Floats:
-        """Probability that each action ends the episode. Shape (A,)."""
-        row = self._row(code)
-        return np.asarray(self._ends[row])
+        return self._reward[row], self._ends[row], self._unknown[row]
 
     def _back_up(self, objective: Objective) -> Floats:
         """Action values of every expanded code, ``depth`` macro-actions deep. Shape (expanded, A)."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,27 +32,15 @@ _Kind = TypeVar("_Kind", bound="ImaginingAgent")
 class ImaginingAgent(DQN):
     """Algorithm 1: a DQN that also learns a world model, and from what that imagines.
 
-    Args:
-        perception: Frames to posteriors of latents.
-        n_actions: A.
-        settings: All hyperparameters.
-        seeds: This agent's node of the seed tree.
-        device: Where networks and memories lie.
-        filtered: Whether transitions of too large an epistemic uncertainty are discarded.
+    ``filtered`` says whether transitions of too large an epistemic uncertainty are discarded.
     """
 
     settings: Settings
 
     def __init__(
-        self,
-        perception: Perception,
-        n_actions: int,
-        settings: Settings,
-        seeds: SeedTree,
-        device: torch.device,
-        *,
+        self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
         filtered: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(perception, n_actions, settings, seeds, device)
         size, node = perception.latent_size, seeds.child("imagination")
         self.imagination = Imagination(size, n_actions, settings, filtered=filtered, seeds=node, device=device)
@@ -63,11 +52,11 @@ class ImaginingAgent(DQN):
         """
         self.learn_model()
         settings = self.settings.imagination
-        if episode >= settings.start_episode:
-            ended = settings.end_episode is not None and episode >= settings.end_episode
-            if not ended:
-                self._imagine(z)
-            self.learn_values(self.real if ended else self.imagination.memory, settings.updates_per_step)
+        if settings.end_episode is not None and episode >= settings.end_episode:
+            self.learn_values(self.real, settings.updates_per_step)
+        elif episode >= settings.start_episode:
+            self._imagine(z)
+            self.learn_values(self.imagination.memory, settings.updates_per_step)
         self.meters.count("time/imagination_s")
 
     def learn_model(self) -> None:
@@ -84,8 +73,8 @@ class ImaginingAgent(DQN):
         self.meters.count("time/model_s")
 
     def _imagine(self, z: Tensor) -> None:
-        chance = epsilon(self.steps, self.settings.controller)
         with self.meters.cpu_time("time/imagination_s"):
+            chance = epsilon(self.steps, self.settings.controller)
             counts = self.imagination.rollouts(self.controller, z, self.real, chance)
         self.meters.add("imagination/acceptance_rate", counts.accepted, counts.predicted)
         self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
@@ -96,17 +85,13 @@ class ImaginingAgent(DQN):
 
     def state(self) -> AgentState:
         """A snapshot, world model and imagined memory included."""
-        base, own = super().state(), self.imagination
-        arrays = {**base.arrays, **snapshot.prefixed("imagination", own.arrays())}
-        values = {**base.values, "filtered": own.filtered, "imagined_added": own.memory.added}
-        return AgentState(arrays=arrays, values=values)
+        state, own = super().state(), self.imagination
+        state.arrays.update(snapshot.prefixed("imagination", own.arrays()))
+        state.values.update(filtered=own.filtered, imagined_added=own.memory.added)
+        return state
 
     def restore(self, state: AgentState) -> None:
-        """Take up a snapshot.
-
-        Raises:
-            ArtefactError: It does not fit this agent; nothing was changed.
-        """
+        """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
         self.imagination.load(snapshot.below("imagination", state.arrays), state.values["imagined_added"])
 
@@ -127,29 +112,18 @@ class ImaginingAgent(DQN):
     ) -> ImaginedRollout:
         """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.capabilities.Imaginer`.
 
-        Raises:
-            InvalidValueError: No depth to imagine, or actions that are none.
+        InvalidValueError if there is no depth to imagine, or actions are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
-        start, _ = self.perception.posterior(frame)
-        steps = list(self._unroll(start.unsqueeze(0), planned, depth, rng))
-        return self._rollout(start.unsqueeze(0), steps)
+        start = self.perception.posterior(frame)[0].unsqueeze(0)  # [1, Z]
+        return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
     def sample_futures(
-        self,
-        frames: Frame,
-        actions: NDArray[np.int64],
-        *,
-        follow: Follow,
-        samples: int,
-        depth: int,
+        self, frames: Frame, actions: NDArray[np.int64], *, follow: Follow, samples: int, depth: int,
         rng: np.random.Generator,
-    ) -> SampledFutures:
+    ) -> SampledFutures:  # fmt: skip
         """Imagine many futures of the same beginnings; see :class:`imagine_bench.capabilities.FutureSampler`."""
-        encoder = self.perception.encoder
-        return sample_futures(
-            self.imagination, encoder, frames, actions, follow=follow, samples=samples, depth=depth, rng=rng
-        )
+        return sample_futures(self.imagination, self.perception.encoder, frames, actions, follow, samples, depth, rng)
 
     def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """The likeliest results of actions; see :class:`imagine_bench.capabilities.MapPredictor`."""
@@ -182,24 +156,22 @@ class ImaginingAgent(DQN):
         values, actions, imagined = zip(*steps, strict=True)
         encoder, imagination = self.perception.encoder, self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
-        kept = torch.cat([imagination.keeps(step) for step in imagined]).cpu().numpy()  # [D]
-
         parts = [decompose(step.samples) for step in imagined]
 
-        def reduced(cause: str) -> NDArray[np.float32]:
-            return torch.cat([imagination.score(getattr(part, cause)) for part in parts]).cpu().numpy()
+        def joined(values: Iterable[Tensor]) -> NDArray[Any]:
+            return torch.cat(list(values)).cpu().numpy()
 
         return ImaginedRollout(
-            actions=torch.cat(actions).cpu().numpy(),
+            actions=joined(actions),
             frames=encoder.decode(latents),
             start_frame=encoder.decode(start)[0],
-            rewards=torch.cat([step.reward for step in imagined]).cpu().numpy(),
-            p_terminated=torch.cat([step.p_terminated for step in imagined]).cpu().numpy(),
-            q_values=torch.cat(values).cpu().numpy(),
-            epistemic=reduced("epistemic"),
-            aleatoric=reduced("aleatoric"),
-            modal=reduced("modal"),
-            accepted=np.logical_and.accumulate(kept),
+            rewards=joined(step.reward for step in imagined),
+            p_terminated=joined(step.p_terminated for step in imagined),
+            q_values=joined(values),
+            epistemic=joined(imagination.score(part.epistemic) for part in parts),
+            aleatoric=joined(imagination.score(part.aleatoric) for part in parts),
+            modal=joined(imagination.score(part.modal) for part in parts),
+            accepted=np.logical_and.accumulate(joined(imagination.keeps(step) for step in imagined)),
             macrostates=encoder.read_macrostate(latents),
         )
 
@@ -213,11 +185,7 @@ def build(kind: type[_Kind], context: AgentContext, *, filtered: bool) -> _Kind:
     return kind(perception, context.n_actions, settings, context.seeds, device, filtered=filtered)
 
 
-def make(context: AgentContext) -> ImaginingAgent:
-    """The ``imagination`` agent: algorithm 1 without the filter."""
-    return build(ImaginingAgent, context, filtered=False)
-
-
-def make_uncertainty(context: AgentContext) -> ImaginingAgent:
-    """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
-    return build(ImaginingAgent, context, filtered=True)
+make = partial(build, ImaginingAgent, filtered=False)
+"""The ``imagination`` agent: algorithm 1 without the filter."""
+make_uncertainty = partial(build, ImaginingAgent, filtered=True)
+"""The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""

@@ -18,27 +18,12 @@ _PREDICTIONS = 20_000
 
 
 def sample_futures(
-    imagination: Imagination,
-    encoder: Encoder,
-    frames: Frame,
-    actions: NDArray[np.int64],
-    *,
-    follow: Follow,
-    samples: int,
-    depth: int,
-    rng: np.random.Generator,
-) -> SampledFutures:
-    """Imagine futures in closed loop; see :class:`imagine_bench.capabilities.FutureSampler`.
+    imagination: Imagination, encoder: Encoder, frames: Frame, actions: NDArray[np.int64], follow: Follow, samples: int,
+    depth: int, rng: np.random.Generator,
+) -> SampledFutures:  # fmt: skip
+    """Imagine D macro-actions of S futures of R rows; see :class:`imagine_bench.capabilities.FutureSampler`.
 
-    Args:
-        imagination: The world model; the filter is not asked.
-        encoder: Frames to latents, and latents to macrostates.
-        frames: Shape (R, 64, 64, 3).
-        actions: Shape (R,).
-        follow: Chooses the later macro-actions.
-        samples: Futures of each row, S.
-        depth: Macro-actions of each future, D.
-        rng: Draws everything.
+    The filter is not asked. Frames are (R, 64, 64, 3), first macro-actions (R,); ``follow`` chooses the later ones.
     """
     generator = torch.Generator(encoder.device).manual_seed(int(rng.integers(2**63)))
     z = encoder.encode(frames)[0].repeat_interleave(samples, dim=0)  # [R S, Z]
@@ -76,7 +61,5 @@ def _predict(
     size = max(1, _PREDICTIONS // samples)
     parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)
     steps = [imagination.step(*part, weights, generator) for part in parts]
-    next_z, reward, p_terminated = (
-        torch.cat([getattr(step, name) for step in steps]) for name in ("next_z", "reward", "p_terminated")
-    )
-    return next_z, reward, p_terminated
+    next_z, rewards, ends = zip(*((step.next_z, step.reward, step.p_terminated) for step in steps), strict=True)
+    return torch.cat(next_z), torch.cat(rewards), torch.cat(ends)

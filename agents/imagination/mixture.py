@@ -41,15 +41,10 @@ def output_size(components: int, dimensions: int) -> int:
 def from_outputs(
     outputs: Tensor, components: int, dimensions: int, log_sigma_floor: float, log_sigma_ceiling: float = math.inf
 ) -> Mixture:
-    """Read network outputs as mixtures: softmax coefficients, linear means, linear log variances.
+    """Read network outputs (..., output_size(K, Z)): softmax coefficients, linear means, linear log variances.
 
-    Args:
-        outputs: Shape (..., output_size(K, Z)).
-        components: K.
-        dimensions: Z.
-        log_sigma_floor: Smallest log sigma, approached smoothly: a hard clamp would leave no gradient below it.
-        log_sigma_ceiling: Largest log sigma, approached as smoothly: far from all data a linear output has no bound,
-            and a variance that overflows spoils every sum it is in.
+    The smallest log sigma is approached smoothly: a hard clamp would leave no gradient below it. So is the largest: far
+    from all data a linear output has no bound, and a variance that overflows spoils every sum it is in.
     """
     logits, means, log_variances = outputs.split((components, *2 * (components * dimensions,)), dim=-1)
     shape = (*outputs.shape[:-1], components, dimensions)
@@ -67,8 +62,7 @@ def log_likelihood(mixture: Mixture, targets: Tensor) -> Tensor:
     normal = distributions.Normal(mixture.means, mixture.log_sigmas.exp(), validate_args=False)
     components = distributions.Independent(normal, 1, validate_args=False)
     weights = distributions.Categorical(logits=mixture.log_weights, validate_args=False)
-    log_p: Tensor = distributions.MixtureSameFamily(weights, components, validate_args=False).log_prob(targets)
-    return log_p
+    return distributions.MixtureSameFamily(weights, components, validate_args=False).log_prob(targets)
 
 
 def mean(mixture: Mixture) -> Tensor:
@@ -83,15 +77,9 @@ def likeliest(mixture: Mixture) -> Tensor:
 
 
 def sample(mixture: Mixture, temperature: float, generator: torch.Generator) -> Tensor:
-    """Sample a component by its coefficient, then a value of it.
+    """Sample a component of each of N mixtures by its coefficient, then a value of it. Shape (N, Z).
 
-    Args:
-        mixture: Mixtures with one leading axis N.
-        temperature: Scale of the component's standard deviation: 0 gives its mean, 1 the thesis' sample.
-        generator: Draws components and noise.
-
-    Returns:
-        One value a mixture. Shape (N, Z).
+    ``temperature`` scales the component's standard deviation: 0 gives its mean, 1 the thesis' sample.
     """
     chosen = torch.multinomial(mixture.log_weights.exp(), 1, generator=generator)  # [N, 1]
     index = chosen.unsqueeze(-1).expand(-1, 1, mixture.means.shape[-1])  # [N, 1, Z]
@@ -106,14 +94,8 @@ def average(mixtures: Mixture, members: int = 1) -> Mixture:
     """Average coefficients, means and variances over weight samples (thesis 4.4), for each member of an ensemble.
 
     Weight samples of one network describe the same components and are averaged one by one; those of different networks
-    do not, so an ensemble's prediction is all their components side by side, each member with the same share.
-
-    Args:
-        mixtures: With a leading axis of E T samples, member by member.
-        members: E.
-
-    Returns:
-        Mixtures without that axis, of E K components.
+    do not, so an ensemble's prediction is all their components side by side, each member with the same share. The
+    leading axis of E T samples, member by member, goes; the result has E K components.
     """
 
     def mean_by_member(values: Tensor) -> tuple[Tensor, ...]:

@@ -8,10 +8,12 @@ real transition is ever learned from.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from imagine_bench.interfaces import AgentContext, AgentState, Transition
+from imagine_bench.interfaces import AgentState, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -28,17 +30,10 @@ _STARTS = 1_000
 
 
 class ModelOnlyTraining:
-    """Trains a new controller in a world model, an imagined episode at a time.
+    """Trains a new controller in a world model, an imagined episode at a time; changes only a threshold that moves.
 
     Every training draws from generators of its own, named by the real step that it begins at, so it is the same whether
-    earlier ones took place or not.
-
-    Args:
-        imagination: The world model that stands for the world, and its filter; only a threshold that moves is changed.
-        n_actions: A.
-        settings: All hyperparameters of the agent.
-        seeds: This training's node of the seed tree.
-        device: Where networks and memory lie.
+    earlier ones took place or not. ``seeds`` is this training's node of the seed tree.
     """
 
     def __init__(
@@ -60,15 +55,8 @@ class ModelOnlyTraining:
     def episode(self, starts: StartMemory, real: RealMemory, meters: Meters) -> None:
         """Imagine one episode from a replayed start, learning at every step of it.
 
-        The filter, where there is one, ends it before the first transition that it discards.
-
-        Args:
-            starts: Where real episodes began.
-            real: Read by a moving threshold only, not learned from.
-            meters: Told the losses, and how much was kept.
-
-        Raises:
-            DivergedError: The controller's loss is no longer finite.
+        The filter, where there is one, ends it before the first transition that it discards. ``real`` is read by a
+        moving threshold only. DivergedError if the controller's loss is no longer finite.
         """
         imagination, settings, generator = self.imagination, self.settings.imagination, self._generator
         weights = imagination.draw_weights(generator)
@@ -83,7 +71,10 @@ class ModelOnlyTraining:
                 break
             terminated = step.p_terminated > TERMINAL
             self._memory.add(Batch(z, action, step.reward, step.next_z, terminated.float()))
-            self._learn(meters)
+            for _ in range(self.settings.controller.updates_per_step):
+                batch = self._memory.sample(self.settings.controller.batch_size, generator)
+                meters.add("loss/bellman_imagined", self.controller.update(batch))
+            self.steps += 1
             kept, z = kept + 1, step.next_z
             if bool(terminated):
                 break
@@ -91,22 +82,16 @@ class ModelOnlyTraining:
         meters.add("imagination/mean_depth", kept)
         self.episodes += 1
 
-    def _learn(self, meters: Meters) -> None:
-        for _ in range(self.settings.controller.updates_per_step):
-            batch = self._memory.sample(self.settings.controller.batch_size, self._generator)
-            meters.add("loss/bellman_imagined", self.controller.update(batch))
-        self.steps += 1
-
     def values(self) -> dict[str, int]:
         """Counters, JSON-serialisable."""
-        counters = {"real_step": self.real_step, "episodes": self.episodes, "steps": self.steps}
-        return {**counters, "imagined": self._memory.added}
+        return {
+            "real_step": self.real_step, "episodes": self.episodes, "steps": self.steps, "imagined": self._memory.added
+        }  # fmt: skip
 
     def arrays(self) -> snapshot.Arrays:
         """Copies of weights, moments, target network, memory and generator."""
-        controller = snapshot.training_arrays(self.controller, self.controller.optimiser)
         return {
-            **snapshot.prefixed("controller", controller),
+            **snapshot.prefixed("controller", snapshot.training_arrays(self.controller, self.controller.optimiser)),
             **snapshot.prefixed("memory", self._memory.arrays()),
             "generator": snapshot.generator_array(self._generator),
         }
@@ -124,28 +109,15 @@ class ModelOnlyTraining:
 class ModelOnlyAgent(ImaginingAgent):
     """Explores with one controller, and is tested with another that was trained in the world model alone.
 
-    Args:
-        perception: Frames to posteriors of latents.
-        n_actions: A.
-        settings: All hyperparameters.
-        seeds: This agent's node of the seed tree.
-        device: Where networks and memories lie.
-        filtered: Whether imagined episodes end where the epistemic uncertainty is too large.
+    ``filtered`` says whether imagined episodes end where the epistemic uncertainty is too large.
     """
 
     def __init__(
-        self,
-        perception: Perception,
-        n_actions: int,
-        settings: Settings,
-        seeds: SeedTree,
-        device: torch.device,
-        *,
+        self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
         filtered: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(perception, n_actions, settings, seeds, device, filtered=filtered)
-        node = seeds.child("model_only")
-        self.training = ModelOnlyTraining(self.imagination, n_actions, settings, node, device)
+        self.training = ModelOnlyTraining(self.imagination, n_actions, settings, seeds.child("model_only"), device)
         self._starts = StartMemory(_STARTS, perception.latent_size, device)
         self._episode = -1
 
@@ -155,11 +127,7 @@ class ModelOnlyAgent(ImaginingAgent):
         return self.training.controller
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember where episodes begin, and learn as the DQN and its world model do.
-
-        Raises:
-            DivergedError: A loss is no longer finite.
-        """
+        """Remember where episodes begin, and learn as the DQN and its world model do; DivergedError as there."""
         if episode != self._episode:
             self._starts.add(self.perception.posterior(transition.observation.frame))
             self._episode = episode
@@ -180,8 +148,7 @@ class ModelOnlyAgent(ImaginingAgent):
     def train_in_model(self) -> bool:
         """Imagine one episode and learn from it, if any is left; real steps make training begin anew.
 
-        Raises:
-            DivergedError: The controller's loss is no longer finite.
+        DivergedError if the controller's loss is no longer finite.
         """
         if self.steps == 0:
             return False  # nothing was learned and no start was seen
@@ -199,31 +166,22 @@ class ModelOnlyAgent(ImaginingAgent):
 
     def state(self) -> AgentState:
         """A snapshot, model-only training and starts included."""
-        base = super().state()
-        arrays = {
-            **snapshot.prefixed("model_only", self.training.arrays()),
-            **snapshot.prefixed("starts", self._starts.arrays()),
-        }
-        values = {"model_only": self.training.values(), "starts_added": self._starts.added, "episode": self._episode}
-        return AgentState(arrays={**base.arrays, **arrays}, values={**base.values, **values})
+        state = super().state()
+        state.arrays.update(snapshot.prefixed("model_only", self.training.arrays()))
+        state.arrays.update(snapshot.prefixed("starts", self._starts.arrays()))
+        own = {"model_only": self.training.values(), "starts_added": self._starts.added, "episode": self._episode}
+        state.values.update(own)
+        return state
 
     def restore(self, state: AgentState) -> None:
-        """Take up a snapshot.
-
-        Raises:
-            ArtefactError: It does not fit this agent; nothing was changed.
-        """
+        """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
         self.training.load(snapshot.below("model_only", state.arrays), state.values["model_only"])
         self._starts.load(snapshot.below("starts", state.arrays), state.values["starts_added"])
         self._episode = state.values["episode"]
 
 
-def make(context: AgentContext) -> ModelOnlyAgent:
-    """The ``imagination_only`` agent."""
-    return build(ModelOnlyAgent, context, filtered=False)
-
-
-def make_uncertainty(context: AgentContext) -> ModelOnlyAgent:
-    """The ``imagination_only_uncertainty`` agent: imagined episodes end where the model is uncertain."""
-    return build(ModelOnlyAgent, context, filtered=True)
+make = partial(build, ModelOnlyAgent, filtered=False)
+"""The ``imagination_only`` agent."""
+make_uncertainty = partial(build, ModelOnlyAgent, filtered=True)
+"""The ``imagination_only_uncertainty`` agent: imagined episodes end where the model is uncertain."""

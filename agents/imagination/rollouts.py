@@ -38,11 +38,9 @@ _CALIBRATION = 64
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Weight samples that all steps of a call share.
+    """Weight samples that all steps of a call share: masks of the dynamics (E, T, H), None where nothing is dropped.
 
-    Attributes:
-        dynamics: Masks of the dynamics, (E, T, H); None drops nothing.
-        reward: Masks of the reward network, (1, T, H); None where the filter does not read it.
+    Those of the reward network are (1, T, H), None where the filter does not read it.
     """
 
     dynamics: Masks | None
@@ -51,12 +49,10 @@ class Weights:
 
 @dataclass(frozen=True, slots=True)
 class Imagined:
-    """One imagined step of N rollouts.
+    """One imagined step of N rollouts, with predicted ``reward`` and probability of the end there, (N,) each.
 
     Attributes:
         next_z: Shape (N, Z), within +-1e6; where that is reached, the closed loop has run away.
-        reward: Predicted reward. Shape (N,).
-        p_terminated: Predicted probability that the episode ends there. Shape (N,).
         samples: What each weight sample of each member predicted, with leading axes (E T, N).
         reward_std: Standard deviation of the reward over its network's weight samples, in units of reward; None where
             the filter does not read it. Shape (N,).
@@ -81,28 +77,17 @@ class Counts:
 class Imagination:
     """A world model, what it imagines, and the filter between the two.
 
-    Args:
-        latent_size: Z.
-        n_actions: A.
-        settings: All hyperparameters of the learner.
-        filtered: Whether epistemic uncertainty above a threshold discards a transition and the rest of its rollout.
-        seeds: This imagination's node of the seed tree.
-        device: Where networks and memory lie.
+    ``filtered``: epistemic uncertainty above a threshold discards a transition and the rest of its rollout.
+    ``seeds`` is this imagination's node of the seed tree, ``device`` where networks and memory lie.
 
     Raises:
         InvalidValueError: A filter is asked for, but no weight sample would differ from another.
     """
 
     def __init__(
-        self,
-        latent_size: int,
-        n_actions: int,
-        settings: Settings,
-        *,
-        filtered: bool,
-        seeds: SeedTree,
+        self, latent_size: int, n_actions: int, settings: Settings, *, filtered: bool, seeds: SeedTree,
         device: torch.device,
-    ) -> None:
+    ) -> None:  # fmt: skip
         samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
         if filtered and samples * settings.model.members == 1:
             raise InvalidValueError(
@@ -144,8 +129,7 @@ class Imagination:
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
         """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then sample z'.
 
-        Raises:
-            DivergedError: What the model predicts is NaN.
+        DivergedError if what the model predicts is NaN.
         """
         model = self.model
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]

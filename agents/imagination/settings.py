@@ -36,22 +36,19 @@ from ..settings import (
 class WorldModelSettings:
     """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.2).
 
+    Sizes are units a hidden layer, of one network with two outputs or of two networks, else: InvalidValueError.
+
     Attributes:
-        dynamics_hidden: Units a hidden layer of the dynamics network.
-        components: Gaussians in its mixture, K.
+        components: Gaussians in the mixture of the dynamics network, K.
         members: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble
             (Lakshminarayanan et al. 2017); the thesis has one.
-        reward_hidden: Units a hidden layer of the reward network.
-        termination_hidden: Units a hidden layer of the termination network.
-        shared_hidden: Units a hidden layer of one network with both outputs, instead of the two (thesis 3.2.2).
+        shared_hidden: Of one network for reward and termination, instead of the two (thesis 3.2.2).
         head_input: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
         reward_scale: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear
             above, where a rare large reward weighs little; the thesis counts in plain units, 1.
         dropout: Probability of dropping a hidden unit, the same in every network.
-        learning_rate: Of Adam (thesis 3.2.2: 1e-3).
         max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
-        updates_per_step: Model updates a real step, N_E.
-        batch_size: Transitions an update.
+        updates_per_step: Model updates a real step, N_E, of ``batch_size`` transitions each.
         spread: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1.
             Where an encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the
             few frames they saw by heart; a larger spread keeps them from it.
@@ -61,11 +58,7 @@ class WorldModelSettings:
         predict_change: Whether the mixture describes z' - z instead of z'.
         sigma_floor: Smallest standard deviation of a component, in units of z.
         gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
-        precision: In which hidden layers train. Weights, moments, output layers, losses and predictions are always
-            float32.
-
-    Raises:
-        InvalidValueError: Sizes for both one network with two outputs and two networks, or for neither.
+        precision: In which hidden layers train. All else is always float32.
     """
 
     dynamics_hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
@@ -100,7 +93,7 @@ class WorldModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginationSettings:
-    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1).
+    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1); InvalidValueError if they end before they start.
 
     Attributes:
         start_episode: First training episode that imagines, I_start.
@@ -124,9 +117,6 @@ class ImaginationSettings:
             over T of its dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
         termination_threshold: If given, the filter reads the termination network too: the largest probability that
             passes of what the model thinks less likely, that the episode ends there or that it goes on.
-
-    Raises:
-        InvalidValueError: Imagination would end before it starts.
     """
 
     start_episode: int = setting(1000, NOT_NEGATIVE)
@@ -155,11 +145,7 @@ class ImaginationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class MemorySettings(ReplaySettings):
-    """How many transitions each memory keeps; the oldest go first (thesis 5.2.2).
-
-    Attributes:
-        imagined: Transitions of the imagined memory.
-    """
+    """How many real and imagined transitions are kept; the oldest go first (thesis 5.2.2)."""
 
     imagined: int = setting(3_000, COUNT)
 
@@ -184,40 +170,25 @@ _FAST_5: dict[str, Override] = {
     "model.learning_rate": Override(2e-3, "fewer updates a step want larger ones; 1e-3: 9 points less (deviations)"),
     "model.updates_per_step": Override(4, "CPU time; sixteen alone: no gain shown (deviations)"),
     "model.batch_size": Override(128, "CPU time; 512 alone: no gain shown at 500 (deviations)"),
-    "model.spread": Override(
-        4.0, "posteriors are narrower than the looks of a macrostate vary; with 1, 12 points less (factors)"
-    ),
-    "model.balance": Override(
-        0.5, "a good policy fails rarely; measured with the whole, and alone no gain after 500 episodes (factors)"
-    ),
+    "model.spread": Override(4.0, "posteriors are narrower than the looks of a state; 1: 12 points less (factors)"),
+    "model.balance": Override(0.5, "a good policy fails rarely; alone no gain after 500 episodes (factors)"),
     "model.predict_change": Override(True, "a macro-action moves one cube; alone no gain shown (deviations)"),
     "model.sigma_floor": Override(0.2, "narrow components stop learning of what they miss; no gain shown (deviations)"),
     "model.gradient_clip": Override(10.0, "narrow components have steep walls; without: 12 points less (deviations)"),
-    "model.precision": Override(
-        "float32", "small batches gain little from bfloat16; 12 points less with it (deviations)"
-    ),
+    "model.precision": Override("float32", "small batches gain little from bfloat16: 12 points less (deviations)"),
     "imagination.start_episode": Override(100, "the quick model is right early; 1000 would leave nothing to compare"),
     "imagination.end_episode": Override(
         1000, "real transitions carry on to 99.8 % at 2,000 (mild, tuning seeds 1001 to 1003; no other value was tried)"
     ),
     "imagination.start_states": Override(
-        "replayed",
-        "rollouts from states of all episodes, not of this one: from the current state 11 points less (factors)",
+        "replayed", "states of all episodes; the current one: 11 points less (factors)"
     ),
-    "imagination.breadth": Override(
-        8, "short rollouts from many states instead of long ones; 3: 14 points less (deviations)"
-    ),
-    "imagination.depth": Override(
-        3, "at depth 10 latents drift to where reward and end contradict each other, and values grow without bound"
-    ),
+    "imagination.breadth": Override(8, "many short rollouts instead of few long ones; 3: 14 points less (deviations)"),
+    "imagination.depth": Override(3, "at 10 latents drift to where reward and end disagree; values grow unbounded"),
     "imagination.updates_per_step": Override(4, "one, the thesis' N_I, solves 12 points less (factors)"),
-    "imagination.temperature": Override(
-        0.0, "sampled latents leave what the networks know: at 1, 16 points less (factors)"
-    ),
+    "imagination.temperature": Override(0.0, "sampled latents leave what networks know; 1: 16 points less (factors)"),
     "imagination.exploration": Override(0.2, "a greedy rollout repeats the real actions; no gain shown (deviations)"),
-    "imagination.weight_samples": Override(
-        10, "acts only where dropout is set again: without it the three members are the samples"
-    ),
+    "imagination.weight_samples": Override(10, "acts only where dropout is set: else the 3 members are the samples"),
     "imagination.termination_threshold": Override(
         0.02, "chosen for 2,000 episodes, where the model half knows of wrong ends; early it costs (factors)"
     ),

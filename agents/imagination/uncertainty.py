@@ -31,12 +31,9 @@ class Uncertainty:
 
 
 def decompose(samples: Mixture) -> Uncertainty:
-    """Split the predictive variance of T weight samples.
+    """Split the predictive variance of T weight samples, mixtures (T, ..., K, Z).
 
     Each spread is a centred sum of squares: the thesis' differences of squares are equal to it, but cancel in float32.
-
-    Args:
-        samples: Mixtures whose first axis is the weight sample, (T, ..., K, Z).
     """
     weights = samples.log_weights.exp().unsqueeze(-1)  # [T, ..., K, 1]
     means = mdn.mean(samples)  # [T, ..., Z]
@@ -50,14 +47,8 @@ def component_variance(samples: Mixture, members: int = 1) -> Tensor:
 
     The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
     :func:`decompose` it does not count that there are other components, which says nothing about a value that was
-    sampled from this one.
-
-    Args:
-        samples: Mixtures whose first axis is the weight sample, member by member, (E T, ..., K, Z).
-        members: E, as in :func:`~.mixture.average`, whose order of components this follows.
-
-    Returns:
-        Shape (..., E K, Z).
+    sampled from this one. Samples are (E T, ..., K, Z), member by member; the result is (..., E K, Z), in the order of
+    :func:`~.mixture.average`.
     """
     means = samples.means.unflatten(0, (members, -1))
     noise = torch.exp(2.0 * samples.log_sigmas).unflatten(0, (members, -1)).mean(dim=1)
@@ -65,18 +56,9 @@ def component_variance(samples: Mixture, members: int = 1) -> Tensor:
 
 
 def sampled_component_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
-    """:func:`component_variance` of the components that sampled values came from, summed over dimensions.
+    """:func:`component_variance` of the components that ``values`` (..., Z) came from, summed over dimensions: (...).
 
-    Each component counts by its posterior probability of having been the one.
-
-    Args:
-        samples: As in :func:`component_variance`.
-        predictive: Their average, which the values were sampled from.
-        values: Shape (..., Z).
-        members: As in :func:`component_variance`.
-
-    Returns:
-        Shape (...).
+    Each component of ``predictive``, the samples' average, counts by its posterior probability of having been the one.
     """
     scaled = (values.unsqueeze(-2) - predictive.means) * torch.exp(-predictive.log_sigmas)  # [..., K, Z]
     log_joint = predictive.log_weights - (0.5 * scaled.square() + predictive.log_sigmas).sum(dim=-1)
@@ -99,9 +81,5 @@ REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def reduction(name: str) -> Callable[[Tensor], Tensor]:
-    """The reduction over dimensions of that name.
-
-    Raises:
-        UnknownNameError: No such reduction.
-    """
+    """The reduction over dimensions of that name; UnknownNameError if there is none."""
     return REDUCTIONS[require_known("uncertainty reduction", name, REDUCTIONS)]

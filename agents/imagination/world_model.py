@@ -46,12 +46,6 @@ class RewardTerminationHead(nn.Module):
 
     The thesis reads both from the next state alone, ``r(z')`` and ``d(z')``. Where a right and a wrong macro-action
     lead to frames that are alike, that cannot tell the two apart; reading the whole transition can.
-
-    Args:
-        latent_size: Z.
-        n_actions: A.
-        settings: Sizes, and what is read.
-        generator: Draws the initial weights; its device is the networks'.
     """
 
     def __init__(
@@ -89,11 +83,7 @@ class RewardTerminationHead(nn.Module):
 class WorldModel(nn.Module):
     """Dynamics, reward and termination, trained together from batches of transitions.
 
-    Args:
-        latent_size: Z.
-        n_actions: A.
-        settings: Sizes and rates.
-        generator: Draws the initial weights; its device is the model's.
+    The generator draws the initial weights; its device is the model's.
     """
 
     def __init__(
@@ -123,8 +113,7 @@ class WorldModel(nn.Module):
     def update(self, batch: Batch, dropout: torch.Generator) -> ModelLosses:
         """One step of Adam on all networks, then the max-norm constraint.
 
-        Raises:
-            DivergedError: A loss is NaN or infinite; the weights are left as they were.
+        DivergedError if a loss is NaN or infinite, with the weights as they were.
         """
         terms = torch.stack(self.losses(batch, dropout))
         losses = ModelLosses(*terms.tolist())
@@ -161,15 +150,9 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def predict(self, z: Tensor, action: Tensor, weights: Masks | None) -> Mixture:
-        """``p(z' | z, a)`` under every weight sample of every member, in one batched pass.
+        """``p(z' | z, a)`` of z (N, Z) and a (N,) under every weight sample of every member, in one batched pass.
 
-        Args:
-            z: Shape (N, Z).
-            action: Shape (N,).
-            weights: From :meth:`draw_weights`; None drops nothing, as one sample.
-
-        Returns:
-            Mixtures with leading axes (E T, N).
+        Weights are from :meth:`draw_weights`; None drops nothing, as one sample. Mixtures have leading axes (E T, N).
         """
         if weights is None:
             return self._mixture(z, action, None)
@@ -188,11 +171,7 @@ class WorldModel(nn.Module):
     def reward_std(self, z: Tensor, action: Tensor, next_z: Tensor, weights: Masks) -> Tensor:
         """Standard deviation of the rewards of N transitions over T weight samples, in units of reward: (N,).
 
-        Args:
-            z: Shape (N, Z).
-            action: Shape (N,).
-            next_z: Shape (N, Z).
-            weights: From :meth:`draw_reward_weights`.
+        Weights are from :meth:`draw_reward_weights`.
         """
         inputs, masks = self.head.inputs(z, action, next_z), [mask.squeeze(0) for mask in weights]
         rewards = sample_outputs(self.head.reward_network, inputs, masks)[..., 0]  # [T, N]

@@ -37,18 +37,13 @@ class NormedMLP(nn.Module):
         dropout: Probability of dropping a unit of a hidden layer that another one follows, in [0, 1). Units right
             before the output stay: their noise is noise of the outputs, which a mixture would take for the data's.
         precision: Type of the products between hidden layers while training, and on a CPU that in which each batch's
-            statistics come. Parameters, the values of first and last layer and all predictions are float32 whatever it
-            is.
+            statistics come. Parameters, the values of first and last layer and all predictions are always float32.
     """
 
     def __init__(
-        self,
-        sizes: Sequence[int],
-        *,
-        generators: Sequence[torch.Generator],
-        dropout: float,
+        self, sizes: Sequence[int], *, generators: Sequence[torch.Generator], dropout: float,
         precision: torch.dtype = torch.float32,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.sizes, self.members, self.dropout, self.precision = tuple(sizes), len(generators), dropout, precision
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
@@ -103,10 +98,7 @@ class NormedMLP(nn.Module):
 
     @torch.no_grad()
     def update_running_stats(self) -> None:
-        """Move the running means and variances toward those of the last batch; the first batches count equally.
-
-        On a CPU those of a bfloat16 layer come in bfloat16.
-        """
+        """Move the running means and variances toward those of the last batch; the first batches count equally."""
         self.batches += 1
         share = max(1.0 - MOMENTUM, 1.0 / self.batches)
         for layer, (mean, rstd) in enumerate(self._statistics):

@@ -19,16 +19,13 @@ _CHUNK = 2048
 
 @torch.no_grad()
 def sample_outputs(network: MemberMLP, x: Tensor, masks: Sequence[Tensor] | None) -> Tensor:
-    """Outputs of every weight sample for every row, without a Python loop over samples.
+    """Outputs (T, N, out) of every weight sample for every row (N, in), without a Python loop over samples.
 
     Args:
         network: One member, with masks, or the T members of an ensemble, without.
         x: Shape (N, in).
         masks: One a hidden layer, from the first on, each (T, H), as :func:`~.mlp.dropout_mask` draws them; layers
             beyond drop nothing. None makes every member a sample.
-
-    Returns:
-        Shape (T, N, out).
     """
     samples = network.members if masks is None else len(masks[0])
     outputs = x.new_empty((samples, len(x), network.sizes[-1]))

@@ -11,9 +11,7 @@ from torch import nn
 def initialise(network: nn.Module, generator: torch.Generator) -> None:
     """Draw every linear and convolutional weight and bias from U(-1/sqrt(fan_in), 1/sqrt(fan_in)), torch's default law.
 
-    Args:
-        network: Modules with weights other than linear and (transposed) convolutional ones are left alone.
-        generator: On the same device as the network.
+    Other modules are left alone. The generator must be on the network's device.
     """
     with torch.no_grad():
         for module in network.modules():
