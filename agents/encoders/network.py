@@ -8,11 +8,7 @@ from torch import Tensor, nn
 
 
 class EncoderNetwork(nn.Module, abc.ABC):
-    """Images to latents and back. Shapes: ``N`` images, ``C`` channels, ``H x W`` pixels, ``Z`` latents.
-
-    Attributes:
-        latent_size: Latents Z of a whole image.
-    """
+    """Images to latents and back. Shapes: ``N`` images, ``C`` channels, ``H x W`` pixels, ``Z`` latents of one."""
 
     latent_size: int
 

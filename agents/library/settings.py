@@ -12,10 +12,8 @@ class SB3Settings:
     """Keywords of ``stable_baselines3.DQN`` and ``sb3_contrib.QRDQN`` that differ from the library's own.
 
     Attributes:
-        learning_rate: Of Adam.
         buffer_size: Transitions of the replay buffer.
         learning_starts: Macro-actions before the first update, all of them random.
-        batch_size: Transitions an update.
         gamma: Discount a macro-action, the same as our agents'.
         train_freq: Macro-actions between updates.
         gradient_steps: Updates then.

@@ -1,9 +1,8 @@
 """The interfaces of regression tasks and regressors: numpy and the standard library only.
 
-A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. The bench
-knows both by these interfaces. One run trains several *networks*, each on data drawn for it, on every *variant* of
-the task. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight
-samples.
+A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. One run
+trains several *networks*, each on data drawn for it, on every *variant* of the task. Shapes: ``E`` networks, ``N``
+rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight samples.
 """
 
 from __future__ import annotations
@@ -21,12 +20,7 @@ from imagine_bench.seeding import SeedTree
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """Pairs to learn from or to be tested on.
-
-    Attributes:
-        inputs: Shape (N, X).
-        targets: Shape (N, D).
-    """
+    """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D)."""
 
     inputs: Floats
     targets: Floats
@@ -34,13 +28,7 @@ class Dataset:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixtures:
-    """Gaussian mixtures with diagonal components.
-
-    Attributes:
-        weights: Each row sums to 1. Shape (..., K).
-        means: Shape (..., K, D).
-        sigmas: Standard deviations, above 0. Shape (..., K, D).
-    """
+    """Diagonal Gaussian mixtures: weights (..., K) of sum 1, means and standard deviations above 0 (..., K, D)."""
 
     weights: Floats
     means: Floats
@@ -101,7 +89,7 @@ class Regressor(Protocol):
 
     @property
     def epochs(self) -> int:
-        """Epochs to do."""
+        """Epochs to do, those done included."""
 
     def train(self, epochs: int) -> None:
         """Train for so many more epochs.
@@ -114,12 +102,7 @@ class Regressor(Protocol):
         """Means since the last call, by slashed name."""
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
-        """Predict, with uncertainties.
-
-        Args:
-            inputs: Each network's own. Shape (E, N, X).
-            rng: Samples predictions and Monte-Carlo sums.
-        """
+        """Predict from each network's own inputs (E, N, X); ``rng`` samples predictions and Monte-Carlo sums."""
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
@@ -144,7 +127,6 @@ class RegressorContext:
         seeds: One node of the seed tree a network. Length E.
         hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
         overrides: Single settings that replace the set's.
-        device: ``"cpu"`` or ``"cuda"``.
     """
 
     datasets: tuple[Dataset, ...]
@@ -162,13 +144,9 @@ class Evaluate(Protocol):
     """A task's own measurements of trained networks."""
 
     def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
-        """Everything the task's figures and tables are made of, by name; the first axis is the network, if there is
-        one.
+        """What the task's figures and tables are made of, by name; the first axis is the network, if there is one.
 
-        Args:
-            variant: What the networks were trained on.
-            predict: Gives their predictions.
-            seeds: One node a network, for test inputs.
+        ``variant`` is what the networks were trained on; ``seeds``, one node a network, draw test inputs.
         """
 
 
@@ -187,21 +165,16 @@ class RegressionSpec:
     """Everything the bench needs to know of a regression task. Building one is cheap.
 
     Attributes:
-        id: Registry name.
-        title: A few words for headings.
-        description: Two sentences for a reader of the report.
-        variants: The variants of the thesis, in its order.
+        variants: Those of the thesis, in its order.
         require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
         training: Data of a variant, drawn from a generator.
         testing: The given number of rows of the same process, never trained on.
         errors: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
-        error_name: What ``errors`` gives, with its unit.
-        wrong_above: Above this error a prediction counts as wrong.
-        evaluate: The task's own measurements.
+        error_name: What ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong.
         sections: ``"module:attr"`` of the function that turns them into sections of the report.
         recorder: ``"module:attr"`` of the function that records them, or None.
         scene: Gives the robot that carries out predictions, where there is one.
-        reference: Name of the thesis' tables, or None.
+        reference: Name of the thesis' tables.
     """
 
     id: str

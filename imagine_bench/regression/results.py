@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,15 +26,11 @@ Row = dict[str, float | str]
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionRun:
-    """One finished run.
+    """One finished run of a registered regressor, whose files lie in ``folder``.
 
     Attributes:
-        agent: Registered regressor.
-        seed: The run's seed.
-        settings: The regressor's settings as run.
         rows: One a variant and network.
         evaluations: The task's own measurements by variant, and under ``calibration/`` those of calibration.
-        folder: Where the run's files lie.
         recording: Its Rerun recording, or None.
     """
 
@@ -55,10 +52,7 @@ class RegressionResult:
     """All runs of a protocol. Every regressor and seed is there, or this cannot be built.
 
     Attributes:
-        protocol: What was compared.
-        runs: One a regressor and seed.
         environment: Command, commit, versions, machine; JSON-like.
-        folder: Where the bench's files lie.
         wall_s: Wall seconds of the bench, over all its sessions.
 
     Raises:
@@ -86,6 +80,11 @@ class RegressionResult:
     def protocol_hash(self) -> str:
         """The hash of the protocol, which names the bench's folder."""
         return self.protocol.hash
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Every regressor and variant."""
+        return list(itertools.product(self.protocol.agents, self.protocol.variants))
 
     def of(self, agent: str) -> tuple[RegressionRun, ...]:
         """The runs of one regressor, in the order of the protocol's seeds."""
