@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,18 +20,10 @@ from .training import draw_frames, train_encoder
 
 
 def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path) -> str:
-    """Make an encoder and leave artefact, card and figure in ``out``.
+    """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
-    Args:
-        spec: The task.
-        recipe: A name among the task's ``RECIPES``, or settings of one's own.
-        appearance: Appearance level of the frames.
-        seed: Root of the seed tree.
-        out: Folder for ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes),
-            ``.json`` and ``.png``; made if missing.
-
-    Returns:
-        A few lines for a person: where it is, and how it compares to the bundled encoder.
+    The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
+    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
@@ -42,9 +36,8 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
     path = out / f"{name}.safetensors"
     refuse_existing(path, path.with_suffix(".json"), path.with_suffix(".png"))
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}") as bar:
-        encoder = train_encoder(
-            spec, recipe=recipe, appearance=appearance, seed=seed, progress=lambda *at: _show(bar, *at)
-        )
+        show = partial(_show, bar)
+        encoder = train_encoder(spec, recipe=recipe, appearance=appearance, seed=seed, progress=show)
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
     frames, macrostates = draw_frames(spec, appearance, COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())
@@ -52,32 +45,30 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
     encoder.save(path)
     sheet.save(path.with_suffix(".png"))
     bundled = bundled_encoder(name)
-    if not bundled.is_file() or bundled.resolve() == path.resolve():
-        return f"Wrote {path}.\n{compare(encoder.card, None)}"
-    return f"Wrote {path}.\n{compare(encoder.card, Encoder.load(bundled).card)}"
+    other = bundled.is_file() and bundled.resolve() != path.resolve()
+    return f"Wrote {path}.\n{compare(encoder.card, Encoder.load(bundled).card if other else None)}"
 
 
 def compare(new: EncoderCard, bundled: EncoderCard | None) -> str:
     """A small table of two cards, or of one where nothing is bundled."""
     columns = {"new": new} if bundled is None else {"new": new, "bundled": bundled}
     lines = [f"{'':34}" + "".join(f"{name:>12}" for name in columns)]
-    for label, texts in _rows(list(columns.values())).items():
-        lines.append(f"{label:34}" + "".join(f"{text:>12}" for text in texts))
+    for label, text in _ROWS.items():
+        lines.append(f"{label:34}" + "".join(f"{text(card):>12}" for card in columns.values()))
     return "\n".join(lines)
 
 
-def _rows(cards: list[EncoderCard]) -> dict[str, list[str]]:
-    return {
-        "recipe": [card.recipe.name for card in cards],
-        "seed": [str(card.seed) for card in cards],
-        "latents": [str(card.latent_size) for card in cards],
-        "macrostate read right": [f"{card.probe['mlp']:.2%}" for card in cards],
-        "  from sampled latents": [f"{card.probe['mlp_sampled']:.2%}" for card in cards],
-        "  by a linear reader": [f"{card.probe['linear']:.2%}" for card in cards],
-        "held-out frames": [str(card.recipe.held_out_frames) for card in cards],
-        "KL from the prior, nats": [f"{card.kl_nats:.1f}" for card in cards],
-        "CPU s, frames included": [f"{card.cpu_s['total']:.0f}" for card in cards],
-    }
+_ROWS: dict[str, Callable[[EncoderCard], str]] = {
+    "recipe": lambda card: card.recipe.name,
+    "seed": lambda card: str(card.seed),
+    "latents": lambda card: str(card.latent_size),
+    "macrostate read right": lambda card: f"{card.probe['mlp']:.2%}",
+    "  from sampled latents": lambda card: f"{card.probe['mlp_sampled']:.2%}",
+    "  by a linear reader": lambda card: f"{card.probe['linear']:.2%}",
+    "held-out frames": lambda card: str(card.recipe.held_out_frames),
+    "KL from the prior, nats": lambda card: f"{card.kl_nats:.1f}",
+    "CPU s, frames included": lambda card: f"{card.cpu_s['total']:.0f}",
+}
 
 
 def _show(bar: tqdm, stage: str, done: float) -> None:

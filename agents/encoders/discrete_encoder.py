@@ -13,7 +13,7 @@ connected components of a mutual nearest-neighbour graph (Brito et al. 1997; the
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.cluster.hierarchy
@@ -49,14 +49,7 @@ _DARK = 0.01  # of full scale; the median brightness is not taken for less
 
 
 class DiscreteEncoder(EncoderNetwork):
-    """One-hot codes of factors, concatenated: factor p has the latents after those of the factors before it.
-
-    Args:
-        code_sizes: Values of each of the P factors.
-        channels: Channels C.
-        height: Pixels H.
-        width: Pixels W.
-    """
+    """One-hot codes of P factors, concatenated in order; ``code_sizes`` are the numbers of their values."""
 
     background: Tensor
     appearance: Tensor
@@ -118,11 +111,9 @@ def smoothed(images: Tensor) -> Tensor:
 
 
 def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
-    """Find the factors of unlabelled images and their values.
+    """Find the factors of unlabelled images (N, C, H, W) in [0, 1] and their values.
 
-    Args:
-        images: Shape (N, C, H, W), in [0, 1]; at most 6000 of them are looked at.
-        generator: Draws which, and the exemplars.
+    ``generator`` draws the 6000 images that are looked at, where there are more, and the exemplars.
 
     Raises:
         InvalidValueError: Nothing in the images ever changes, or no factor has more than one value.
@@ -143,8 +134,7 @@ def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
     return network
 
 
-@dataclass(frozen=True)
-class _Factor:
+class _Factor(NamedTuple):
     """A factor: its pixels (X,), basis (F, X) and centre (F,) of its features (N, F), and values (N,), -1 for none."""
 
     group: NDArray[np.bool_]
@@ -155,21 +145,16 @@ class _Factor:
 
 
 def pixel_groups(pixels: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
-    """Groups of pixels that depend on one another, by average linkage; groups that hardly vary are left out.
+    """Groups of pixels (N, X) that depend on one another, by average linkage, but for those that hardly vary.
 
-    Args:
-        pixels: Shape (N, X).
-
-    Returns:
-        Masks of shape (X,), the most varied first.
+    Masks of shape (X,), the most varied first.
     """
     pixels = pixels[:_DEPENDENCE_IMAGES]
     spread = pixels.std(axis=0)
     moving = np.flatnonzero(spread > _STILL)
     if len(moving) < 2:
         return []
-    distance = 1.0 - dependence(pixels[:, moving])
-    condensed = scipy.spatial.distance.squareform(distance, checks=False)
+    condensed = scipy.spatial.distance.squareform(1.0 - dependence(pixels[:, moving]), checks=False)
     tree = scipy.cluster.hierarchy.linkage(condensed, "average")
     label = scipy.cluster.hierarchy.fcluster(tree, _INDEPENDENT, "distance")
     variance = np.bincount(label, spread[moving] ** 2)
@@ -196,16 +181,10 @@ def dependence(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Which separate cloud each point belongs to; the number of clouds is found, not given.
+    """Which separate cloud each point (N, F) belongs to, numbered by size from 0; -1 for none. Shape (N,).
 
     Two points are linked if each is among the other's nearest, and equal points always are; clouds are the connected
     components. Clouds too small to be a value are left out; clouds with a narrow gap between them are merged.
-
-    Args:
-        points: Shape (N, F).
-
-    Returns:
-        Cloud of each point, numbered by size from 0; -1 for none. Shape (N,).
     """
     count = len(points)
     # A tree splits just above a coordinate. With denormals flushed nothing is just above 0, so start at 1.
@@ -265,12 +244,9 @@ def _factor(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> _Factor | 
 
 def _balanced(value: NDArray[np.int64], generator: torch.Generator) -> NDArray[np.int64]:
     """Rows of exemplars, drawn with replacement, as many of each value but for one."""
-    count = int(value.max()) + 1
-    rows: list[NDArray[np.int64]] = []
-    for index in range(EXEMPLARS):
-        own = np.flatnonzero(value == index % count)
-        rows.append(own[torch.randint(len(own), (1,), generator=generator).numpy()])
-    return np.concatenate(rows)
+    rows = [np.flatnonzero(value == index) for index in range(int(value.max()) + 1)]
+    picks = [rows[index % len(rows)] for index in range(EXEMPLARS)]
+    return np.concatenate([own[torch.randint(len(own), (1,), generator=generator).numpy()] for own in picks])
 
 
 def _fit_appearance(network: DiscreteEncoder, images: Tensor, groups: list[NDArray[np.bool_]]) -> None:

@@ -37,22 +37,35 @@ _FRAME_SHAPE = (64, 64, 3)
 class EncoderCard:
     """Where an encoder comes from and what it can do."""
 
-    task: str  #: id of the task whose frames it was trained on
-    appearance: str  #: their appearance level
-    recipe: Recipe  #: every setting of its making
-    preprocessing: str  #: name in :mod:`imagine_bench.preprocessing`
-    latent_size: int  #: latents Z
-    macrostate_names: tuple[str, ...]  #: the coordinates its probe reads. Length M.
-    cardinalities: tuple[int, ...]  #: values of each. Length M.
-    seed: int  #: root of the seed tree it was made from
-    command: str  #: makes it again
-    data: str  #: what the frames were, in words
-    versions: dict[str, str]  #: of the libraries that made it
-    cpu_s: dict[str, float]  #: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``
-    kl_nats: float  #: KL from the prior on held-out frames, mean a frame
-    reconstruction: float  #: squared error of the decoded held-out frames, mean a pixel, in the network's own units
-    #: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a ``linear`` reader and
-    #: by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
+    Attributes:
+        preprocessing: Name in :mod:`imagine_bench.preprocessing`.
+        latent_size: Latents Z.
+        macrostate_names: The coordinates its probe reads. Length M.
+        cardinalities: Values of each. Length M.
+        command: Makes it again.
+        data: What the frames were, in words.
+        cpu_s: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``.
+        kl_nats: KL from the prior on held-out frames, mean a frame.
+        reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
+        probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
+            ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
+        code_sizes: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
+    """
+
+    task: str
+    appearance: str
+    recipe: Recipe
+    preprocessing: str
+    latent_size: int
+    macrostate_names: tuple[str, ...]
+    cardinalities: tuple[int, ...]
+    seed: int
+    command: str
+    data: str
+    versions: dict[str, str]
+    cpu_s: dict[str, float]
+    kl_nats: float
+    reconstruction: float
     probe: dict[str, float]
     #: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     code_sizes: tuple[int, ...] = ()
@@ -63,11 +76,7 @@ class EncoderCard:
 
     @classmethod
     def from_json(cls, text: str) -> EncoderCard:
-        """Undo :meth:`to_json`.
-
-        Raises:
-            InvalidValueError: It is not an encoder's card of this format.
-        """
+        """Undo :meth:`to_json`; InvalidValueError where it is not an encoder's card of this format."""
         try:
             values: dict[str, Any] = json.loads(text)
             if values.pop("format") != FORMAT:
@@ -85,41 +94,27 @@ class EncoderCard:
 
 
 class Encoder:
-    """Frames to latents and back, with no gradient and no randomness.
-
-    Args:
-        network: The trained network.
-        probe: The evaluation-only reader of the macrostate.
-        card: Its origin.
-        device: A torch device name.
-    """
+    """Frames to latents and back, with no gradient and no randomness, and an evaluation-only reader (``probe``)."""
 
     def __init__(self, network: EncoderNetwork, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
-        self.card = card
-        self.latent_size = card.latent_size
-        self.device = torch.device(device)
+        self.card, self.latent_size, self.device = card, card.latent_size, torch.device(device)
         self.network = network.to(self.device).requires_grad_(False).eval()
         self.probe = probe.to(self.device).requires_grad_(False).eval()
         self._preprocess = preprocess(card.preprocessing)
 
     @torch.no_grad()
     def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
-        """The latents of frames.
+        """Posterior means and standard deviations (N, Z), float32 on the encoder's device, of frames.
 
         Args:
             frames: Shape (N, 64, 64, 3), uint8.
-
-        Returns:
-            Posterior means and standard deviations, float32 on the encoder's device. Each of shape (N, Z).
 
         Raises:
             InvalidValueError: Frames of another shape or type.
         """
         if frames.dtype != np.uint8 or frames.shape[1:] != _FRAME_SHAPE:
-            raise InvalidValueError(
-                f"The encoder got frames of type {frames.dtype} and shape {frames.shape}; "
-                "give uint8 of shape (N, 64, 64, 3)."
-            )
+            got = f"frames of type {frames.dtype} and shape {frames.shape}"
+            raise InvalidValueError(f"The encoder got {got}; give uint8 of shape (N, 64, 64, 3).")
         chunks = [self._encode_chunk(frames[i : i + _CHUNK]) for i in range(0, len(frames), _CHUNK)]
         if len(chunks) == 1:
             return chunks[0]
@@ -128,14 +123,12 @@ class Encoder:
         return torch.cat(mu), torch.cat(sigma)
 
     def _encode_chunk(self, frames: Frame) -> tuple[Tensor, Tensor]:
-        images = torch.from_numpy(self._preprocess(frames)).to(self.device)
-        mu, log_variance = self.network.posterior(images)
+        mu, log_variance = self.network.posterior(torch.from_numpy(self._preprocess(frames)).to(self.device))
         return mu, (0.5 * log_variance).exp()
 
     def latents(self, frame: Frame) -> NDArray[np.float32]:
         """Posterior means (Z,) of one frame (64, 64, 3)."""
-        mu: NDArray[np.float32] = self.encode(frame[None])[0][0].cpu().numpy()
-        return mu
+        return self.encode(frame[None])[0][0].cpu().numpy()
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.float32]:
@@ -180,7 +173,7 @@ class Encoder:
             with safe_open(path, framework="pt") as file:
                 card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
                 tensors = {key: file.get_tensor(key).float() for key in file.keys()}
-            network = empty_network(card)
+            network = _empty_network(card)
             if network.latent_size != card.latent_size:
                 raise InvalidValueError(f"its card says {card.latent_size} latents, its network {network.latent_size}")
             probe = empty_probe(network.latent_size, card.cardinalities)
@@ -198,11 +191,7 @@ def bundled_encoder(name: str) -> Path:
 
 
 def refuse_existing(*paths: Path) -> None:
-    """Stop before anything is overwritten.
-
-    Raises:
-        ArtefactError: One of ``paths`` exists.
-    """
+    """Raise ArtefactError where one of ``paths`` exists, before anything is overwritten."""
     for path in paths:
         if path.exists():
             raise ArtefactError(f"{path} exists already and is never overwritten; choose another folder or remove it.")
@@ -221,8 +210,7 @@ def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]
     return np.ascontiguousarray(np.moveaxis(images, 1, -1), dtype=np.float32)
 
 
-def empty_network(card: EncoderCard) -> EncoderNetwork:
-    """The network that a card describes, on the meta device."""
+def _empty_network(card: EncoderCard) -> EncoderNetwork:
     if card.recipe.kind == "latents":
         return empty_vae(card.recipe, card.preprocessing)
     with torch.device("meta"):
@@ -242,12 +230,7 @@ def empty_probe(latent_size: int, cardinalities: tuple[int, ...], hidden: int = 
 
 
 def _fill(network: nn.Module, tensors: dict[str, Tensor], prefix: str) -> None:
-    """Give an empty network its weights.
-
-    Raises:
-        RuntimeError: Names or shapes do not fit.
-        InvalidValueError: A weight is not finite.
-    """
+    """Give an empty network its weights; RuntimeError where names or shapes do not fit."""
     weights = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
     network.load_state_dict(weights, strict=True, assign=True)
     for name, value in weights.items():

@@ -31,16 +31,11 @@ def sample_sheet(
 ) -> Image.Image:
     """A sheet with one column a frame: camera, network input, reconstruction from mean and from sampled latents.
 
-    Args:
-        encoder: Whose reconstructions are shown.
-        spec: Names the values of the macrostate.
-        frames: At most :data:`COLUMNS` of them are shown. Shape (N, 64, 64, 3).
-        macrostates: The truth, to mark misreadings. Shape (N, M).
-        generator: Draws the sampled latents.
+    At most :data:`COLUMNS` ``frames`` (N, 64, 64, 3) are shown; ``macrostates`` (N, M) are the truth, to mark
+    misreadings.
     """
     frames, macrostates = frames[:COLUMNS], macrostates[:COLUMNS]
-    mu, sigma = encoder.encode(frames)
-    latents = Latents(mu=mu, sigma=sigma)
+    latents = Latents(*encoder.encode(frames))
     rows: dict[str, NDArray[Any]] = {
         "camera": frames,
         "encoder's view": view(preprocess(encoder.card.preprocessing)(frames), encoder.card.preprocessing),
@@ -54,14 +49,17 @@ def sample_sheet(
     _write_heading(draw, encoder)
     for row, (label, images) in enumerate(rows.items()):
         top = _HEADING + row * cell
-        draw.text((_GAP, top + cell / 2), label, fill=_MUTED, font=_font(16))
+        draw.text((_GAP, top + cell / 2), label, fill=_MUTED, font=ImageFont.load_default(16))
         for column, image in enumerate(images):
             sheet.paste(_enlarged(image), (_LABEL + column * cell, top))
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
-        words = " · ".join(_short(spec.macrostate_values[i][value]) for i, value in enumerate(found))
+        values = [spec.macrostate_values[i][value].replace("_", " ") for i, value in enumerate(found)]
+        words = " · ".join(value.split()[-1] for value in values)
         names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
         color = _INK if (right == found).all() else _WRONG
-        draw.text((_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=color, font=_font(14))
+        draw.text(
+            (_LABEL + column * cell, _HEADING + cell * len(rows)), names, fill=color, font=ImageFont.load_default(14)
+        )
     return sheet
 
 
@@ -74,21 +72,12 @@ def _write_heading(draw: ImageDraw.ImageDraw, encoder: Encoder) -> None:
         f"KL {card.kl_nats:.1f} nats · {card.cpu_s['total']:.0f} CPU s."
     )
     reading = f"Below each column what the probe reads ({' · '.join(card.macrostate_names)}), red where it is wrong."
-    draw.text((_GAP, _GAP), title, fill=_INK, font=_font(20))
-    draw.text((_GAP, _GAP + 27), numbers, fill=_MUTED, font=_font(14))
-    draw.text((_GAP, _GAP + 46), reading, fill=_MUTED, font=_font(14))
-
-
-def _short(name: str) -> str:
-    """The last word of a value's name."""
-    return name.replace("_", " ").split()[-1]
+    draw.text((_GAP, _GAP), title, fill=_INK, font=ImageFont.load_default(20))
+    draw.text((_GAP, _GAP + 27), numbers, fill=_MUTED, font=ImageFont.load_default(14))
+    draw.text((_GAP, _GAP + 46), reading, fill=_MUTED, font=ImageFont.load_default(14))
 
 
 def _enlarged(pixels: NDArray[Any]) -> Image.Image:
     if pixels.dtype != np.uint8:
         pixels = np.rint(pixels * 255.0).astype(np.uint8)
     return Image.fromarray(pixels).convert("RGB").resize((_CELL, _CELL), Image.Resampling.NEAREST)
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)

@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 
 class EncoderNetwork(nn.Module, abc.ABC):
-    """Images to latents and back. Shapes: ``N`` images, ``C`` channels, ``H x W`` pixels, ``Z`` latents."""
+    """Images to latents and back. Shapes: ``N`` images, ``C`` channels, ``H x W`` pixels, ``Z`` latents of one."""
 
-    latent_size: int  #: latents Z of a whole image
+    latent_size: int
 
     @abc.abstractmethod
     def target(self, images: Tensor) -> Tensor:

@@ -17,11 +17,7 @@ _CACHED = 2
 
 
 class Perception:
-    """Encodes single frames; a frame that is both the end of one transition and the start of the next costs once.
-
-    Args:
-        encoder: Frames to posteriors.
-    """
+    """Encodes single frames; a frame that is both the end of one transition and the start of the next costs once."""
 
     def __init__(self, encoder: Encoder) -> None:
         self.encoder = encoder
@@ -71,8 +67,7 @@ def load_perception(context: AgentContext) -> Perception:
         raise InvalidValueError("This agent sees latents; give it the path of an encoder.")
     encoder = Encoder.load(context.encoder, context.device)
     if encoder.card.preprocessing != context.preprocessing:
-        raise InvalidValueError(
-            f"Encoder {context.encoder.name!r} reads frames as {encoder.card.preprocessing!r}, "
-            f"the task declares {context.preprocessing!r}; choose an encoder of this task."
-        )
+        reads = f"Encoder {context.encoder.name!r} reads frames as {encoder.card.preprocessing!r}"
+        declared = f"the task declares {context.preprocessing!r}"
+        raise InvalidValueError(f"{reads}, {declared}; choose an encoder of this task.")
     return Perception(encoder)

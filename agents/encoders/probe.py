@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,8 +17,7 @@ _BATCH = 256
 _LEARNING_RATE = 3e-3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Latents:
+class Latents(NamedTuple):
     """Posterior means and standard deviations of N frames. Each of shape (N, Z)."""
 
     mu: Tensor
@@ -56,27 +55,21 @@ class Probe(nn.Module):
 
     def logits(self, latents: Tensor) -> tuple[Tensor, ...]:
         """Unnormalised log probabilities of each coordinate's values. M tensors of shape (N, cardinality)."""
-        joined: Tensor = self.layers((latents - self.centre) / self.scale)  # [N, sum of cardinalities]
+        joined = self.layers((latents - self.centre) / self.scale)  # [N, sum of cardinalities]
         return torch.split(joined, list(self.cardinalities), dim=1)
 
     @torch.no_grad()
     def read(self, latents: Tensor) -> NDArray[np.int64]:
         """The most likely macrostates of ``latents`` (N, Z). Shape (N, M)."""
-        macrostates = torch.stack([part.argmax(dim=1) for part in self.logits(latents)], dim=1)
-        return macrostates.cpu().numpy()
+        return torch.stack([part.argmax(dim=1) for part in self.logits(latents)], dim=1).cpu().numpy()
 
 
 def train_probe(
     probe: Probe, latents: Latents, macrostates: NDArray[np.int64], *, steps: int, generator: torch.Generator
 ) -> None:
-    """Fit ``probe`` by cross-entropy to freshly sampled latents, so that it reads imagined ones as well.
+    """Fit ``probe`` in place, on the CPU, by cross-entropy to freshly sampled latents: it must read imagined ones too.
 
-    Args:
-        probe: Changed in place, on the CPU.
-        latents: Of N training frames.
-        macrostates: Their labels. Shape (N, M).
-        steps: Gradient steps.
-        generator: Draws weights, batches and latent noise.
+    ``macrostates`` (N, M) are the labels of ``latents`` (N, Z); ``generator`` draws weights, batches and latent noise.
     """
     initialise(probe, generator)
     probe.centre.copy_(latents.mu.mean(dim=0))
@@ -86,7 +79,7 @@ def train_probe(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, T_max=steps)
     for _ in range(steps):
         rows = torch.randint(len(labels), (_BATCH,), generator=generator)
-        sampled = Latents(mu=latents.mu[rows], sigma=latents.sigma[rows]).sample(generator)
+        sampled = Latents(latents.mu[rows], latents.sigma[rows]).sample(generator)
         parts = zip(probe.logits(sampled), labels[rows].T, strict=True)
         loss = torch.stack([functional.cross_entropy(logits, right) for logits, right in parts]).sum()
         optimiser.zero_grad()

@@ -14,10 +14,23 @@ ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors")
 class Recipe:
     """Settings of one way to make an encoder; the defaults are those of the thesis' chapter 5 (section 5.2.2)."""
 
-    name: str  #: name in its chapter's :data:`RECIPES`
-    #: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel on its own,
-    #: ``"image"`` all together; or ``"factors"``: one categorical value a factor of the scene, which has no gradient
-    #: steps and no number of latents to choose.
+    Attributes:
+        name: Name in its chapter's :data:`RECIPES`.
+        architecture: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel
+            on its own, ``"image"`` all together; or ``"factors"``: one categorical value a factor of the scene, which
+            has no gradient steps and no number of latents to choose.
+        latents: Latents of the whole image, or of each strip.
+        widths: Hidden units of the small network, from the pixels to the latents.
+        pixel_std: Standard deviation of Gaussian pixels, in units of the contrast.
+        beta: Weight of the KL term against a SUM over pixels.
+        kl_warmup: Fraction of the steps over which beta grows from 0.
+        held_out_frames: Fresh frames for the probe's accuracy.
+        learning_rate: Of Adam, at its highest.
+        cosine: Whether the learning rate falls to 0 along a half cosine, after a short linear rise.
+        probe_steps: Gradient steps of the evaluation-only probe.
+    """
+
+    name: str
     architecture: str = "ha_schmidhuber"
     latents: int = 8  #: latents of the whole image, or of each strip
     widths: tuple[int, ...] = ()  #: hidden units of the small network, from the pixels to the latents
@@ -41,15 +54,11 @@ class Recipe:
     def __post_init__(self) -> None:
         require_known("encoder architecture", self.architecture, ARCHITECTURES)
         if min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps) < 1:
-            raise InvalidValueError(
-                f"Encoder recipe {self.name!r} has a count below 1; latents, frames, held_out_frames, steps, batch and "
-                "probe_steps must be at least 1."
-            )
+            counts = "latents, frames, held_out_frames, steps, batch and probe_steps"
+            raise InvalidValueError(f"Encoder recipe {self.name!r} has a count below 1; {counts} must be at least 1.")
         if not (self.beta >= 0 and self.pixel_std > 0 and self.learning_rate > 0 and 0 <= self.kl_warmup < 1):
-            raise InvalidValueError(
-                f"Encoder recipe {self.name!r} needs beta >= 0, pixel_std > 0, learning_rate > 0 and kl_warmup in "
-                "[0, 1)."
-            )
+            ranges = "beta >= 0, pixel_std > 0, learning_rate > 0 and kl_warmup in [0, 1)"
+            raise InvalidValueError(f"Encoder recipe {self.name!r} needs {ranges}.")
 
 
 _STRIPS = Recipe(

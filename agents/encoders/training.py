@@ -42,10 +42,10 @@ _LIBRARIES = ("torch", "numpy", "mujoco")
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSet:
-    """Labelled frames, preprocessed, with 8 bits a value to quarter the memory."""
+    """Labelled frames: images (N, C, H, W), preprocessed, uint8 to quarter the memory; macrostates (N, M)."""
 
-    images: Tensor  #: shape (N, C, H, W), uint8
-    macrostates: NDArray[np.int64]  #: shape (N, M)
+    images: Tensor
+    macrostates: NDArray[np.int64]
 
     def batch(self, rows: Tensor) -> Tensor:
         """The images of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""
@@ -114,13 +114,8 @@ def train_encoder(
 ) -> Encoder:
     """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
 
-    Args:
-        spec: The task, which renders the frames.
-        recipe: A name among the task's ``RECIPES``, or settings of one's own.
-        appearance: Appearance level of every frame.
-        seed: Root of the seed tree; training frames come from its ``encoder_training`` branch and held-out ones from
-            its ``encoder_probe`` branch.
-        progress: Told how far it is.
+    A recipe is a name among the task's ``RECIPES``, or settings of one's own. ``seed`` is the root of the seed tree:
+    training frames come from its ``encoder_training`` branch and held-out ones from its ``encoder_probe`` branch.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
@@ -133,11 +128,10 @@ def train_encoder(
     prepare_torch("cpu")
     seeds = SeedTree(seed)
     train_seeds, probe_seeds = (seeds.child(use, spec.id, appearance) for use in ("encoder_training", "encoder_probe"))
-    clock = _Clock()
-
+    clock = {"": time.process_time()}
     data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress)
     held_out = frame_set(spec, appearance, recipe.held_out_frames, probe_seeds.generator(), progress)
-    clock.lap("frames")
+    clock["frames"] = time.process_time()
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
     network: EncoderNetwork
     if recipe.kind == "codes":
@@ -145,19 +139,19 @@ def train_encoder(
     else:
         network = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
     _round_to_half(network)
-    clock.lap("training")
+    clock["training"] = time.process_time()
     cardinalities = tuple(len(values) for values in spec.macrostate_values)
     latents = latents_of(network, data)
     probe, linear = (empty_probe(network.latent_size, cardinalities, hidden) for hidden in (PROBE_HIDDEN, 0))
     for reader in (probe.to_empty(device="cpu"), linear.to_empty(device="cpu")):
         train_probe(reader, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
         _round_to_half(reader)
-    clock.lap("probe")
+    clock["probe"] = time.process_time()
     progress("probe", 1.0)
     noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
     measured = _measure(network, probe, linear, held_out, noise)
     sizes = network.code_sizes if isinstance(network, DiscreteEncoder) else ()
-    measured |= {"latent_size": network.latent_size, "code_sizes": sizes, "cpu_s": clock.seconds()}
+    measured |= {"latent_size": network.latent_size, "code_sizes": sizes, "cpu_s": _laps(clock)}
     return Encoder(network, probe, _card(spec, recipe, appearance, seed, **measured))
 
 
@@ -178,19 +172,10 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
     )
 
 
-class _Clock:
-    """CPU seconds of consecutive stages."""
-
-    def __init__(self) -> None:
-        self._last, self._laps = time.process_time(), dict[str, float]()
-
-    def lap(self, stage: str) -> None:
-        now = time.process_time()
-        self._laps[stage], self._last = now - self._last, now
-
-    def seconds(self) -> dict[str, float]:
-        laps = {**self._laps, "total": sum(self._laps.values())}
-        return {stage: round(seconds, 1) for stage, seconds in laps.items()}
+def _laps(clock: dict[str, float]) -> dict[str, float]:
+    """Seconds of each stage and in total, from the times at which stages ended."""
+    laps = {stage: end - start for start, (stage, end) in zip(clock.values(), list(clock.items())[1:], strict=False)}
+    return {stage: round(seconds, 1) for stage, seconds in {**laps, "total": sum(laps.values())}.items()}
 
 
 def _trained_vae(
@@ -216,7 +201,7 @@ def latents_of(network: EncoderNetwork, data: FrameSet) -> Latents:
     """The latents of every frame."""
     chunks = [network.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.images)), _CHUNK)]
     mu, log_variance = (torch.cat(column) for column in zip(*chunks, strict=True))
-    return Latents(mu=mu, sigma=(0.5 * log_variance).exp())
+    return Latents(mu, (0.5 * log_variance).exp())
 
 
 def _measure(
@@ -225,15 +210,10 @@ def _measure(
     """What the card says of an encoder on frames that no training saw."""
     latents, right = latents_of(network, held_out), held_out.macrostates
     kl = network.information(latents.mu, 2.0 * latents.sigma.log())
-    return {
-        "kl_nats": round(kl.mean().item(), 3),
-        "reconstruction": _squared_error(network, held_out, latents),
-        "probe": {
-            "linear": accuracy(linear, latents.mu, right),
-            "mlp": accuracy(probe, latents.mu, right),
-            "mlp_sampled": accuracy(probe, latents.sample(generator), right),
-        },
-    }
+    read = {"linear": accuracy(linear, latents.mu, right), "mlp": accuracy(probe, latents.mu, right)}
+    read["mlp_sampled"] = accuracy(probe, latents.sample(generator), right)
+    reconstruction = _squared_error(network, held_out, latents)
+    return {"kl_nats": round(kl.mean().item(), 3), "reconstruction": reconstruction, "probe": read}
 
 
 @torch.no_grad()

@@ -14,10 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.errors import require_known
-
 from .network import EncoderNetwork
-from .recipes import ARCHITECTURES, Recipe
+from .recipes import Recipe
 
 _LEAST_CONTRAST = 0.005  # of full scale; inputs about as flat as this are amplified less
 _SIDE = 64  # pixels; input and output of the Ha & Schmidhuber network
@@ -35,13 +33,7 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
     """KL(N(mu, sigma^2) || N(0, 1)) summed over latents: -1/2 sum(1 + log sigma^2 - mu^2 - sigma^2).
 
     The thesis prints it with the wrong sign and without 1/2 (equations 2.7, 3.1 and 5.1), an erratum.
-
-    Args:
-        mu: Means. Shape (N, Z).
-        log_variance: Logarithms of the variances. Shape (N, Z).
-
-    Returns:
-        Nats. Shape (N,).
+    From means and log variances (N, Z) to nats (N,).
     """
     return -0.5 * (1.0 + log_variance - mu.square() - log_variance.exp()).sum(dim=1)  # [N]
 
@@ -66,12 +58,9 @@ class Vae(EncoderNetwork):
         return kl_from_standard_normal(mu, log_variance)
 
     def elbo(self, images: Tensor, noise: Tensor, beta: float) -> Elbo:
-        """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of a batch.
+        """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of images (N, C, H, W) in [0, 1].
 
-        Args:
-            images: Shape (N, C, H, W), in [0, 1].
-            noise: Standard normal, for the reparametrisation. Shape (N, Z).
-            beta: Weight of the KL term.
+        ``noise`` (N, Z) is standard normal, for the reparametrisation; ``beta`` weighs the KL term.
         """
         mu, log_variance = self.posterior(images)  # [N, Z]
         latents = mu + (0.5 * log_variance).exp() * noise  # [N, Z]
@@ -90,14 +79,8 @@ class MlpVae(Vae):
     """One small network that reads a image whole, or each of its channels on its own.
 
     Channels that are strips hold one cube each: sharing the weights triples the data and lets no cube crowd out
-    another. The latents of group g are ``[g * L, (g + 1) * L)``.
-
-    Args:
-        recipe: Widths, latents a group and pixel noise.
-        channels: Channels C.
-        height: Pixels of a channel.
-        width: Pixels of a channel.
-        groups: C where every channel is read on its own, 1 where all are read together.
+    another. The latents of group g are ``[g * L, (g + 1) * L)``; ``groups`` is C where every channel is read on its
+    own, 1 where all are read together.
     """
 
     brightness: Tensor
@@ -105,10 +88,8 @@ class MlpVae(Vae):
 
     def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, groups: int) -> None:
         super().__init__()
-        self.latent_size = groups * recipe.latents
-        self._groups = groups
-        self._image_shape = (channels, height, width)
-        self._precision = recipe.pixel_std**-2
+        self._groups, self.latent_size = groups, groups * recipe.latents
+        self._image_shape, self._precision = (channels, height, width), recipe.pixel_std**-2
         sizes = (channels // groups * height * width, *recipe.widths)
         self.encoder = _mlp(*sizes, 2 * recipe.latents)
         self.decoder = _mlp(recipe.latents, *reversed(sizes))
@@ -132,8 +113,7 @@ class MlpVae(Vae):
     def generate(self, latents: Tensor) -> Tensor:
         """Means of the standardised pixels. Shape (N, C, H, W)."""
         apart = latents.reshape(len(latents) * self._groups, self.latent_size // self._groups)
-        pixels: Tensor = self.decoder(apart)  # [N * groups, pixels]
-        return pixels.reshape(len(latents), *self._image_shape)
+        return self.decoder(apart).reshape(len(latents), *self._image_shape)
 
     def log_loss(self, generated: Tensor, target: Tensor) -> Tensor:
         """Gaussian pixels of a fixed standard deviation."""
@@ -154,31 +134,19 @@ class HaSchmidhuberVae(Vae):
     """The convolutional VAE of Ha & Schmidhuber 2018 (World Models, A.1), one joint latent (thesis 5.2.2).
 
     Strips are resampled to 64 x 64 and enter as channels.
-
-    Args:
-        recipe: Gives the number of latents.
-        channels: Channels C in and out.
     """
 
     def __init__(self, recipe: Recipe, channels: int) -> None:
         super().__init__()
         self.latent_size = recipe.latents
-        depths = (channels, 32, 64, 128, 256)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(depths):
-            layers += [nn.Conv2d(before, after, kernel_size=4, stride=2), nn.ReLU()]
-        self.encoder = nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 2 * recipe.latents))
-        self.decoder = nn.Sequential(
-            nn.Linear(recipe.latents, 1024),
-            nn.Unflatten(1, (1024, 1, 1)),
-            nn.ConvTranspose2d(1024, 128, kernel_size=5, stride=2),
-            nn.ReLU(),
-            nn.ConvTranspose2d(128, 64, kernel_size=5, stride=2),
-            nn.ReLU(),
-            nn.ConvTranspose2d(64, 32, kernel_size=6, stride=2),
-            nn.ReLU(),
-            nn.ConvTranspose2d(32, channels, kernel_size=6, stride=2),
-        )
+        down: list[nn.Module] = []
+        for before, after in pairwise((channels, 32, 64, 128, 256)):
+            down += [nn.Conv2d(before, after, kernel_size=4, stride=2), nn.ReLU()]
+        self.encoder = nn.Sequential(*down, nn.Flatten(), nn.Linear(1024, 2 * recipe.latents))
+        up: list[nn.Module] = [nn.Linear(recipe.latents, 1024), nn.Unflatten(1, (1024, 1, 1))]
+        for (before, after), size in zip(pairwise((1024, 128, 64, 32, channels)), (5, 5, 6, 6), strict=True):
+            up += [nn.ConvTranspose2d(before, after, kernel_size=size, stride=2), nn.ReLU()]
+        self.decoder = nn.Sequential(*up[:-1])
 
     def target(self, images: Tensor) -> Tensor:
         """Images resampled to 64 x 64."""
@@ -191,8 +159,7 @@ class HaSchmidhuberVae(Vae):
 
     def generate(self, latents: Tensor) -> Tensor:
         """Logits of the pixels; the sigmoid of the output layer is in the loss and in :meth:`mean`."""
-        generated: Tensor = self.decoder(latents)
-        return generated
+        return self.decoder(latents)
 
     def mean(self, latents: Tensor) -> Tensor:
         """Probabilities of the pixels. Shape (N, C, 64, 64)."""
@@ -208,12 +175,8 @@ class HaSchmidhuberVae(Vae):
 
 
 def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
-    """The VAE of a recipe for images of shape (C, H, W), with whatever weights torch initialises it to.
-
-    Raises:
-        UnknownNameError: The recipe names an unknown architecture.
-    """
-    if require_known("encoder architecture", recipe.architecture, ARCHITECTURES) == "ha_schmidhuber":
+    """The VAE of a recipe for images of shape (C, H, W), with whatever weights torch initialises it to."""
+    if recipe.architecture == "ha_schmidhuber":
         return HaSchmidhuberVae(recipe, channels)
     return MlpVae(recipe, channels, height, width, groups=channels if recipe.architecture == "strips" else 1)
 

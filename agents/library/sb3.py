@@ -16,32 +16,31 @@ from imagine_bench.capabilities import OnEpisode
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 
-from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
 from .latent_observation import LatentObservation
-from .settings import HYPERPARAMETERS, LibrarySettings
+from .settings import HYPERPARAMETERS
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
 
 
 class LibraryAgent:
-    """One learner of the library, for one run.
+    """One learner of the library, for one run; it sees latents where the context names an encoder, else pixels.
 
     Args:
-        algorithm: Its class, such as ``stable_baselines3.DQN``.
-        settings: Its keywords.
-        seed: Of everything random in the library, which draws from torch's and numpy's global generators.
-        device: A torch device name.
-        encoder: Frames to latents; None for one that sees the pixels.
+        context: Of the run. Its seed is that of torch's and numpy's global generators, which the library draws from.
+        algorithm: The library's class, such as ``"stable_baselines3:DQN"``.
+
+    Raises:
+        SetupError: The library is not installed.
     """
 
-    def __init__(
-        self, algorithm: Any, settings: LibrarySettings, *, seed: int, device: str, encoder: Encoder | None
-    ) -> None:
-        self.settings = settings
-        self._algorithm, self._device, self._encoder = algorithm, device, encoder
-        self._seed = seed % _SEEDS
+    def __init__(self, context: AgentContext, algorithm: str) -> None:
+        prepare_torch(context.device)
+        self._algorithm, self._device = _load(algorithm), context.device
+        self.settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self._seed = context.seeds.child("library").integer() % _SEEDS
+        self._encoder = None if context.encoder is None else load_perception(context).encoder
         self._model: Any = None
 
     def train(self, env: gymnasium.Env[Any, Any], *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
@@ -62,11 +61,7 @@ class LibraryAgent:
         learn(self._model, steps, on_episode)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """The library's greedy action.
-
-        Raises:
-            ArtefactError: It was not trained.
-        """
+        """The library's greedy action; ArtefactError before training."""
         if self._model is None:
             raise ArtefactError("This agent has no policy before its training loop has run; train it first.")
         frame = observation.frame
@@ -90,26 +85,11 @@ class LibraryAgent:
         return AgentState(arrays=weights, values={})
 
     def restore(self, state: AgentState) -> None:
-        """Refuse.
-
-        Raises:
-            ArtefactError: Always: the library cannot go on from here bit for bit.
-        """
+        """Raise ArtefactError: the library cannot go on from here bit for bit."""
         raise ArtefactError("An agent of Stable-Baselines3 cannot be taken up again; run its bench anew.")
 
 
-def _make(context: AgentContext, target: str) -> LibraryAgent:
-    prepare_torch(context.device)
-    return LibraryAgent(
-        _algorithm(target),
-        HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group),
-        seed=context.seeds.child("library").integer(),
-        device=context.device,
-        encoder=None if context.encoder is None else load_perception(context).encoder,
-    )
-
-
-def _algorithm(target: str) -> Any:
+def _load(target: str) -> Any:
     module, _, name = target.partition(":")
     try:
         return getattr(importlib.import_module(module), name)
@@ -121,18 +101,10 @@ def _algorithm(target: str) -> Any:
 
 
 def make_dqn(context: AgentContext) -> LibraryAgent:
-    """The ``sb3_dqn`` agents: DQN (Mnih et al. 2015), on pixels, or on latents where there is an encoder.
-
-    Raises:
-        SetupError: The library is not installed.
-    """
-    return _make(context, "stable_baselines3:DQN")
+    """The ``sb3_dqn`` agents: DQN (Mnih et al. 2015), on pixels, or on latents where there is an encoder."""
+    return LibraryAgent(context, "stable_baselines3:DQN")
 
 
 def make_qrdqn(context: AgentContext) -> LibraryAgent:
-    """The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018).
-
-    Raises:
-        SetupError: The library is not installed.
-    """
-    return _make(context, "sb3_contrib:QRDQN")
+    """The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018)."""
+    return LibraryAgent(context, "sb3_contrib:QRDQN")

@@ -15,8 +15,7 @@ class _EpisodeCounter(BaseCallback):
 
     def __init__(self, on_episode: OnEpisode) -> None:
         super().__init__()
-        self._on_episode = on_episode
-        self._length = 0
+        self._on_episode, self._length = on_episode, 0
 
     def _on_step(self) -> bool:
         self._length += 1

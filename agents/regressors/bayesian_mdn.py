@@ -26,13 +26,9 @@ from .settings import MDNSettings
 
 
 class BayesianMDN:
-    """E mixture density networks, trained side by side.
+    """E mixture density networks of X inputs and D outputs, trained side by side.
 
-    Args:
-        n_inputs: X.
-        n_outputs: D.
-        settings: Sizes and rates.
-        generators: One a network: its initial weights, then its dropout masks.
+    Each has a generator, of its initial weights, then of its dropout masks.
     """
 
     def __init__(
@@ -56,12 +52,7 @@ class BayesianMDN:
     def update(self, x: Tensor, y: Tensor) -> Tensor:
         """One step of Adam on the mean negative log-likelihood of each network's own batch (equation 4.28).
 
-        Args:
-            x: Shape (E, N, X).
-            y: Shape (E, N, D).
-
-        Returns:
-            The losses before the step, in nats. Shape (E,).
+        From ``x`` (E, N, X) and ``y`` (E, N, D) to the losses (E,) before the step, in nats.
 
         Raises:
             DivergedError: A loss or gradient is NaN or infinite; weights and statistics are left as they were.

@@ -49,10 +49,6 @@ _Arrays = TypeVar("_Arrays", Prediction, Mixtures)
 class MixtureRegressor:
     """E Bayesian mixture density networks.
 
-    Args:
-        context: Their data and seeds.
-        settings: Sizes, rates, epochs.
-
     Raises:
         InvalidValueError: Data of unequal sizes, of wrong shapes, or not finite.
     """
@@ -69,23 +65,14 @@ class MixtureRegressor:
         self._x = self._tensor(inputs)
         self._y = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
         nodes = [seeds.child("member", m) for seeds in context.seeds for m in range(settings.members)]
-        self._weights_and_masks = [self._generator(node.child("network").integer()) for node in nodes]
-        self._order = [self._generator(node.child("batches").integer()) for node in nodes]
+        self._generators = {  # of weights and dropout masks, of the order of rows
+            kind: [self._generator(node.child(kind).integer()) for node in nodes] for kind in ("network", "batches")
+        }
         self._samples = [seeds.child("weight_samples") for seeds in context.seeds]
-        self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._weights_and_masks)
-        self._epoch = 0
+        self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._generators["network"])
+        self.epoch, self.epochs = 0, settings.epochs
         self._losses: list[float] = []
         self._folded: MemberMLP | None = None
-
-    @property
-    def epoch(self) -> int:
-        """Epochs done."""
-        return self._epoch
-
-    @property
-    def epochs(self) -> int:
-        """Epochs to do."""
-        return self.settings.epochs
 
     def train(self, epochs: int) -> None:
         """Train for so many more epochs: in each, every member sees each of its rows once, in an order of its own."""
@@ -96,16 +83,17 @@ class MixtureRegressor:
         for _ in range(epochs):
             for group in self._model.optimiser.param_groups:
                 group["lr"] = self._rate()
-            orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._order])
-            losses = []
-            for batch in orders.tensor_split(batches, dim=1):
-                losses.append(self._model.update(self._x[owner, batch], self._y[owner, batch]))
+            orders = torch.stack(
+                [torch.randperm(rows, generator=g, device=self._device) for g in self._generators["batches"]]
+            )
+            chosen = orders.tensor_split(batches, dim=1)
+            losses = [self._model.update(self._x[owner, batch], self._y[owner, batch]) for batch in chosen]
             self._losses.append(float(torch.stack(losses).mean()))
-            self._epoch += 1
+            self.epoch += 1
 
     def _rate(self) -> float:
         """The learning rate of the coming epoch."""
-        final, gone = self.settings.final_rate, min(1.0, self._epoch / self.settings.epochs)
+        final, gone = self.settings.final_rate, min(1.0, self.epoch / self.epochs)
         return self.settings.learning_rate * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * gone)))
 
     def diagnostics(self) -> dict[str, float]:
@@ -133,29 +121,22 @@ class MixtureRegressor:
         """Weights, moments, running statistics, generators, epochs."""
         arrays = prefixed("network", training_arrays(self._model.network, self._model.optimiser))
         arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
-        for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
+        for kind, generators in self._generators.items():
             arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
-        values = {
-            "settings": dataclasses.asdict(self.settings), "epoch": self._epoch,
-            "batches": self._model.network.batches, "losses": self._losses,
-        }  # fmt: skip
-        return AgentState(arrays=arrays, values=jsonable(values))
+        values = {"settings": dataclasses.asdict(self.settings), "epoch": self.epoch, "losses": self._losses}
+        return AgentState(arrays=arrays, values=jsonable({**values, "batches": self._model.network.batches}))
 
     def restore(self, state: AgentState) -> None:
-        """Continue from ``state``, bit for bit.
-
-        Raises:
-            ArtefactError: The snapshot does not fit.
-        """
+        """Continue from ``state``, bit for bit; ArtefactError where it does not fit."""
         require_fit(state, self.state(), equal=("settings",))
         arrays = state.arrays
         load_training(self._model.network, self._model.optimiser, below("network", arrays))
         for name, buffer in self._model.network.named_buffers():
             buffer.copy_(torch.tensor(arrays[f"statistics/{name}"]))
-        for kind, generators in (("network", self._weights_and_masks), ("batches", self._order)):
+        for kind, generators in self._generators.items():
             for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
                 load_generator(generator, array)
-        self._epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
+        self.epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
         self._losses, self._folded = list(state.values["losses"]), None
 
     def _tensor(self, values: Floats) -> Tensor:
@@ -168,12 +149,11 @@ class MixtureRegressor:
         """Mixtures (T, N) in the units of the targets; a network's weight samples are always the same ones."""
         if self._folded is None:
             self._folded = self._model.network.folded()
-        settings = self.settings
-        part, masks = members(self._folded, network * settings.members, settings.members), None
+        settings, masks = self.settings, None
+        part = members(self._folded, network * settings.members, settings.members)
         if settings.dropout > 0.0:
-            generator = self._generator(self._samples[network].integer())
-            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
-            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
+            generator, count = self._generator(self._samples[network].integer()), settings.weight_samples
+            masks = [dropout_mask((count, units), settings.dropout, generator) for units in settings.hidden[:-1]]
         samples = self._model.mixture(sample_outputs(part, x, masks))
         return rescaled(samples, self._shift[network], self._scale[network])
 
@@ -196,9 +176,8 @@ class MixtureRegressor:
         )
 
     def _require_inputs(self, inputs: Floats) -> None:
-        wanted = (self.networks, "N", self._x.shape[-1])
-        shape = np.shape(inputs)
-        fits = len(shape) == 3 and (shape[0], shape[2]) == (wanted[0], wanted[2]) and shape[1] > 0
+        wanted, shape = (self.networks, "N", self._x.shape[-1]), np.shape(inputs)
+        fits = len(shape) == 3 and shape[::2] == wanted[::2] and shape[1] > 0
         if not (fits and np.isfinite(inputs).all()):
             raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, N at least 1, not {shape}.")
 
@@ -227,8 +206,7 @@ def _shapes(data: Dataset) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def _array(values: Tensor) -> Floats:
-    array: Floats = values.double().cpu().numpy()
-    return array
+    return values.double().cpu().numpy()
 
 
 def _mixtures(mixture: Mixture) -> Mixtures:

@@ -8,21 +8,8 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError
 
-from ..settings import (
-    COUNT,
-    LAYERS,
-    NOT_NEGATIVE,
-    POSITIVE,
-    PRECISIONS,
-    PROBABILITY,
-    RATE,
-    ConfigGroup,
-    Hyperparameters,
-    Override,
-    Range,
-    between,
-    setting,
-)
+from .. import settings as kinds
+from ..settings import COUNT, POSITIVE, PROBABILITY, ConfigGroup, Hyperparameters, Override, Range, between, setting
 
 _DROPOUT = Range(
     lambda value: value == 0.0 or 1 / 256 <= value <= 0.95,
@@ -42,25 +29,23 @@ class MDNSettings:
         weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
             ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
             leave the data as ``w`` shrinks, and a third of the first layer die.
-        learning_rate: Of Adam.
         gradient_clip: Largest gradient norm of each network.
-        sigma_floor: Smallest standard deviation of a component, in units of the network's outputs.
-        sigma_ceiling: Largest, in the same units.
+        sigma_floor, sigma_ceiling: Range of a component's standard deviation, in units of the network's outputs.
         precision: Products between hidden layers while training.
 
     Raises:
         InvalidValueError: Dropout without two hidden layers.
     """
 
-    hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
+    hidden: tuple[int, ...] = setting((256, 256, 256), kinds.LAYERS)
     components: int = setting(10, between(1, 1_000))
     dropout: float = setting(0.2, _DROPOUT)
-    weight_decay: float = setting(0.02, NOT_NEGATIVE)
-    learning_rate: float = setting(1e-3, RATE)
+    weight_decay: float = setting(0.02, kinds.NOT_NEGATIVE)
+    learning_rate: float = setting(1e-3, kinds.RATE)
     gradient_clip: float = setting(10.0, POSITIVE)
     sigma_floor: float = setting(1e-3, between(1e-9, 1.0))
     sigma_ceiling: float = setting(10.0, between(1.0, 1e9))
-    precision: str = setting("float32", PRECISIONS)
+    precision: str = setting("float32", kinds.PRECISIONS)
 
     def __post_init__(self) -> None:
         if self.dropout > 0.0 and len(self.hidden) < 2:
@@ -75,7 +60,6 @@ class RegressorSettings(MDNSettings):
     """A regressor: its networks and how long they train.
 
     Attributes:
-        epochs: Passes over the data.
         final_rate: What the learning rate falls to after the last epoch, as a cosine, as a share of the first's
             (Loshchilov & Hutter 2017). 1 keeps it, as the thesis does.
         batch_size: Rows an update, at most; None for all, as the thesis names none.
@@ -107,20 +91,12 @@ _BATCH = Override(1000, "where there are more data: few epochs, more steps (all 
 _FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
 _FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for what it changes")
 
+_SHORT = {
+    "batch_size": _BATCH, "learning_rate": Override(3e-3, "fewer epochs want larger steps"), "precision": _FORMAT,
+}  # fmt: skip
 _SETS: dict[str, dict[str, Override]] = {
-    "minimal": {
-        "epochs": Override(20, "shows that every part works, within a minute"),
-        "batch_size": _BATCH,
-        "learning_rate": Override(3e-3, "so few epochs want larger steps"),
-        "precision": _FORMAT,
-    },
-    "fast": {
-        "epochs": Override(600, "CPU time"),
-        "batch_size": _BATCH,
-        "learning_rate": Override(3e-3, "fewer epochs want larger steps"),
-        "final_rate": _FALLING,
-        "precision": _FORMAT,
-    },
+    "minimal": {"epochs": Override(20, "shows that every part works, within a minute"), **_SHORT},
+    "fast": {"epochs": Override(600, "CPU time"), **_SHORT, "final_rate": _FALLING},
     "published": {"final_rate": _FALLING, "precision": _FORMAT},
 }
 """What each set changes of the thesis' values for one network with dropout."""
@@ -149,16 +125,11 @@ def _of_ensemble(changes: Mapping[str, Override]) -> dict[str, Override]:
     return {**changes, **_ENSEMBLE, "epochs": fewer}
 
 
-HYPERPARAMETERS = Hyperparameters(
-    {
-        "mc_dropout": ConfigGroup(RegressorSettings(), _SETS, unused=frozenset({"members"})),
-        "ensemble": ConfigGroup(
-            RegressorSettings(),
-            {name: _of_ensemble(changes) for name, changes in _SETS.items()},
-            unused=frozenset({"dropout"}),
-        ),
-    }
-)
+_ENSEMBLE_SETS = {name: _of_ensemble(changes) for name, changes in _SETS.items()}
+HYPERPARAMETERS = Hyperparameters({
+    "mc_dropout": ConfigGroup(RegressorSettings(), _SETS, unused=frozenset({"members"})),
+    "ensemble": ConfigGroup(RegressorSettings(), _ENSEMBLE_SETS, unused=frozenset({"dropout"})),
+})  # fmt: skip
 
 
 def resolve_all(hyperparameters: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, ...]:

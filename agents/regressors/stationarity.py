@@ -27,25 +27,15 @@ _CHUNK = 2_000_000
 
 @torch.no_grad()
 def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:
-    """Monte-Carlo estimate of the divergence between T mixtures, for each row.
+    """Monte-Carlo estimate of the divergence between T mixtures, (T, N) to (N,), in nats, cut to [0, log T].
 
-    Every mixture is drawn from equally often (stratified over t), so that only the value within it is chance.
-
-    Args:
-        samples: Mixtures with leading axes (T, N).
-        draws: Values drawn from each mixture, S: the standard error falls as 1 / sqrt(T S).
-        generator: Draws them.
-
-    Returns:
-        In nats, cut to [0, log T]. Shape (N,).
+    Every mixture is drawn from equally often (stratified over t), so that only the value within it is chance: the
+    standard error falls as 1 / sqrt(T S) with ``draws`` S from each.
     """
     count, rows, components, size = samples.means.shape
     piece = max(1, _CHUNK // (draws * count * count * components * size))
-    parts = [
-        _divergence(samples.map(itemgetter((slice(None), slice(start, start + piece)))), draws, generator)
-        for start in range(0, rows, piece)
-    ]
-    return torch.cat(parts)
+    pieces = (itemgetter((slice(None), slice(start, start + piece))) for start in range(0, rows, piece))
+    return torch.cat([_divergence(samples.map(rows_of), draws, generator) for rows_of in pieces])
 
 
 def _divergence(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:

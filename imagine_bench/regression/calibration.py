@@ -7,15 +7,8 @@ from operator import itemgetter
 import numpy as np
 
 from imagine_bench.interfaces import Floats
-from imagine_bench.judge.calibration import (
-    LEVELS,
-    auroc,
-    coverage,
-    crps,
-    log_score,
-    probability_transform,
-    transform_distance,
-)
+from imagine_bench.judge import calibration as measures
+from imagine_bench.judge.calibration import LEVELS, auroc, coverage, crps, log_score, transform_distance
 from imagine_bench.regression.interfaces import SCORES, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
@@ -42,22 +35,21 @@ def calibrate(
 
     Args:
         task: Gives the points and says how wrong a prediction is.
-        regressor: E trained networks.
-        variant: What they were trained on.
-        networks: One node of the seed tree each.
+        regressor: E networks, trained on ``variant``.
+        variant: Of the task.
+        networks: One node of the seed tree each, for its test points.
         points: Unseen points a network, N.
         rng: Samples the predictions.
 
     Returns:
-        One row a network, and arrays: ``transform`` and ``pooled_transform`` (E, N, D), ``error`` (E, N), and one a
-        score (E, N).
+        One row a network, and arrays: ``transform``, ``pooled_transform`` (E, N, D), ``error`` and each score (E, N).
     """
     tests = [task.testing(variant, node.child("test", variant).generator(), points) for node in networks]
     inputs, targets = np.stack([t.inputs for t in tests]), np.stack([t.targets for t in tests])
     prediction = regressor.predict(inputs, rng)
     error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, prediction.prediction, strict=True)])
     scores = {name: score(prediction) for name, score in SCORES.items()}
-    transform = probability_transform(prediction.predictive, targets)
+    transform = measures.probability_transform(prediction.predictive, targets)
     pooled_transform, pooled_crps = _pooled(regressor, inputs, targets)
     rows: list[Row] = []
     for e in range(len(networks)):
@@ -67,10 +59,9 @@ def calibrate(
         own_crps = crps(own, targets[e])  # [N, D]
         row |= {"log_score": log_score(own, targets[e]).mean(), "crps": own_crps.mean()}
         row |= {"crps_shared": own_crps[:CRPS_POINTS].mean(), "pooled_crps_shared": pooled_crps[e].mean()}
-        row |= {f"coverage_{level:g}": coverage(transform[e], level) for level in LEVELS}
-        row |= {"transform_distance": transform_distance(transform[e])}
-        row |= {f"pooled_coverage_{level:g}": coverage(pooled_transform[e], level) for level in LEVELS}
-        row |= {"pooled_transform_distance": transform_distance(pooled_transform[e])}
+        for prefix, each in (("", transform[e]), ("pooled_", pooled_transform[e])):
+            row |= {f"{prefix}coverage_{level:g}": coverage(each, level) for level in LEVELS}
+            row |= {f"{prefix}transform_distance": transform_distance(each)}
         row |= {f"auroc_{name}": auroc(values[e], wrong) for name, values in scores.items()}
         rows.append({name: float(value) for name, value in row.items()})
     return rows, {"transform": transform, "pooled_transform": pooled_transform, "error": error, **scores}
@@ -82,7 +73,7 @@ def _pooled(regressor: Regressor, inputs: Floats, targets: Floats) -> tuple[Floa
     for start in range(0, inputs.shape[1], _CHUNK):
         part = slice(start, start + _CHUNK)
         mixtures = regressor.pooled(inputs[:, part])
-        transforms.append(probability_transform(mixtures, targets[:, part]))
+        transforms.append(measures.probability_transform(mixtures, targets[:, part]))
         for point in range(start, min(start + _CHUNK, CRPS_POINTS, inputs.shape[1])):
             one = mixtures.map(itemgetter((slice(None), point - start)))
             scores.append(crps(one, targets[:, point]))  # [E, D]

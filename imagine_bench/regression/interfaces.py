@@ -1,9 +1,8 @@
 """The interfaces of regression tasks and regressors: numpy and the standard library only.
 
-A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. The bench
-knows both by these interfaces. One run trains several *networks*, each on data drawn for it, on every *variant* of
-the task. Shapes: ``E`` networks, ``N`` rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight
-samples.
+A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. One run
+trains several *networks*, each on data drawn for it, on every *variant* of the task. Shapes: ``E`` networks, ``N``
+rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight samples.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from imagine_bench.seeding import SeedTree
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """Pairs to learn from or to be tested on."""
+    """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D)."""
 
-    inputs: Floats  #: shape (N, X)
-    targets: Floats  #: shape (N, D)
+    inputs: Floats
+    targets: Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixtures:
-    """Gaussian mixtures with diagonal components."""
+    """Diagonal Gaussian mixtures: weights (..., K) of sum 1, means and standard deviations above 0 (..., K, D)."""
 
-    weights: Floats  #: each row sums to 1. Shape (..., K).
-    means: Floats  #: shape (..., K, D)
-    sigmas: Floats  #: standard deviations, above 0. Shape (..., K, D).
+    weights: Floats
+    means: Floats
+    sigmas: Floats
 
     def map(self, change: Callable[[Floats], Floats]) -> Mixtures:
         """The mixtures with each array changed alike, in their leading axes."""
@@ -79,7 +78,7 @@ class Regressor(Protocol):
 
     @property
     def epochs(self) -> int:
-        """Epochs to do."""
+        """Epochs to do, those done included."""
 
     def train(self, epochs: int) -> None:
         """Train for so many more epochs.
@@ -92,12 +91,7 @@ class Regressor(Protocol):
         """Means since the last call, by slashed name."""
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
-        """Predict, with uncertainties.
-
-        Args:
-            inputs: Each network's own. Shape (E, N, X).
-            rng: Samples predictions and Monte-Carlo sums.
-        """
+        """Predict from each network's own inputs (E, N, X); ``rng`` samples predictions and Monte-Carlo sums."""
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
@@ -117,11 +111,18 @@ class Regressor(Protocol):
 class RegressorContext:
     """What a regressor is built from."""
 
-    datasets: tuple[Dataset, ...]  #: one a network, all of the same size. Length E.
-    seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
-    hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
-    overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
-    device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``
+    Attributes:
+        datasets: One a network, all of the same size. Length E.
+        seeds: One node of the seed tree a network. Length E.
+        hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
+        overrides: Single settings that replace the set's.
+    """
+
+    datasets: tuple[Dataset, ...]
+    seeds: tuple[SeedTree, ...]
+    hyperparameters: str = "fast"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
 
 
 Predict = Callable[[Floats, str], Prediction]
@@ -132,13 +133,9 @@ class Evaluate(Protocol):
     """A task's own measurements of trained networks."""
 
     def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
-        """Everything the task's figures and tables are made of, by name; the first axis is the network, if there is
-        one.
+        """What the task's figures and tables are made of, by name; the first axis is the network, if there is one.
 
-        Args:
-            variant: What the networks were trained on.
-            predict: Gives their predictions.
-            seeds: One node a network, for test inputs.
+        ``variant`` is what the networks were trained on; ``seeds``, one node a network, draw test inputs.
         """
 
 
@@ -156,11 +153,23 @@ class MovingScene(Protocol):
 class RegressionSpec:
     """Everything the bench needs to know of a regression task. Building one is cheap."""
 
-    id: str  #: registry name
-    title: str  #: A few words for headings
-    description: str  #: two sentences for a reader of the report
-    variants: tuple[str, ...]  #: the variants of the thesis, in its order
-    #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
+    Attributes:
+        variants: Those of the thesis, in its order.
+        require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
+        training: Data of a variant, drawn from a generator.
+        testing: The given number of rows of the same process, never trained on.
+        errors: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
+        error_name: What ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong.
+        sections: ``"module:attr"`` of the function that turns them into sections of the report.
+        recorder: ``"module:attr"`` of the function that records them, or None.
+        scene: Gives the robot that carries out predictions, where there is one.
+        reference: Name of the thesis' tables.
+    """
+
+    id: str
+    title: str
+    description: str
+    variants: tuple[str, ...]
     require_variant: Callable[[str], None]
     training: Callable[[str, np.random.Generator], Dataset]  #: data of a variant, drawn from a generator
     #: The given number of rows of the same process, never trained on.

@@ -9,7 +9,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.protocols.data import ProtocolData, digest, require_seeds
+from imagine_bench.protocols.data import ProtocolData, digest, require_different, require_seeds
 
 _SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -21,21 +21,22 @@ class RegressionProtocol(ProtocolData):
 
     A run is one regressor and one seed: it trains ``networks`` networks on every variant, each on data of its own, as
     one batched computation, and that is why they share a run.
+
+    Attributes:
+        hyperparameters: Set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``.
+        variants: Variants of the task, in the order of the report; the task's own where none are given.
+        networks: Networks a run and variant, each on data drawn for it; in [1, 1000].
+        test_points: Unseen points of each network, for errors and calibration; in [2, 100000].
+        recorded: Whether runs leave a recording.
     """
 
-    task: str  #: registered regression task
-    preset: str  #: name of this protocol
-    hyperparameters: str = "fast"  #: set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``
-    #: Variants of the task, in the order of the report; the task's own where none are given.
+    hyperparameters: str = "fast"
     variants: tuple[str, ...] = ()
-    agents: tuple[str, ...] = ("mc_dropout", "ensemble")  #: registered regressors, in the order of the report
-    seeds: tuple[int, ...] = (0,)  #: one run a seed and regressor; each in [0, 2**24)
-    networks: int = 3  #: networks a run and variant, each on data drawn for it
-    test_points: int = 500  #: unseen points of each network, for errors and calibration
-    recorded: bool = True  #: whether runs leave a recording
-    overrides: tuple[tuple[str, Any], ...] = ()  #: settings that replace the preset's, as sorted (name, value) pairs
-    settings_digest: str = ""  #: as of :class:`imagine_bench.protocols.data.ProtocolData`
-    device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``
+    agents: tuple[str, ...] = ("mc_dropout", "ensemble")
+    seeds: tuple[int, ...] = (0,)
+    networks: int = 3
+    test_points: int = 500
+    recorded: bool = True
 
     def __post_init__(self) -> None:
         spec = registry.regression(self.task)
@@ -45,16 +46,12 @@ class RegressionProtocol(ProtocolData):
             spec.require_variant(variant)
         for agent in self.agents:
             registry.regressor_entry(agent)
-        for name, values in (("agents", self.agents), ("variants", self.variants)):
-            if not values or len(set(values)) != len(values):
-                raise InvalidValueError(f"{name} {values} must be at least one name, none of them twice.")
+        require_different("agents", self.agents)
+        require_different("variants", self.variants)
         require_known("device", self.device, DEVICES)
         require_seeds(self.seeds)
-        for name, value, low, high in (
-            ("networks", self.networks, 1, 1000),
-            ("test_points", self.test_points, 2, 10**5),
-        ):
-            if not low <= value <= high:
+        for name, low, high in (("networks", 1, 1000), ("test_points", 2, 10**5)):
+            if not low <= (value := getattr(self, name)) <= high:
                 raise InvalidValueError(f"{name} is {value}; it must lie in [{low}, {high}].")
 
     def work(self, agent: str, until: int | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +23,14 @@ _SHADES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 
 def write_report(result: RegressionResult) -> Path:
-    """Write ``result.folder / "report"``: index.html, report.md, results.csv, one CSV a table, and the figures.
-
-    Returns:
-        The path of index.html.
+    """Write index.html, report.md, results.csv, a CSV a table, the figures below ``report``; the path of index.html.
 
     Raises:
         SetupError: The folder cannot be written.
     """
-    spec, protocol, sections = registry.regression(result.protocol.task), result.protocol, collect(result)
-    tables = {
-        f"{table.name}.csv": csv_text([table.header, *table.rows]) for section in sections for table in section.tables
-    }
+    spec, protocol = registry.regression(result.protocol.task), result.protocol
+    sections = [*_own(result), _calibration(result), _costs(result)]
+    tables = [table for section in sections for table in section.tables]
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
     networks = f"{protocol.networks} network{'' if protocol.networks == 1 else 's'} a dataset"
     page = Page(
@@ -42,7 +39,7 @@ def write_report(result: RegressionResult) -> Path:
         question=spec.description,
         answers=[answer for section in sections for answer in section.answers],
         sections=[_compared(result), *sections],
-        files={"results.csv": table_text(rows), **tables},
+        files={"results.csv": table_text(rows), **{f"{t.name}.csv": csv_text([t.header, *t.rows]) for t in tables}},
         **made(result, {agent: _title(agent) for agent in protocol.agents}),
     )
     return write_page(result.folder / "report", page)
@@ -51,18 +48,10 @@ def write_report(result: RegressionResult) -> Path:
 def summary_table(result: RegressionResult) -> str:
     """The task's first table, if there is one, and the short answer, as plain text."""
     own = _own(result)
-    table = [
-        line
-        for first in own[0].tables[:1]
-        for line in aligned([list(first.header), *([str(cell) for cell in row] for row in first.rows)])
-    ]
-    answers = [answer for section in own for answer in section.answers]
-    return "\n".join([own[0].title, "", *table, *([""] if table else []), *answers])
-
-
-def collect(result: RegressionResult) -> list[Section]:
-    """Every section: the task's own, then what all regression tasks have."""
-    return [*_own(result), _calibration(result), _costs(result)]
+    lines = [own[0].title, ""]
+    for first in own[0].tables[:1]:
+        lines += [*aligned([list(first.header), *([str(cell) for cell in row] for row in first.rows)]), ""]
+    return "\n".join([*lines, *(answer for section in own for answer in section.answers)])
 
 
 def _title(agent: str) -> str:
@@ -90,30 +79,23 @@ def _compared(result: RegressionResult) -> Section:
 
 
 def _own(result: RegressionResult) -> list[Section]:
-    sections: list[Section] = registry.load(registry.regression(result.protocol.task).sections)(result)
-    return sections
+    return registry.load(registry.regression(result.protocol.task).sections)(result)
 
 
 def _calibration(result: RegressionResult) -> Section:
     spec, protocol = registry.regression(result.protocol.task), result.protocol
     rows, detectors = [], []
-    for agent in protocol.agents:
-        title = _title(agent)
-        for variant in protocol.variants:
-            values = {name: result.values(agent, variant, name) for name in _MEASURES}
-            for prefix, kind in (("", "predicts with"), ("pooled_", "all weight samples")):
-                inside = [f"{100 * values[f'{prefix}coverage_{level:g}'].mean():.1f}" for level in LEVELS]
-                rows.append([
-                    f"{title}, {variant}: {kind}", *inside,
-                    number(float(values[f"{prefix}transform_distance"].mean()), 2),
-                    mean_std(values[f"{prefix}crps_shared"]),
-                ])  # fmt: skip
-            found = [result.values(agent, variant, f"auroc_{name}") for name in SCORES]
-            detectors.append([
-                f"{title}, {variant}", f"{100 * result.values(agent, variant, 'wrong').mean():.1f}",
-                *(number(float(np.nanmean(f)) if np.isfinite(f).any() else np.nan, 2) for f in found),
-            ])  # fmt: skip
+    for agent, variant in result.pairs:
+        label, measured = f"{_title(agent)}, {variant}", partial(result.values, agent, variant)
+        for prefix, kind in (("", "predicts with"), ("pooled_", "all weight samples")):
+            inside = [f"{100 * measured(f'{prefix}coverage_{level:g}').mean():.1f}" for level in LEVELS]
+            distance = number(float(measured(f"{prefix}transform_distance").mean()), 2)
+            rows.append([f"{label}: {kind}", *inside, distance, mean_std(measured(f"{prefix}crps_shared"))])
+        found = [measured(f"auroc_{name}") for name in SCORES]
+        aurocs = [number(float(np.nanmean(f)) if np.isfinite(f).any() else np.nan, 2) for f in found]
+        detectors.append([label, f"{100 * measured('wrong').mean():.1f}", *aurocs])
     levels = [f"in {100 * level:g} % interval (%)" for level in LEVELS]
+    names = [name.replace("_", " ") for name in SCORES]
     return Section(
         title="Calibration: as sure as it may be?",
         words=(
@@ -129,19 +111,9 @@ def _calibration(result: RegressionResult) -> Section:
         images=(_coverage_image(result),),
         tables=(
             Table(name="calibration", header=["", *levels, "PIT distance", "CRPS, mean (std)"], rows=rows),
-            Table(
-                name="auroc", header=["AUROC of", "wrong (%)", *(name.replace("_", " ") for name in SCORES)],
-                rows=detectors,
-            ),
+            Table(name="auroc", header=["AUROC of", "wrong (%)", *names], rows=detectors),
         ),
-    )  # fmt: skip
-
-
-_MEASURES = tuple(
-    f"{prefix}{name}"
-    for prefix in ("", "pooled_")
-    for name in (*(f"coverage_{level:g}" for level in LEVELS), "transform_distance", "crps_shared")
-)
+    )
 
 
 def _coverage_image(result: RegressionResult) -> Image:
@@ -154,14 +126,10 @@ def _coverage_image(result: RegressionResult) -> Image:
         for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
             axes.plot([0, 100], [0, 100], color="#8c8c8c", linewidth=1, linestyle=(0, (4, 3)))
             for shade, agent in zip(_SHADES, agents, strict=False):
-                title = _title(agent)
-                for name, line, label in (
-                    ("transform", "-", "predicts with"),
-                    ("pooled_transform", ":", "all samples"),
-                ):
-                    values = np.abs(result.arrays(agent, variant, f"calibration/{name}").ravel() - 0.5)
+                for prefix, line, label in (("", "-", "predicts with"), ("pooled_", ":", "all samples")):
+                    values = np.abs(result.arrays(agent, variant, f"calibration/{prefix}transform").ravel() - 0.5)
                     share = [(values <= level / 2).mean() * 100 for level in levels]
-                    axes.plot(100 * levels, share, color=shade, linestyle=line, label=f"{title}, {label}")
+                    axes.plot(100 * levels, share, color=shade, linestyle=line, label=f"{_title(agent)}, {label}")
             axes.set(title=variant, xlabel="central interval (%)", xlim=(0, 100), ylim=(0, 100))
         figure.axes[0].set_ylabel("outcomes inside (%)")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8.5)
@@ -173,21 +141,13 @@ def _coverage_image(result: RegressionResult) -> Image:
 
 
 def _costs(result: RegressionResult) -> Section:
-    rows = [
-        [
-            f"{_title(agent)}, {variant}",
-            number(float(result.values(agent, variant, "train_cpu_s").mean())),
-            number(float(result.values(agent, variant, "measure_cpu_s").mean())),
-        ]
-        for agent in result.protocol.agents
-        for variant in result.protocol.variants
-    ]
+    rows = []
+    for agent, variant in result.pairs:
+        costs = [result.values(agent, variant, name).mean() for name in ("train_cpu_s", "measure_cpu_s")]
+        rows.append([f"{_title(agent)}, {variant}", *(number(float(cost)) for cost in costs)])
     table = Table(name="costs", header=["CPU seconds a network", "training", "measuring"], rows=rows)
-    return Section(
-        title="What it cost",
-        words=(
-            f"The networks of a run train together, as one batched computation; its CPU seconds are shared out among "
-            f"them. The whole bench took {result.wall_s:,.0f} s of wall time.",
-        ),
-        tables=(table,),
+    words = (
+        "The networks of a run train together, as one batched computation; its CPU seconds are shared out among them. "
+        f"The whole bench took {result.wall_s:,.0f} s of wall time."
     )
+    return Section(title="What it cost", words=(words,), tables=(table,))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,6 +26,7 @@ Ratios = dict[str, statistics.Estimate]
 """Error as a ratio to a random choice, by criterion."""
 _JOINTS = ("q1", "q2", "q3")
 _UNPRINTED = "not in the thesis"
+_INTERVALS = "In brackets: 95 % interval over networks (bootstrap)."
 _KINDS = ("epistemic", "modal", "aleatoric")
 
 
@@ -44,14 +46,9 @@ def totals(result: RegressionResult, agent: str, variant: str) -> dict[str, Valu
 
 
 def by_criterion(result: RegressionResult, agent: str, variant: str, part: str, what: str) -> dict[str, Values]:
-    """``what`` of the chosen candidates, cumulated over the choices, by criterion: (E,) each.
+    """``what`` (``error``, ``outside_m``) of the chosen candidates, cumulated over choices, by criterion: (E,) each.
 
-    Args:
-        result: What was measured.
-        agent: The regressor.
-        variant: Its data.
-        part: ``decision``, whose candidates are within reach, or ``disc``, whose need not be.
-        what: A quantity of every candidate: ``error`` or ``outside_m``.
+    The candidates of ``part`` ``decision`` are within reach, those of ``disc`` need not be.
     """
     values = result.arrays(agent, variant, f"{part}/{what}")  # [E, choices, candidates]
     picks = {name: result.arrays(agent, variant, f"{part}/{name}").argmin(axis=-1) for name in SCORES}
@@ -61,12 +58,9 @@ def by_criterion(result: RegressionResult, agent: str, variant: str, part: str, 
 
 
 def ratio_to_random(values: Values, random: Values, rng: np.random.Generator) -> statistics.Estimate:
-    """Ratio of mean cumulated errors with its 95 % interval, networks resampled with both of their errors.
+    """Ratio of mean cumulated errors (E,) to those of a random choice (E,) by the same networks.
 
-    Args:
-        values: Cumulated errors of a criterion. Shape (E,).
-        random: Those of a random choice by the same networks. Shape (E,).
-        rng: Draws the resamples.
+    The 95 % interval resamples networks with both of their errors; ``rng`` draws the resamples.
     """
     value = float(values.mean() / random.mean())
     if len(values) < 2:
@@ -80,25 +74,27 @@ def _decisions(result: RegressionResult) -> Section:
     protocol, columns = result.protocol, (*SCORES, "min", "max", "random", "mink")
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
     rng = SeedTree(int(protocol.hash, 16)).child("report").generator()
-    found = {pair: totals(result, *pair) for pair in _pairs(result)}
-    against = {pair: _against_chance(errors, rng) for pair, errors in found.items()}
-    errors, ratios = _rows(found, against, columns)
+    found = {pair: totals(result, *pair) for pair in result.pairs}
+    against, errors, ratios = _rows(found, columns, rng)
     answers = []
     for (agent, variant), estimates in against.items():
+        known = variant in printed["random"]
+        thesis = f" (thesis {printed['epistemic'][variant][0] / printed['random'][variant][0]:.2f})" if known else ""
         least, best = min((estimate.value, name) for name, estimate in estimates.items())
         answers.append(
             f"{_label(agent, variant)} samples: choosing the least epistemic uncertainty leaves "
-            f"{estimates['epistemic'].value:.2f} of the error of a random choice"
-            f"{_printed_ratio(printed, variant)}; best is {best.replace('_', ' ')} with {least:.2f}."
+            f"{estimates['epistemic'].value:.2f} of the error of a random choice{thesis}; best is "
+            f"{best.replace('_', ' ')} with {least:.2f}."
         )
     for variant in protocol.variants:
         if variant in printed["random"]:
             cells = {name: rows[variant] for name, rows in printed.items() if variant in rows}
-            errors.append([f"thesis, {variant}", *(_printed(cells, name) for name in columns)])
-            chance = cells["random"][0]
-            shares = [f"{cells[name][0] / chance:.2f}" if name in cells else DASH for name in SCORES]
-            ratios.append([f"thesis, {variant}", *shares])
-    names = [name.replace("_", " ") for name in columns]
+            texts = {name: f"{mean:.2f} ({std:.2f})" for name, (mean, std) in cells.items()}
+            errors.append([f"thesis, {variant}", *(texts.get(name, DASH) for name in columns)])
+            shares = {name: f"{mean / cells['random'][0]:.2f}" for name, (mean, _) in cells.items()}
+            ratios.append([f"thesis, {variant}", *(shares.get(name, DASH) for name in SCORES)])
+    header, scores = _headers(columns)
+    caption = f"{_INTERVALS} Below 1 a criterion beats chance."
     return Section(
         title="Table 4.1: which place can the robot trust itself to reach?",
         words=(
@@ -112,24 +108,19 @@ def _decisions(result: RegressionResult) -> Section:
         ),
         images=(_ratio_image(result, against),),
         tables=(
-            Table(name="table_4_1", header=["cumulated error (m)", *names], rows=errors, why_dash=_UNPRINTED),
-            Table(
-                name="ratio_to_random", header=["ratio to random", *(n.replace("_", " ") for n in SCORES)], rows=ratios,
-                caption="In brackets: 95 % interval over networks (bootstrap). Below 1 a criterion beats chance.",
-                why_dash=_UNPRINTED,
-            ),
+            Table(name="table_4_1", header=header, rows=errors, why_dash=_UNPRINTED),
+            Table(name="ratio_to_random", header=scores, rows=ratios, caption=caption, why_dash=_UNPRINTED),
         ),
         answers=answers,
-    )  # fmt: skip
+    )
 
 
 def _beyond(result: RegressionResult) -> Section:
     """The same choices among points of the whole disc of the stretched arm."""
-    protocol, columns = result.protocol, (*SCORES, "min", "max", "random")
-    rng = SeedTree(int(protocol.hash, 16)).child("report_disc").generator()
-    found = {pair: by_criterion(result, *pair, "disc", "error") for pair in _pairs(result)}
-    against = {pair: _against_chance(errors, rng) for pair, errors in found.items()}
-    errors, ratios = _rows(found, against, columns)
+    columns = (*SCORES, "min", "max", "random")
+    rng = SeedTree(int(result.protocol.hash, 16)).child("report_disc").generator()
+    found = {pair: by_criterion(result, *pair, "disc", "error") for pair in result.pairs}
+    against, errors, ratios = _rows(found, columns, rng)
     answers = []
     for (agent, variant), estimates in against.items():
         outside = by_criterion(result, agent, variant, "disc", "outside_m")
@@ -139,7 +130,7 @@ def _beyond(result: RegressionResult) -> Section:
             f"asks for {outside['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
             f"{outside['random'].mean():.2f} m)."
         )
-    names = [name.replace("_", " ") for name in columns]
+    header, scores = _headers(columns)
     return Section(
         title="The same among places that may be out of reach",
         words=(
@@ -148,45 +139,33 @@ def _beyond(result: RegressionResult) -> Section:
             "what it cannot reach? The thesis draws its points 'over the workspace' and does not say how.",
         ),
         tables=(
-            Table(name="disc", header=["cumulated error (m)", *names], rows=errors),
-            Table(
-                name="disc_ratio_to_random", header=["ratio to random", *(n.replace("_", " ") for n in SCORES)],
-                rows=ratios, caption="In brackets: 95 % interval over networks (bootstrap).",
-            ),
+            Table(name="disc", header=header, rows=errors),
+            Table(name="disc_ratio_to_random", header=scores, rows=ratios, caption=_INTERVALS),
         ),
         answers=answers,
-    )  # fmt: skip
+    )
 
 
-def _pairs(result: RegressionResult) -> list[Pair]:
-    return [(agent, variant) for agent in result.protocol.agents for variant in result.protocol.variants]
+def _headers(columns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Of the table of errors and of that of ratios."""
+    errors, ratios = ([name.replace("_", " ") for name in names] for names in (columns, SCORES))
+    return ["cumulated error (m)", *errors], ["ratio to random", *ratios]
 
 
 def _label(agent: str, variant: str) -> str:
     return f"{registry.regressor_entry(agent).title}, {variant}"
 
 
-def _against_chance(errors: Mapping[str, Values], rng: np.random.Generator) -> Ratios:
-    return {name: ratio_to_random(errors[name], errors["random"], rng) for name in SCORES}
-
-
 def _rows(
-    found: Mapping[Pair, Mapping[str, Values]], against: Mapping[Pair, Ratios], columns: Sequence[str]
-) -> tuple[list[list[str]], list[list[str]]]:
-    """Rows of errors by criterion, and of their ratios to a random choice, one a regressor and dataset."""
+    found: Mapping[Pair, Mapping[str, Values]], columns: Sequence[str], rng: np.random.Generator
+) -> tuple[dict[Pair, Ratios], list[list[str]], list[list[str]]]:
+    """Ratios of errors to a random choice; rows of the errors and of these, one a regressor and dataset."""
+    against = {
+        pair: {name: ratio_to_random(by[name], by["random"], rng) for name in SCORES} for pair, by in found.items()
+    }
     errors = [[_label(*pair), *(mean_std(by[name].tolist()) for name in columns)] for pair, by in found.items()]
     ratios = [[_label(*pair), *(_interval(by[name]) for name in SCORES)] for pair, by in against.items()]
-    return errors, ratios
-
-
-def _printed(cells: dict[str, list[float]], criterion: str) -> str:
-    return f"{cells[criterion][0]:.2f} ({cells[criterion][1]:.2f})" if criterion in cells else DASH
-
-
-def _printed_ratio(printed: dict[str, dict[str, list[float]]], variant: str) -> str:
-    if variant not in printed["random"]:
-        return ""
-    return f" (thesis {printed['epistemic'][variant][0] / printed['random'][variant][0]:.2f})"
+    return against, errors, ratios
 
 
 def _interval(estimate: statistics.Estimate) -> str:
@@ -208,10 +187,8 @@ def _ratio_image(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Im
             marker = "osDv^"[protocol.agents.index(agent) % 5]
             shade = shades[protocol.variants.index(variant) % 5]
             bars = np.nan_to_num(np.abs(values[:, 1:].T - values[:, 0]))
-            axes.errorbar(
-                off, values[:, 0], yerr=bars, fmt=marker, markersize=5, color=shade, capsize=2,
-                label=_label(agent, variant),
-            )  # fmt: skip
+            style: dict[str, Any] = {"fmt": marker, "markersize": 5, "color": shade, "capsize": 2}
+            axes.errorbar(off, values[:, 0], yerr=bars, label=_label(agent, variant), **style)
         for index, name in enumerate(SCORES):
             ratios = [
                 c[0] / printed["random"][v][0] for v, c in printed.get(name, {}).items() if v in protocol.variants
@@ -230,25 +207,22 @@ def _ratio_image(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Im
 
 
 def _maps(result: RegressionResult) -> Section:
-    agents, variants = result.protocol.agents, result.protocol.variants
     images = []
-    for agent in agents:
-        title = registry.regressor_entry(agent).title
-        for variant in variants:
-            name = f"{agent}_{variant}"
-            images.append(image(
-                f"figure_4_2_{name}", partial(figure_4_2, result, agent, variant),
-                alt="Places visited while babbling, error of reaching, and stationarity over the workspace.",
-                caption=f"{title}, {variant} samples (first network), after figure 4.2: where the arm's tip was while "
-                "babbling, how far it misses a place that it reaches for, and the stationarity score.",
-            ))  # fmt: skip
-            images.append(image(
-                f"figure_4_3_{name}", partial(figure_4_3, result, agent, variant),
-                alt="Epistemic, modal and aleatoric uncertainty of each joint over the workspace.",
-                caption=f"{title}, {variant} samples (first network), after figure 4.3: standard deviation of each "
-                "joint by cause, in radians. Outside of the line no place can be reached.",
-            ))  # fmt: skip
-    outside = result.first(agents[0], variants[0])["map/outside_m"]
+    for pair in result.pairs:
+        name, samples = "_".join(pair), f"{_label(*pair)} samples (first network)"
+        alt = "Places visited while babbling, error of reaching, and stationarity over the workspace."
+        caption = (
+            f"{samples}, after figure 4.2: where the arm's tip was while babbling, how far it misses a place that it "
+            "reaches for, and the stationarity score."
+        )
+        images.append(image(f"figure_4_2_{name}", partial(figure_4_2, result, *pair), alt=alt, caption=caption))
+        alt = "Epistemic, modal and aleatoric uncertainty of each joint over the workspace."
+        caption = (
+            f"{samples}, after figure 4.3: standard deviation of each joint by cause, in radians. Outside of the line "
+            "no place can be reached."
+        )
+        images.append(image(f"figure_4_3_{name}", partial(figure_4_3, result, *pair), alt=alt, caption=caption))
+    outside = result.first(*result.pairs[0])["map/outside_m"]
     words = (
         f"{int((outside > 0).sum())} of the {len(outside)} places of the maps are unreachable, the farthest by "
         f"{outside.max():.2f} m: nothing is asked of the arm there (white in the error map), and the uncertainties "
@@ -284,20 +258,23 @@ def figure_4_3(result: RegressionResult, agent: str, variant: str) -> Figure:
 def _field(
     figure: Figure, axes: Axes, data: dict[str, Values], values: Values, title: str, top: float | None = None
 ) -> None:
-    side = round(len(values) ** 0.5)
-    points = data["map/points"].reshape(side, side, 2)
-    shown = axes.pcolormesh(*points.transpose(2, 0, 1), values.reshape(side, side), cmap="viridis", vmin=0, vmax=top,
-                            shading="nearest", rasterized=True)  # fmt: skip
+    grid = _grid(data)
+    style: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top, "shading": "nearest", "rasterized": True}
+    shown = axes.pcolormesh(*grid, values.reshape(grid.shape[1:]), **style)
     figure.colorbar(shown, ax=axes, shrink=0.85, extend="max" if top is not None else "neither")
     _arena(axes, data, title)
 
 
 def _arena(axes: Axes, data: dict[str, Values], title: str) -> None:
     """The edge of the workspace, the arm's base, equal axes."""
-    side = round(len(data["map/outside_m"]) ** 0.5)
-    points = data["map/points"].reshape(side, side, 2)
-    edge = data["map/outside_m"].reshape(side, side)
-    axes.contour(*points.transpose(2, 0, 1), edge, levels=[1e-3], colors="#d55e00", linewidths=1.1)
+    grid = _grid(data)
+    axes.contour(*grid, data["map/outside_m"].reshape(grid.shape[1:]), levels=[1e-3], colors="#d55e00", linewidths=1.1)
     axes.plot(0, 0, marker="o", color="#d55e00", markersize=4)
     axes.set(title=title, aspect="equal", xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), xlabel="x1 (m)")
     axes.grid(visible=False)
+
+
+def _grid(data: dict[str, Values]) -> Values:
+    """Places of the map. Shape (2, side, side)."""
+    side = round(len(data["map/points"]) ** 0.5)
+    return data["map/points"].reshape(side, side, 2).transpose(2, 0, 1)

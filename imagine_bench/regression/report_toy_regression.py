@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
@@ -17,7 +14,7 @@ from imagine_bench.report.sections import Image, Section, Table, number
 
 _REGION, _EDGE = (-10.0, 10.0), 30.0
 _SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00"}
-_KINDS = (("epistemic", "true_epistemic"), ("modal", "true_modal"), ("aleatoric", "true_aleatoric"))
+_KINDS = ("epistemic", "modal", "aleatoric")
 _TITLES = {"base": "base", "low_data": "little data in the region", "high_noise": "much noise in the region"}
 
 Values = NDArray[np.float64]
@@ -66,35 +63,27 @@ def ratio(result: RegressionResult, agent: str, kind: str, variant: str) -> Valu
     x = result.first(agent, variant)["x"]
     inside = (x >= _REGION[0]) & (x <= _REGION[1])
     changed, base = (result.arrays(agent, v, kind)[:, inside].mean(axis=1) for v in (variant, "base"))
-    found: Values = changed / base
-    return found
+    return changed / base
 
 
 def rank_correlation(result: RegressionResult, agent: str, kind: str, variant: str) -> Values:
     """Spearman's correlation of an uncertainty with the distance from the data, where x > 30. Shape (E,)."""
     x = result.first(agent, variant)["x"]
-    beyond = x > _EDGE
-    rows = result.arrays(agent, variant, kind)[:, beyond]
-    return np.array([stats.spearmanr(x[beyond], row).statistic for row in rows])
+    rows = result.arrays(agent, variant, kind)[:, x > _EDGE]
+    return np.array([stats.spearmanr(x[x > _EDGE], row).statistic for row in rows])
 
 
-_CLAIMS: tuple[tuple[str, str, Callable[[RegressionResult, str], Values], str], ...] = (
-    ("low_data", "little data: epistemic there, times base", lambda r, a: ratio(r, a, "epistemic", "low_data"), "≥ 3"),
-    ("low_data", "little data: aleatoric there, times base", lambda r, a: ratio(r, a, "aleatoric", "low_data"), "≤ 2"),
-    (
-        "high_noise", "much noise: aleatoric there, times base (truth 9)",
-        lambda r, a: ratio(r, a, "aleatoric", "high_noise"), "≥ 4",
-    ),
-    ("high_noise", "much noise: epistemic there, times base",
-     lambda r, a: ratio(r, a, "epistemic", "high_noise"), "≤ 2"),
-    ("low_data", "little data: stationarity there, times base",
-     lambda r, a: ratio(r, a, "stationarity", "low_data"), ""),
-    ("base", "extrapolation: rank correlation of epistemic with distance",
-     lambda r, a: rank_correlation(r, a, "epistemic", "base"), "> 0"),
-    ("base", "extrapolation: rank correlation of aleatoric with distance",
-     lambda r, a: rank_correlation(r, a, "aleatoric", "base"), "> 0"),
-)  # fmt: skip
-"""The variant a claim needs beside the base, its words, its measure, and what is asked of it."""
+_LOW, _HIGH, _FAR = "little data", "much noise", "extrapolation: rank correlation of"
+_CLAIMS = (
+    ("low_data", ratio, "epistemic", f"{_LOW}: epistemic there, times base", "≥ 3"),
+    ("low_data", ratio, "aleatoric", f"{_LOW}: aleatoric there, times base", "≤ 2"),
+    ("high_noise", ratio, "aleatoric", f"{_HIGH}: aleatoric there, times base (truth 9)", "≥ 4"),
+    ("high_noise", ratio, "epistemic", f"{_HIGH}: epistemic there, times base", "≤ 2"),
+    ("low_data", ratio, "stationarity", f"{_LOW}: stationarity there, times base", ""),
+    ("base", rank_correlation, "epistemic", f"{_FAR} epistemic with distance", "> 0"),
+    ("base", rank_correlation, "aleatoric", f"{_FAR} aleatoric with distance", "> 0"),
+)
+"""The variant a claim needs beside the base, its measure of which uncertainty, its words, and what is asked of it."""
 
 
 def holds(values: Values, asked: str) -> NDArray[np.bool_]:
@@ -106,9 +95,9 @@ def holds(values: Values, asked: str) -> NDArray[np.bool_]:
 
 def _claims(result: RegressionResult, agent: str) -> Table:
     rows = []
-    for variant, words, measure, asked in _CLAIMS:
+    for variant, measure, kind, words, asked in _CLAIMS:
         if {variant, "base"} <= set(result.protocol.variants):
-            values = measure(result, agent)
+            values = measure(result, agent, kind, variant)
             met = f"{int(holds(values, asked).sum())} of {len(values)}" if asked else ""
             spread = f"[{number(values.min())}, {number(values.max())}]"
             rows.append([words, f"{number(float(np.median(values)))} {spread}", asked, met])
@@ -118,18 +107,20 @@ def _claims(result: RegressionResult, agent: str) -> Table:
 
 def _answers(result: RegressionResult, agent: str) -> list[str]:
     title, variants = registry.regressor_entry(agent).title, set(result.protocol.variants)
+
+    def times(kind: str, variant: str) -> str:
+        return f"{number(float(np.median(ratio(result, agent, kind, variant))))} times"
+
     sentences = []
     if {"base", "low_data"} <= variants:
-        low = [float(np.median(ratio(result, agent, kind, "low_data"))) for kind in ("epistemic", "aleatoric")]
         sentences.append(
-            f"{title}: where data is scarce, epistemic uncertainty is {number(low[0])} times that of the base networks "
-            f"and aleatoric {number(low[1])} times (medians over networks)."
+            f"{title}: where data is scarce, epistemic uncertainty is {times('epistemic', 'low_data')} that of the "
+            f"base networks and aleatoric {times('aleatoric', 'low_data')} (medians over networks)."
         )
     if {"base", "high_noise"} <= variants:
-        noisy = [float(np.median(ratio(result, agent, kind, "high_noise"))) for kind in ("aleatoric", "epistemic")]
         sentences.append(
-            f"{title}: where noise is high, aleatoric uncertainty is {number(noisy[0])} times that of the base "
-            f"networks (truth 9) and epistemic {number(noisy[1])} times."
+            f"{title}: where noise is high, aleatoric uncertainty is {times('aleatoric', 'high_noise')} that of the "
+            f"base networks (truth 9) and epistemic {times('epistemic', 'high_noise')}."
         )
     return sentences
 
@@ -139,23 +130,19 @@ def _against_truth(result: RegressionResult, agent: str) -> Table:
     for variant in result.protocol.variants:
         first = result.first(agent, variant)
         inside = np.abs(first["x"]) <= _EDGE
-        for kind, name in _KINDS:
+        for kind in _KINDS:
             estimate = np.sqrt(result.arrays(agent, variant, kind)[:, inside])
+            name = f"true_{kind}"
             known = first[name] if first[name].ndim == 1 else result.arrays(agent, variant, name)
             truth = np.broadcast_to(np.sqrt(known[..., inside]), estimate.shape)
             # equation 4.6 contains the estimate, which would agree with itself: the rest is the error of the mean
             target = truth**2 - estimate**2 if kind == "epistemic" else truth
-            varies = np.ptp(target, axis=1).max() > 0
-            along = (
-                np.mean([stats.spearmanr(*pair).statistic for pair in zip(estimate, target, strict=True)])
-                if varies
-                else np.nan
-            )
+            varies, pairs = np.ptp(target, axis=1).max() > 0, zip(estimate, target, strict=True)
+            along = np.mean([stats.spearmanr(*pair).statistic for pair in pairs]) if varies else np.nan
             off = np.median(np.abs(estimate - truth), axis=1).mean()
             cells = [np.median(estimate, axis=1).mean(), np.median(truth, axis=1).mean(), off, along]
             rows.append([f"{_TITLES[variant]}: {kind}", *(number(float(cell)) for cell in cells)])
-    title = registry.regressor_entry(agent).title
-    header = [title, "estimated (y)", "true (y)", "difference (y)", "rank correlation"]
+    header = [registry.regressor_entry(agent).title, "estimated (y)", "true (y)", "difference (y)", "rank correlation"]
     return Table(name=f"truth_{agent}", header=header, rows=rows)
 
 
@@ -180,27 +167,20 @@ def figure_4_1(result: RegressionResult, agent: str) -> Figure:
         column[0].scatter(data["training_x"], data["training_y"], s=2, color="#a8a8a8", linewidths=0)
         column[0].scatter(x, data["prediction"][0], s=2.5, color="#0072b2", linewidths=0)
         column[0].set(title=_TITLES[variant], ylim=(-120, 140))
-        for axes, (kind, truth) in zip(column[1:], _KINDS, strict=True):
-            known = data[truth] if data[truth].ndim == 1 else data[truth][0]
+        for axes, kind in zip(column[1:], _KINDS, strict=True):
+            truth = data[f"true_{kind}"]
+            known = truth if truth.ndim == 1 else truth[0]
             axes.plot(x, np.sqrt(known), color="#2b2b2f", linewidth=1.2, label="true")
             axes.plot(x, np.sqrt(data[kind][0]), color="#0072b2", linewidth=1.3, label="estimated")
         for axes in column:
-            _shade(axes, variant)
+            if variant in _SHADE:
+                axes.axvspan(*_REGION, color=_SHADE[variant], alpha=0.25, linewidth=0)
+            axes.axvspan(_EDGE, 40.0, color="#d55e00", alpha=0.15, linewidth=0)
+            axes.set_xlim(-30, 40)
         column[3].set_xlabel("x")
-    _label_rows(grid)
-    return figure
-
-
-def _shade(axes: Axes, variant: str) -> None:
-    if variant in _SHADE:
-        axes.axvspan(*_REGION, color=_SHADE[variant], alpha=0.25, linewidth=0)
-    axes.axvspan(_EDGE, 40.0, color="#d55e00", alpha=0.15, linewidth=0)
-    axes.set_xlim(-30, 40)
-
-
-def _label_rows(grid: NDArray[np.object_]) -> None:
-    for row, words in zip(grid, ("y", "epistemic (std of y)", "modal (std of y)", "aleatoric (std of y)"), strict=True):
+    for row, words in zip(grid, ("y", *(f"{kind} (std of y)" for kind in _KINDS)), strict=True):
         row[0].set_ylabel(words)
     for row, top in zip(grid[1:], (60, 60, 20), strict=True):
         row[0].set_ylim(0, top)
     grid[1][0].legend(loc="upper left", fontsize=8.5)
+    return figure

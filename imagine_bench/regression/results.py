@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,13 +26,18 @@ Row = dict[str, float | str]
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionRun:
-    """One finished run."""
+    """One finished run of a registered regressor, whose files lie in ``folder``.
 
-    agent: str  #: registered regressor
-    seed: int  #: the run's seed
-    settings: Mapping[str, Any]  #: the regressor's settings as run
-    rows: tuple[Row, ...]  #: one a variant and network
-    #: The task's own measurements by variant, and under ``calibration/`` those of calibration.
+    Attributes:
+        rows: One a variant and network.
+        evaluations: The task's own measurements by variant, and under ``calibration/`` those of calibration.
+        recording: Its Rerun recording, or None.
+    """
+
+    agent: str
+    seed: int
+    settings: Mapping[str, Any]
+    rows: tuple[Row, ...]
     evaluations: Mapping[str, Arrays]
     folder: Path  #: where the run's files lie
     recording: Path | None  #: its Rerun recording, or None
@@ -46,10 +52,7 @@ class RegressionResult:
     """All runs of a protocol. Every regressor and seed is there, or this cannot be built.
 
     Attributes:
-        protocol: What was compared.
-        runs: One a regressor and seed.
         environment: Command, commit, versions, machine; JSON-like.
-        folder: Where the bench's files lie.
         wall_s: Wall seconds of the bench, over all its sessions.
 
     Raises:
@@ -77,6 +80,11 @@ class RegressionResult:
     def protocol_hash(self) -> str:
         """The hash of the protocol, which names the bench's folder."""
         return self.protocol.hash
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Every regressor and variant."""
+        return list(itertools.product(self.protocol.agents, self.protocol.variants))
 
     def of(self, agent: str) -> tuple[RegressionRun, ...]:
         """The runs of one regressor, in the order of the protocol's seeds."""

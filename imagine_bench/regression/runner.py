@@ -16,7 +16,7 @@ from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.interfaces import Dataset, Prediction, Regressor, RegressorContext
+from imagine_bench.regression.interfaces import Prediction, Regressor, RegressorContext
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree
@@ -33,11 +33,6 @@ _MEASURING = 10
 
 def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
     """Do a run, or what is left of it, and read its result; a finished run is only read.
-
-    Args:
-        spec: What to run, with a regression protocol.
-        folder: The run's own folder.
-        on_progress: Called now and then with the progress.
 
     Raises:
         BusyError: Another process is at this run.
@@ -69,7 +64,6 @@ class _Run:
         self.saved_s = time.monotonic()
 
     def execute(self) -> None:
-        """Train and measure every variant, record, and mark the run as done."""
         for variant in self.protocol.variants[len(self.evaluations) :]:
             regressor = self._regressor(variant)
             self._train(regressor, variant)
@@ -81,23 +75,20 @@ class _Run:
     def _regressor(self, variant: str) -> Regressor:
         """A new regressor, or the one of the newest checkpoint where that was made in the middle of this variant."""
         # the task's own measurements draw the same data again, from the same node
-        datasets = tuple(self.task.training(variant, node.child("data").generator()) for node in self.networks)
-        regressor = registry.make_regressor(self.spec.agent, self._context(datasets, variant))
+        context = RegressorContext(
+            datasets=tuple(self.task.training(variant, node.child("data").generator()) for node in self.networks),
+            seeds=tuple(node.child("regressor", variant) for node in self.networks),
+            hyperparameters=self.protocol.hyperparameters,
+            overrides=dict(self.protocol.overrides),
+            device=self.protocol.device,
+        )
+        regressor = registry.make_regressor(self.spec.agent, context)
         self._check_config(regressor)
         snapshot, self.snapshot, self.train_cpu_s = self.snapshot, None, 0.0
         if snapshot is not None and snapshot.values["variant"] == variant:
             regressor.restore(snapshot.agent)
             self.train_cpu_s = snapshot.values["train_cpu_s"]
         return regressor
-
-    def _context(self, datasets: tuple[Dataset, ...], variant: str) -> RegressorContext:
-        return RegressorContext(
-            datasets=datasets,
-            seeds=tuple(node.child("regressor", variant) for node in self.networks),
-            hyperparameters=self.protocol.hyperparameters,
-            overrides=dict(self.protocol.overrides),
-            device=self.protocol.device,
-        )
 
     def _check_config(self, regressor: Regressor) -> None:
         settings: Any = getattr(regressor, "settings", None)
@@ -137,10 +128,9 @@ class _Run:
             return regressor.predict(inputs, self.seeds.child("predict", variant, name).generator())
 
         evaluation = self.task.evaluate(variant, predict, self.networks)
-        measure_cpu_s = time.process_time() - start_s
         shared: Row = {**regressor.diagnostics()}  # of all networks together; the CPU seconds are a network's share
         shared["train_cpu_s"] = self.train_cpu_s / self.protocol.networks
-        shared["measure_cpu_s"] = measure_cpu_s / self.protocol.networks
+        shared["measure_cpu_s"] = (time.process_time() - start_s) / self.protocol.networks
         self.rows += [{"variant": variant, "network": index, **row, **shared} for index, row in enumerate(rows)]
         self.evaluations[variant] = {**evaluation, **{f"calibration/{name}": a for name, a in arrays.items()}}
         write_rows(self.folder, self.rows)
@@ -165,9 +155,6 @@ class _Run:
         self.saved_s = time.monotonic()
 
     def _report(self, phase: Phase, detail: str, done: int) -> None:
-        before = (_SLICES + _MEASURING) * len(self.evaluations)
-        progress = Progress(
-            agent=self.spec.agent, seed=self.spec.seed, phase=phase, done=min(before + done, self.spec.work),
-            work=self.spec.work, detail=detail,
-        )  # fmt: skip
-        self.on_progress(progress)
+        done = min((_SLICES + _MEASURING) * len(self.evaluations) + done, self.spec.work)
+        agent, seed, work = self.spec.agent, self.spec.seed, self.spec.work
+        self.on_progress(Progress(agent=agent, seed=seed, phase=phase, done=done, work=work, detail=detail))
