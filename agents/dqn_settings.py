@@ -23,27 +23,21 @@ from .settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSettings:
-    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise: InvalidValueError.
-
-    Attributes:
-        batch_size: Transitions an update, real or imagined.
-        updates_per_step: Updates on real transitions a real step, N_R.
-        discount: Gamma in [0, 1], a macro-action. The thesis gives none; see docs/explanation/deviations.md.
-        target_rate: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no
-            target network (thesis).
-        epsilon_min: Exploration probability in the limit; ``epsilon_max`` that at step 0.
-        epsilon_decay: Decay rate lambda, a real step.
-    """
+    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise: InvalidValueError."""
 
     hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
     learning_rate: float = setting(1e-3, POSITIVE)
-    batch_size: int = setting(64, COUNT)
-    updates_per_step: int = setting(1, NOT_NEGATIVE)
+    batch_size: int = setting(64, COUNT)  #: transitions an update, real or imagined
+    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: updates on real transitions a real step, N_R
+    #: Gamma in [0, 1], a macro-action. The thesis gives none; see docs/explanation/deviations.md.
     discount: float = setting(0.95, PROBABILITY)
+    #: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no target network
+    #: (thesis).
     target_rate: float = setting(1.0, RATE)
+    #: Exploration probability in the limit; ``epsilon_max`` that at step 0.
     epsilon_min: float = setting(0.001, PROBABILITY)
     epsilon_max: float = setting(0.8, PROBABILITY)
-    epsilon_decay: float = setting(0.03, FINITE)
+    epsilon_decay: float = setting(0.03, FINITE)  #: decay rate lambda, a real step
 
     def __post_init__(self) -> None:
         if self.epsilon_min > self.epsilon_max:

@@ -70,15 +70,11 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class ConfigGroup(Generic[S]):
-    """The settings of one chapter of the thesis, or of one kind of agent.
-
-    Attributes:
-        sets: By name of a set, what it changes of them, by dotted name.
-        unused: Settings that this group does without: an override of one is checked and left out.
-    """
+    """The settings of one chapter of the thesis, or of one kind of agent."""
 
     published: S
-    sets: Mapping[str, Mapping[str, Override]]
+    sets: Mapping[str, Mapping[str, Override]]  #: by name of a set, what it changes of them, by dotted name
+    #: Settings that this group does without: an override of one is checked and left out.
     unused: frozenset[str] = frozenset()
 
 

@@ -37,35 +37,22 @@ _FRAME_SHAPE = (64, 64, 3)
 class EncoderCard:
     """Where an encoder comes from and what it can do."""
 
-    Attributes:
-        preprocessing: Name in :mod:`imagine_bench.preprocessing`.
-        latent_size: Latents Z.
-        macrostate_names: The coordinates its probe reads. Length M.
-        cardinalities: Values of each. Length M.
-        command: Makes it again.
-        data: What the frames were, in words.
-        cpu_s: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``.
-        kl_nats: KL from the prior on held-out frames, mean a frame.
-        reconstruction: Squared error of the decoded held-out frames, mean a pixel, in the network's own units.
-        probe: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a
-            ``linear`` reader and by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
-        code_sizes: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
-    """
-
     task: str
     appearance: str
     recipe: Recipe
-    preprocessing: str
-    latent_size: int
-    macrostate_names: tuple[str, ...]
-    cardinalities: tuple[int, ...]
+    preprocessing: str  #: name in :mod:`imagine_bench.preprocessing`
+    latent_size: int  #: latents Z
+    macrostate_names: tuple[str, ...]  #: the coordinates its probe reads. Length M.
+    cardinalities: tuple[int, ...]  #: values of each. Length M.
     seed: int
-    command: str
-    data: str
+    command: str  #: makes it again
+    data: str  #: what the frames were, in words
     versions: dict[str, str]
-    cpu_s: dict[str, float]
-    kl_nats: float
-    reconstruction: float
+    cpu_s: dict[str, float]  #: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``
+    kl_nats: float  #: KL from the prior on held-out frames, mean a frame
+    reconstruction: float  #: squared error of the decoded held-out frames, mean a pixel, in the network's own units
+    #: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a ``linear`` reader and
+    #: by the stored ``mlp``, and from sampled latents by it (``mlp_sampled``).
     probe: dict[str, float]
     #: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     code_sizes: tuple[int, ...] = ()

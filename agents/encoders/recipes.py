@@ -14,34 +14,20 @@ ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors")
 class Recipe:
     """Settings of one way to make an encoder; the defaults are those of the thesis' chapter 5 (section 5.2.2)."""
 
-    Attributes:
-        name: Name in its chapter's :data:`RECIPES`.
-        architecture: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel
-            on its own, ``"image"`` all together; or ``"factors"``: one categorical value a factor of the scene, which
-            has no gradient steps and no number of latents to choose.
-        latents: Latents of the whole image, or of each strip.
-        widths: Hidden units of the small network, from the pixels to the latents.
-        pixel_std: Standard deviation of Gaussian pixels, in units of the contrast.
-        beta: Weight of the KL term against a SUM over pixels.
-        kl_warmup: Fraction of the steps over which beta grows from 0.
-        held_out_frames: Fresh frames for the probe's accuracy.
-        learning_rate: Of Adam, at its highest.
-        cosine: Whether the learning rate falls to 0 along a half cosine, after a short linear rise.
-        probe_steps: Gradient steps of the evaluation-only probe.
-    """
-
-    name: str
+    name: str  #: name in its chapter's :data:`RECIPES`
+    #: ``"ha_schmidhuber"`` (convolutions), or a small network without: ``"strips"`` reads every channel on its own,
+    #: ``"image"`` all together; or ``"factors"``: one categorical value a factor of the scene, which has no gradient
+    #: steps and no number of latents to choose.
     architecture: str = "ha_schmidhuber"
     latents: int = 8  #: latents of the whole image, or of each strip
     widths: tuple[int, ...] = ()  #: hidden units of the small network, from the pixels to the latents
     pixel_std: float = 1.0  #: standard deviation of Gaussian pixels, in units of the contrast
     beta: float = 4.0  #: weight of the KL term against a SUM over pixels
     kl_warmup: float = 0.0  #: fraction of the steps over which beta grows from 0
-    frames: int = 100_000  #: training frames
+    frames: int = 100_000
     held_out_frames: int = 10_000  #: fresh frames for the probe's accuracy
-    #: Gradient steps.
     steps: int = 50_000  # 1000 epochs of 50 batches
-    batch: int = 2000  #: frames a step
+    batch: int = 2000
     learning_rate: float = 5e-4  #: of Adam, at its highest
     cosine: bool = False  #: whether the learning rate falls to 0 along a half cosine, after a short linear rise
     probe_steps: int = 4000  #: gradient steps of the evaluation-only probe

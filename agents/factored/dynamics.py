@@ -25,17 +25,12 @@ _LARGEST_TABLE = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class FactorPrediction:
-    """What each action would make of one factor in N codes.
+    """What each action would make of one factor in N codes."""
 
-    Attributes:
-        expected: Predictive probability of each value. Shape (N, A, K).
-        seen: From observations alone: staying, if ever tried, and frequencies; 0 where there are none. Shape (N, A, K).
-        unknown: Weight of the prior in ``expected``. Shape (N, A).
-    """
-
-    expected: Floats
+    expected: Floats  #: predictive probability of each value. Shape (N, A, K).
+    #: From observations alone: staying, if ever tried, and frequencies; 0 where there are none. Shape (N, A, K).
     seen: Floats
-    unknown: Floats
+    unknown: Floats  #: weight of the prior in ``expected``. Shape (N, A).
 
 
 class Table:

@@ -16,21 +16,13 @@ from .settings import FactoredSettings
 
 @dataclass(frozen=True, slots=True)
 class Successors:
-    """What every action would lead to from N codes; B branches each.
+    """What every action would lead to from N codes; B branches each."""
 
-    Attributes:
-        following: Next codes. Shape (N, A, B, P).
-        p_continues: Probability that this branch comes about and the episode goes on. Shape (N, A, B).
-        reward: Expected reward. Shape (N, A), as of all that follow.
-        p_terminated: Probability that the episode ends.
-        unknown: Probability that something untested decides what happens.
-    """
-
-    following: Codes
-    p_continues: Floats
-    reward: Floats
-    p_terminated: Floats
-    unknown: Floats
+    following: Codes  #: next codes. Shape (N, A, B, P).
+    p_continues: Floats  #: probability that this branch comes about and the episode goes on. Shape (N, A, B).
+    reward: Floats  #: expected reward. Shape (N, A), as of all that follow.
+    p_terminated: Floats  #: probability that the episode ends
+    unknown: Floats  #: probability that something untested decides what happens
 
 
 class FactoredModel:

@@ -90,23 +90,14 @@ class _Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Causes:
-    """Learned causes.
+    """Learned causes."""
 
-    Attributes:
-        outcomes: The outcomes they are about. Length O.
-        default: Index of the default outcome, which has no causes.
-        strength: Probability that a conjunction brings an outcome about. Shape (O, J).
-        tests: How often each conjunction was tested while nothing else decided. Shape (J,).
-        cause_rate: Probability that an untested conjunction is a cause of anything, a group. Shape (G,).
-        log_posterior: Log likelihood less the cost of the causes.
-    """
-
-    outcomes: tuple[Outcome, ...]
-    default: int
-    strength: Floats
-    tests: Floats
-    cause_rate: Floats
-    log_posterior: float
+    outcomes: tuple[Outcome, ...]  #: the outcomes they are about. Length O.
+    default: int  #: index of the default outcome, which has no causes
+    strength: Floats  #: probability that a conjunction brings an outcome about. Shape (O, J).
+    tests: Floats  #: how often each conjunction was tested while nothing else decided. Shape (J,).
+    cause_rate: Floats  #: probability that an untested conjunction is a cause of anything, a group. Shape (G,).
+    log_posterior: float  #: log likelihood less the cost of the causes
 
 
 class OutcomeModel:

@@ -22,21 +22,15 @@ ACCEPTED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ImaginedStep:
-    """One imagined transition to ``code``, with expected reward and the probability that the episode ends.
-
-    Attributes:
-        values: Value of every action before it. Shape (A,).
-        unknown: Probability that something untested decides.
-        p_other: Probability that it leads elsewhere than to the likeliest code.
-    """
+    """One imagined transition to ``code``, with expected reward and the probability that the episode ends."""
 
     action: int
     code: Code
     reward: float
     p_terminated: float
-    values: Floats
-    unknown: float
-    p_other: float
+    values: Floats  #: value of every action before it. Shape (A,).
+    unknown: float  #: probability that something untested decides
+    p_other: float  #: probability that it leads elsewhere than to the likeliest code
 
 
 class CodePerception:

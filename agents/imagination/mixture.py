@@ -16,17 +16,11 @@ from torch.nn import functional
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """Gaussian mixtures, one a leading index.
+    """Gaussian mixtures, one a leading index."""
 
-    Attributes:
-        log_weights: Logarithms of the mixture coefficients, normalised. Shape (..., K).
-        means: Shape (..., K, Z).
-        log_sigmas: Logarithms of the standard deviations. Shape (..., K, Z).
-    """
-
-    log_weights: Tensor
-    means: Tensor
-    log_sigmas: Tensor
+    log_weights: Tensor  #: logarithms of the mixture coefficients, normalised. Shape (..., K).
+    means: Tensor  #: shape (..., K, Z)
+    log_sigmas: Tensor  #: logarithms of the standard deviations. Shape (..., K, Z).
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Mixture:
         """The mixtures whose three tensors are changed alike, in their leading axes."""

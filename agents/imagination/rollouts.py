@@ -49,19 +49,14 @@ class Weights:
 
 @dataclass(frozen=True, slots=True)
 class Imagined:
-    """One imagined step of N rollouts, with predicted ``reward`` and probability of the end there, (N,) each.
+    """One imagined step of N rollouts, with predicted ``reward`` and probability of the end there, (N,) each."""
 
-    Attributes:
-        next_z: Shape (N, Z), within +-1e6; where that is reached, the closed loop has run away.
-        samples: What each weight sample of each member predicted, with leading axes (E T, N).
-        reward_std: Standard deviation of the reward over its network's weight samples, in units of reward; None where
-            the filter does not read it. Shape (N,).
-    """
-
-    next_z: Tensor
+    next_z: Tensor  #: shape (N, Z), within +-1e6; where that is reached, the closed loop has run away
     reward: Tensor
     p_terminated: Tensor
-    samples: Mixture
+    samples: Mixture  #: what each weight sample of each member predicted, with leading axes (E T, N)
+    #: Standard deviation of the reward over its network's weight samples, in units of reward; None where the filter
+    #: does not read it. Shape (N,).
     reward_std: Tensor | None
 
 

@@ -37,49 +37,41 @@ class WorldModelSettings:
     """The environment model: dynamics p(z' | z, a), reward r(z'), termination d(z') (thesis 5.2.2).
 
     Sizes are units a hidden layer, of one network with two outputs or of two networks, else: InvalidValueError.
-
-    Attributes:
-        components: Gaussians in the mixture of the dynamics network, K.
-        members: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble
-            (Lakshminarayanan et al. 2017); the thesis has one.
-        shared_hidden: Of one network for reward and termination, instead of the two (thesis 3.2.2).
-        head_input: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
-        reward_scale: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear
-            above, where a rare large reward weighs little; the thesis counts in plain units, 1.
-        dropout: Probability of dropping a hidden unit, the same in every network.
-        max_norm: Largest norm of the incoming weights of a unit; None limits nothing.
-        updates_per_step: Model updates a real step, N_E, of ``batch_size`` transitions each.
-        spread: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1.
-            Where an encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the
-            few frames they saw by heart; a larger spread keeps them from it.
-        balance: How much batches make up for rare outcomes: a transition is sampled in proportion to n ** -balance,
-            with n the number of replayed ones of the same reward and end. In the thesis all are equally likely, 0. A
-            good policy fails rarely, and a model that has forgotten what fails imagines that nothing does.
-        predict_change: Whether the mixture describes z' - z instead of z'.
-        sigma_floor: Smallest standard deviation of a component, in units of z.
-        gradient_clip: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
-        precision: In which hidden layers train. All else is always float32.
     """
 
     dynamics_hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
-    components: int = setting(5, COUNT)
+    components: int = setting(5, COUNT)  #: gaussians in the mixture of the dynamics network, K
+    #: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble (Lakshminarayanan et
+    #: al. 2017); the thesis has one.
     members: int = setting(1, COUNT)
     reward_hidden: tuple[int, ...] = setting((512, 512, 512), SIZES)
     termination_hidden: tuple[int, ...] = setting((256, 256), SIZES)
+    #: Of one network for reward and termination, instead of the two (thesis 3.2.2).
     shared_hidden: tuple[int, ...] = setting((), SIZES)
+    #: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
     head_input: str = setting("next_state", ("next_state", "transition"))
+    #: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear above, where a
+    #: rare large reward weighs little; the thesis counts in plain units, 1.
     reward_scale: float = setting(1.0, POSITIVE)
-    dropout: float = setting(0.5, DROPOUT)
+    dropout: float = setting(0.5, DROPOUT)  #: probability of dropping a hidden unit, the same in every network
     learning_rate: float = setting(1e-3, POSITIVE)
+    #: Largest norm of the incoming weights of a unit; None limits nothing.
     max_norm: float | None = setting(3.0, POSITIVE)
-    updates_per_step: int = setting(16, COUNT)
+    updates_per_step: int = setting(16, COUNT)  #: model updates a real step, N_E, of ``batch_size`` transitions each
     batch_size: int = setting(512, COUNT)
+    #: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1. Where an
+    #: encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the few frames
+    #: they saw by heart; a larger spread keeps them from it.
     spread: float = setting(1.0, NOT_NEGATIVE)
+    #: How much batches make up for rare outcomes: a transition is sampled in proportion to n ** -balance, with n the
+    #: number of replayed ones of the same reward and end. In the thesis all are equally likely, 0. A good policy fails
+    #: rarely, and a model that has forgotten what fails imagines that nothing does.
     balance: float = setting(0.0, NOT_NEGATIVE)
-    predict_change: bool = setting(False, SWITCH)
-    sigma_floor: float = setting(0.01, POSITIVE)
+    predict_change: bool = setting(False, SWITCH)  #: whether the mixture describes z' - z instead of z'
+    sigma_floor: float = setting(0.01, POSITIVE)  #: smallest standard deviation of a component, in units of z
+    #: Largest gradient norm of each network, an ensemble counting as one; None clips nothing.
     gradient_clip: float | None = setting(None, POSITIVE)
-    precision: str = setting("auto", PRECISIONS)
+    precision: str = setting("auto", PRECISIONS)  #: in which hidden layers train. All else is always float32.
 
     def __post_init__(self) -> None:
         apart = bool(self.reward_hidden), bool(self.termination_hidden)
@@ -93,46 +85,39 @@ class WorldModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginationSettings:
-    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1); InvalidValueError if they end before they start.
+    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1). Raises InvalidValueError: an end before the start."""
 
-    Attributes:
-        start_episode: First training episode that imagines, I_start.
-        end_episode: First training episode that imagines no more; its updates are made on real transitions instead, of
-            which there are enough by then. None: imagination never ends (thesis).
-        start_states: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``,
-            states sampled from the real memory.
-        model_only_episodes: Imagined episodes of a controller that is trained in the model alone (thesis 3.2.2).
-        breadth: Rollouts a real step, I_B.
-        depth: Longest rollout in macro-actions, I_D.
-        updates_per_step: Controller updates on imagined transitions a real step, N_I.
-        temperature: Scale of the component's standard deviation when z' is sampled: 1 the thesis, 0 its mean.
-        exploration: Smallest exploration probability inside rollouts; the real one counts where it is larger.
-        weight_samples: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
-        reduction: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation
-            4.25) and one threshold; see docs/explanation/deviations.md for why that is read as max.
-        threshold: Largest reduced epistemic variance that passes the filter, in squared units of z.
-        threshold_quantile: If given, the threshold moves with the model instead: it is this quantile of the reduced
-            epistemic variance of transitions that really happened, a batch of them a real step.
-        reward_threshold: If given, the filter reads the reward network too: the largest standard deviation of a reward
-            over T of its dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
-        termination_threshold: If given, the filter reads the termination network too: the largest probability that
-            passes of what the model thinks less likely, that the episode ends there or that it goes on.
-    """
-
-    start_episode: int = setting(1000, NOT_NEGATIVE)
+    start_episode: int = setting(1000, NOT_NEGATIVE)  #: first training episode that imagines, I_start
+    #: First training episode that imagines no more; its updates are made on real transitions instead, of which there
+    #: are enough by then. None: imagination never ends (thesis).
     end_episode: int | None = setting(None, NOT_NEGATIVE)
+    #: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``, states sampled
+    #: from the real memory.
     start_states: str = setting("current", ("current", "replayed"))
+    #: Imagined episodes of a controller that is trained in the model alone (thesis 3.2.2).
     model_only_episodes: int = setting(1000, COUNT)
-    breadth: int = setting(3, COUNT)
-    depth: int = setting(10, COUNT)
-    updates_per_step: int = setting(1, NOT_NEGATIVE)
+    breadth: int = setting(3, COUNT)  #: rollouts a real step, I_B
+    depth: int = setting(10, COUNT)  #: longest rollout in macro-actions, I_D
+    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: controller updates on imagined transitions a real step, N_I
+    #: Scale of the component's standard deviation when z' is sampled: 1 the thesis, 0 its mean.
     temperature: float = setting(1.0, NOT_NEGATIVE)
+    #: Smallest exploration probability inside rollouts; the real one counts where it is larger.
     exploration: float = setting(0.0, PROBABILITY)
+    #: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
     weight_samples: int = setting(50, COUNT)
+    #: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation 4.25) and one
+    #: threshold; see docs/explanation/deviations.md for why that is read as max.
     reduction: str = setting("max", ("sum", "mean", "max"))
+    #: Largest reduced epistemic variance that passes the filter, in squared units of z.
     threshold: float = setting(0.3, NOT_NEGATIVE)
+    #: If given, the threshold moves with the model instead: it is this quantile of the reduced epistemic variance of
+    #: transitions that really happened, a batch of them a real step.
     threshold_quantile: float | None = setting(None, PROBABILITY)
+    #: If given, the filter reads the reward network too: the largest standard deviation of a reward over T of its
+    #: dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
     reward_threshold: float | None = setting(None, NOT_NEGATIVE)
+    #: If given, the filter reads the termination network too: the largest probability that passes of what the model
+    #: thinks less likely, that the episode ends there or that it goes on.
     termination_threshold: float | None = setting(None, between(0.0, 0.5, "it bounds the less likely of two"))
 
     def __post_init__(self) -> None:

@@ -17,17 +17,11 @@ from .mixture import Mixture
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Predictive variance by cause, a dimension at a time; the three sum to the total (equation 4.24).
+    """Predictive variance by cause, a dimension at a time; the three sum to the total (equation 4.24)."""
 
-    Attributes:
-        epistemic: Spread of the mean over weight samples: too little data. Shape (..., Z).
-        aleatoric: Mean variance of the components: noise. Shape (..., Z).
-        modal: Mean spread of the components: several possible outcomes. Shape (..., Z).
-    """
-
-    epistemic: Tensor
-    aleatoric: Tensor
-    modal: Tensor
+    epistemic: Tensor  #: spread of the mean over weight samples: too little data. Shape (..., Z).
+    aleatoric: Tensor  #: mean variance of the components: noise. Shape (..., Z).
+    modal: Tensor  #: mean spread of the components: several possible outcomes. Shape (..., Z).
 
 
 def decompose(samples: Mixture) -> Uncertainty:

@@ -43,8 +43,7 @@ class RayCluster:
         self._workers = workers
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job. Raises SetupError: no cluster at ``RAY_ADDRESS``, or none with the GPU that is wanted.
-        """
+        """Carry out every job. Raises SetupError: no cluster at ``RAY_ADDRESS``, or none with the GPU wanted."""
         import ray  # noqa: PLC0415 - as above
 
         self._connect(ray)

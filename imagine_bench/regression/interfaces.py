@@ -111,17 +111,10 @@ class Regressor(Protocol):
 class RegressorContext:
     """What a regressor is built from."""
 
-    Attributes:
-        datasets: One a network, all of the same size. Length E.
-        seeds: One node of the seed tree a network. Length E.
-        hyperparameters: Name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``.
-        overrides: Single settings that replace the set's.
-    """
-
-    datasets: tuple[Dataset, ...]
-    seeds: tuple[SeedTree, ...]
-    hyperparameters: str = "fast"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
+    datasets: tuple[Dataset, ...]  #: one a network, all of the same size. Length E.
+    seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
+    hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
+    overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
     device: str = "cpu"
 
 
@@ -153,33 +146,21 @@ class MovingScene(Protocol):
 class RegressionSpec:
     """Everything the bench needs to know of a regression task. Building one is cheap."""
 
-    Attributes:
-        variants: Those of the thesis, in its order.
-        require_variant: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
-        training: Data of a variant, drawn from a generator.
-        testing: The given number of rows of the same process, never trained on.
-        errors: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
-        error_name: What ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong.
-        sections: ``"module:attr"`` of the function that turns them into sections of the report.
-        recorder: ``"module:attr"`` of the function that records them, or None.
-        scene: Gives the robot that carries out predictions, where there is one.
-        reference: Name of the thesis' tables.
-    """
-
     id: str
     title: str
     description: str
-    variants: tuple[str, ...]
+    variants: tuple[str, ...]  #: those of the thesis, in its order
+    #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
     require_variant: Callable[[str], None]
     training: Callable[[str, np.random.Generator], Dataset]  #: data of a variant, drawn from a generator
     #: The given number of rows of the same process, never trained on.
     testing: Callable[[str, np.random.Generator, int], Dataset]
     #: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
     errors: Callable[[str, Floats, Floats], Floats]
-    error_name: str  #: what ``errors`` gives, with its unit
-    wrong_above: float  #: above this error a prediction counts as wrong
-    evaluate: Evaluate  #: the task's own measurements
+    error_name: str  #: what ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong
+    wrong_above: float
+    evaluate: Evaluate
     sections: str  #: ``"module:attr"`` of the function that turns them into sections of the report
     recorder: str | None = None  #: ``"module:attr"`` of the function that records them, or None
     scene: Callable[[], MovingScene] | None = None  #: gives the robot that carries out predictions, where there is one
-    reference: str | None = None  #: name of the thesis' tables, or None
+    reference: str | None = None  #: name of the thesis' tables

@@ -21,22 +21,16 @@ class RegressionProtocol(ProtocolData):
 
     A run is one regressor and one seed: it trains ``networks`` networks on every variant, each on data of its own, as
     one batched computation, and that is why they share a run.
-
-    Attributes:
-        hyperparameters: Set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``.
-        variants: Variants of the task, in the order of the report; the task's own where none are given.
-        networks: Networks a run and variant, each on data drawn for it; in [1, 1000].
-        test_points: Unseen points of each network, for errors and calibration; in [2, 100000].
-        recorded: Whether runs leave a recording.
     """
 
-    hyperparameters: str = "fast"
+    hyperparameters: str = "fast"  #: set of the regressors' settings: ``"minimal"``, ``"fast"`` or ``"published"``
+    #: Variants of the task, in the order of the report; the task's own where none are given.
     variants: tuple[str, ...] = ()
     agents: tuple[str, ...] = ("mc_dropout", "ensemble")
     seeds: tuple[int, ...] = (0,)
-    networks: int = 3
-    test_points: int = 500
-    recorded: bool = True
+    networks: int = 3  #: networks a run and variant, each on data drawn for it; in [1, 1000]
+    test_points: int = 500  #: unseen points of each network, for errors and calibration; in [2, 100000]
+    recorded: bool = True  #: whether runs leave a recording
 
     def __post_init__(self) -> None:
         spec = registry.regression(self.task)

@@ -26,20 +26,16 @@ Row = dict[str, float | str]
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionRun:
-    """One finished run of a registered regressor, whose files lie in ``folder``.
-
-    Attributes:
-        rows: One a variant and network.
-        evaluations: The task's own measurements by variant, and under ``calibration/`` those of calibration.
-        recording: Its Rerun recording, or None.
-    """
+    """One finished run of a registered regressor, whose files lie in ``folder``."""
 
     agent: str
     seed: int
     settings: Mapping[str, Any]
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  #: one a variant and network
+    #: The task's own measurements by variant, and under ``calibration/`` those of calibration.
     evaluations: Mapping[str, Arrays]
     folder: Path  #: where the run's files lie
+    #: Its Rerun recording, or None.
     recording: Path | None  #: its Rerun recording, or None
 
     def values(self, variant: str, name: str) -> NDArray[np.float64]:
