@@ -23,7 +23,7 @@ from .settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSettings:
-    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise: InvalidValueError."""
+    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise."""
 
     hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
     learning_rate: float = setting(1e-3, POSITIVE)

@@ -85,7 +85,7 @@ class WorldModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginationSettings:
-    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1). Raises InvalidValueError: an end before the start."""
+    """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1); none ends before it starts."""
 
     start_episode: int = setting(1000, NOT_NEGATIVE)  #: first training episode that imagines, I_start
     #: First training episode that imagines no more; its updates are made on real transitions instead, of which there
