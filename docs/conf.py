@@ -1,5 +1,6 @@
 """The site: Sphinx with MyST and furo. ``make docs`` builds it into build/docs; warnings are errors."""
 
+import os
 from importlib import metadata
 
 project = "imagine_bench"
@@ -12,7 +13,7 @@ myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 4
 exclude_patterns = ["results/**/report"]
 
-autodoc_mock_imports = ["mujoco", "mink"]  # so that the site builds where there is no OpenGL
+os.environ["MUJOCO_GL"] = "off"  # the site builds where there is no OpenGL
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
