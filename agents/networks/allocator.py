@@ -12,7 +12,7 @@ _MIB = 2**20
 def keep_freed_memory() -> None:
     """Ask glibc not to give blocks below 32 MiB back to the system at once; elsewhere do nothing.
 
-    An update of the world model frees and takes a few megabytes dozens of times. Each page given back costs a fault when
+    An update of the world model frees and takes a few megabytes dozens of times; a page given back costs a fault when
     taken again: 1,500 to 2,200 an update at the thesis' settings, a fifth of its time.
     """
     try:
