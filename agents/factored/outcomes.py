@@ -42,10 +42,10 @@ class _Template:
 
 
 class Conjunctions:
-    """All candidate conjunctions, numbered, of factors with so many values each.
+    """All candidate conjunctions of factors with so many values each, numbered, in groups of one order and kind.
 
     Attributes:
-        group: Group of each conjunction; a group has one order, with or without the action. Shape (J,).
+        group: Group of each, which has one order, with or without the action. Shape (J,).
         prior: Prior probability of being a cause, a group. Shape (G,).
     """
 

@@ -100,8 +100,7 @@ class ModelOnlyTraining:
         """Take up the results of :meth:`arrays` and :meth:`values`."""
         self.begin(values["real_step"])
         self.episodes, self.steps = values["episodes"], values["steps"]
-        controller = self.controller
-        snapshot.load_training(controller, controller.optimiser, snapshot.below("controller", arrays))
+        snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
         self._memory.load(snapshot.below("memory", arrays), values["imagined"])
         snapshot.load_generator(self._generator, arrays["generator"])
 

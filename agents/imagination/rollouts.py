@@ -179,11 +179,9 @@ class Imagination:
             step = self.step(z, action, weights, generator)
             terminated = step.p_terminated > TERMINAL
             keep = self.keeps(step)
-            kept = int(keep.sum())
-            predicted, accepted = predicted + len(z), accepted + kept
-            if kept:
-                batch = Batch(z, action, step.reward, step.next_z, terminated.float())
-                self.memory.add(batch.where(keep))
+            predicted, accepted = predicted + len(z), accepted + int(keep.sum())
+            if keep.any():
+                self.memory.add(Batch(z, action, step.reward, step.next_z, terminated.float()).where(keep))
             z = step.next_z[keep & ~terminated]
             if len(z) == 0:
                 break
@@ -207,9 +205,8 @@ class Imagination:
     def act(controller: Controller, z: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
         """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
         greedy = controller.values(z).argmax(dim=-1)
-        size = greedy.shape
-        random = torch.randint(controller.n_actions, size, generator=generator, device=generator.device)
-        explores = torch.rand(size, generator=generator, device=generator.device) < epsilon
+        random = torch.randint(controller.n_actions, greedy.shape, generator=generator, device=generator.device)
+        explores = torch.rand(greedy.shape, generator=generator, device=generator.device) < epsilon
         return torch.where(explores, random, greedy)
 
     def arrays(self) -> snapshot.Arrays:
