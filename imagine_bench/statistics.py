@@ -90,7 +90,8 @@ def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> 
     """
     table = _finite(scores)
     if table.ndim != 2 or table.shape[1] != len(budgets):
-        raise InvalidValueError(f"{len(budgets)} budgets need scores (runs, {len(budgets)}), not {table.shape}.")
+        count = len(budgets)
+        raise InvalidValueError(f"{count} budgets need scores of shape (runs, {count}), not {table.shape}.")
     episodes = np.array([0, *budgets], dtype=np.float64)
     values = np.concatenate([np.full((len(table), 1), at_zero), table], axis=1)  # [runs, B + 1]
     pieces = np.diff(episodes) * (values[:, 1:] + values[:, :-1]) / 2.0
