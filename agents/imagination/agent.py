@@ -87,7 +87,7 @@ class ImaginingAgent(DQN):
         """A snapshot, world model and imagined memory included."""
         state, own = super().state(), self.imagination
         state.arrays.update(snapshot.prefixed("imagination", own.arrays()))
-        state.values.update(filtered=own.filtered, imagined_added=own.memory.added)
+        state.values.update(filtered=own.filter.active, imagined_added=own.memory.added)
         return state
 
     def restore(self, state: AgentState) -> None:
@@ -168,9 +168,9 @@ class ImaginingAgent(DQN):
             rewards=joined(step.reward for step in imagined),
             p_terminated=joined(step.p_terminated for step in imagined),
             q_values=joined(values),
-            epistemic=joined(imagination.score(part.epistemic) for part in parts),
-            aleatoric=joined(imagination.score(part.aleatoric) for part in parts),
-            modal=joined(imagination.score(part.modal) for part in parts),
+            epistemic=joined(imagination.filter.score(part.epistemic) for part in parts),
+            aleatoric=joined(imagination.filter.score(part.aleatoric) for part in parts),
+            modal=joined(imagination.filter.score(part.modal) for part in parts),
             accepted=np.logical_and.accumulate(joined(imagination.keeps(step) for step in imagined)),
             macrostates=encoder.read_macrostate(latents),
         )

@@ -60,7 +60,7 @@ class ModelOnlyTraining:
         """
         imagination, settings, generator = self.imagination, self.settings.imagination, self._generator
         weights = imagination.draw_weights(generator)
-        imagination.move_threshold(real, weights, generator)
+        imagination.filter.move_threshold(imagination.model, real, weights.dynamics, generator)
         z, predicted, kept = starts.sample(1, generator), 0, 0
         while kept < settings.depth:
             chance = max(epsilon(self.steps, self.settings.controller), settings.exploration)

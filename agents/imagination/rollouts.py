@@ -1,9 +1,7 @@
-"""Imagination: the world model in closed loop, and the epistemic filter on what it says (thesis 5.2.2).
+"""Imagination: the world model in closed loop, and what the filter keeps of it (thesis 5.2.2).
 
 From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
 dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
-Dynamics may be certain of a place where no reward was ever seen, so the filter can also read how much T weight samples
-of the reward network disagree there.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.errors import DivergedError, InvalidValueError
+from imagine_bench.errors import DivergedError
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -22,9 +20,9 @@ from ..dqn import Controller
 from ..networks.mlp import Masks
 from ..replay import Batch, ImaginedMemory, RealMemory
 from . import mixture as mdn
+from .filter import EpistemicFilter
 from .mixture import Mixture
 from .settings import Settings
-from .uncertainty import decompose, reduction
 from .world_model import WorldModel
 
 TERMINAL = 0.5
@@ -32,8 +30,6 @@ TERMINAL = 0.5
 LATENT_LIMIT = 1e6
 """A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
 is in the square of a gradient of a controller that learns from it, which Adam keeps and which must not overflow."""
-_CALIBRATION = 64
-"""Real transitions whose epistemic variance a moving threshold is read from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +68,8 @@ class Counts:
 class Imagination:
     """A world model, what it imagines, and the filter between the two.
 
-    ``filtered``: epistemic uncertainty above a threshold discards a transition and the rest of its rollout.
-    ``seeds`` is this imagination's node of the seed tree, ``device`` where networks and memory lie.
+    ``filtered`` says whether the filter is active. ``seeds`` is this imagination's node of the seed tree, ``device`` where
+    networks and memory lie.
 
     Raises:
         InvalidValueError: A filter is asked for, but no weight sample would differ from another.
@@ -83,29 +79,13 @@ class Imagination:
         self, latent_size: int, n_actions: int, settings: Settings, *, filtered: bool, seeds: SeedTree,
         device: torch.device,
     ) -> None:  # fmt: skip
-        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
-        if filtered and samples * settings.model.members == 1:
-            raise InvalidValueError(
-                "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
-                "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
-                "above 1, or model.members above 1, or choose the agent without the filter."
-            )
-        self._reads_reward = filtered and settings.imagination.reward_threshold is not None
-        if self._reads_reward and samples == 1:
-            raise InvalidValueError(
-                "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
-                "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
-                "imagination.weight_samples above 1, or imagination.reward_threshold to null."
-            )
-        self.settings, self.filtered = settings.imagination, filtered
+        self.settings, self.filter = settings.imagination, EpistemicFilter(settings, active=filtered)
         self.generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
             for name in ("weights", "replay", "dropout", "rollouts")
         }
         self.model = WorldModel(latent_size, n_actions, settings.model, self.generators["weights"])
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
-        self._reduce = reduction(self.settings.reduction)
-        self.threshold = self.settings.threshold
 
     def reset_for_new_task(self) -> None:
         """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
@@ -113,13 +93,13 @@ class Imagination:
         self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self.generators["weights"])
         self.model.dynamics.load_state_dict(known)
         self.memory.clear()
-        self.threshold = self.settings.threshold
+        self.filter.reset()
 
     def draw_weights(self, generator: torch.Generator) -> Weights:
         """T weight samples of what the filter reads."""
         count = self.settings.weight_samples
         dynamics = self.model.draw_weights(count, generator)
-        return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self._reads_reward else None)
+        return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self.filter.reads_reward else None)
 
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
         """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then sample z'.
@@ -140,24 +120,13 @@ class Imagination:
         """The mean of the likeliest component of what :meth:`step` samples from. Shape (N, Z)."""
         return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
 
-    def score(self, variances: Tensor) -> Tensor:
-        """Reduce variances (..., Z) as the filter does; one that overflowed is infinite. Shape (...)."""
-        return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
-
     def keeps(self, step: Imagined) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
 
         A variance that is sampled in full and fed back can grow without bound, within some five imagined steps.
         """
-        keep = step.next_z.abs().amax(dim=-1) < LATENT_LIMIT
-        if not self.filtered:
-            return keep
-        keep &= self.score(decompose(step.samples).epistemic) <= self.threshold
-        if self.settings.reward_threshold is not None and step.reward_std is not None:
-            keep &= step.reward_std <= self.settings.reward_threshold
-        if self.settings.termination_threshold is not None:
-            keep &= torch.minimum(step.p_terminated, 1.0 - step.p_terminated) <= self.settings.termination_threshold
-        return keep
+        bounded = step.next_z.abs().amax(dim=-1) < LATENT_LIMIT
+        return bounded & self.filter.passes(step.samples, step.p_terminated, step.reward_std)
 
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts and store what the filter keeps.
@@ -172,7 +141,7 @@ class Imagination:
         """
         settings, generator = self.settings, self.generators["rollouts"]
         weights = self.draw_weights(self.generators["dropout"])
-        self.move_threshold(real, weights, self.generators["replay"])
+        self.filter.move_threshold(self.model, real, weights.dynamics, self.generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):
             action = self.act(controller, z, max(epsilon, settings.exploration), generator)
@@ -193,14 +162,6 @@ class Imagination:
             return current.expand(self.settings.breadth, -1)
         return real.sample(self.settings.breadth, self.generators["replay"]).z
 
-    def move_threshold(self, real: RealMemory, weights: Weights, generator: torch.Generator) -> None:
-        """Where the settings want it, set the threshold to a quantile of the uncertainty about real transitions."""
-        quantile = self.settings.threshold_quantile
-        if self.filtered and quantile is not None:
-            known = real.sample(_CALIBRATION, generator)
-            epistemic = self.score(decompose(self.model.predict(known.z, known.action, weights.dynamics)).epistemic)
-            self.threshold = float(epistemic.quantile(quantile))
-
     @staticmethod
     def act(controller: Controller, z: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
         """Epsilon-greedy actions of states (N, Z). Shape (N,)."""
@@ -216,14 +177,14 @@ class Imagination:
             **snapshot.prefixed("model", snapshot.training_arrays(self.model, self.model.optimiser)),
             **snapshot.prefixed("memory", self.memory.arrays()),
             **snapshot.prefixed("generator", generators),
-            "threshold": np.array(self.threshold),
+            "threshold": np.array(self.filter.threshold),
         }
 
     def load(self, arrays: snapshot.Arrays, added: int) -> None:
         """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
         snapshot.load_training(self.model, self.model.optimiser, snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)
-        self.threshold = float(arrays["threshold"])
+        self.filter.threshold = float(arrays["threshold"])
         for name, generator in self.generators.items():
             snapshot.load_generator(generator, arrays[f"generator/{name}"])
 

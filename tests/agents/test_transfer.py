@@ -228,9 +228,9 @@ def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatc
     moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
     learner = imagination_agents.make_uncertainty(context(monkeypatch, moving))
     live_on_latents(learner, range(4), np.random.default_rng(0))
-    assert learner.imagination.threshold < 99.0
+    assert learner.imagination.filter.threshold < 99.0
     learner.reset_for_new_task()
-    assert learner.imagination.threshold == 99.0
+    assert learner.imagination.filter.threshold == 99.0
 
 
 @pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, imagination_only.make])

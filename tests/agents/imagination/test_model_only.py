@@ -202,7 +202,7 @@ def test_a_moving_threshold_moves_in_model_only_training_too() -> None:
         CountingModel(), filtered=True, depth=1, threshold=99.0, threshold_quantile=1.0
     )
     one_episode()
-    assert practice.imagination.threshold == 0.0  # this model is certain
+    assert practice.imagination.filter.threshold == 0.0  # this model is certain
 
 
 def test_diagnostics_count_what_model_only_training_imagined(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,4 +218,4 @@ def test_a_filter_without_dropout_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     for maker in (model_only.make_uncertainty, imagination_agents.make_uncertainty):
         with pytest.raises(InvalidValueError, match=r"model.members 1 .* Set model.dropout above 0"):
             maker(context(monkeypatch, {"model.dropout": 0.0}))
-        assert maker(context(monkeypatch, {"model.dropout": 0.0, "model.members": 2})).imagination.filtered
+        assert maker(context(monkeypatch, {"model.dropout": 0.0, "model.members": 2})).imagination.filter.active

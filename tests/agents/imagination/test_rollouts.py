@@ -131,7 +131,7 @@ def test_what_is_kept_of_a_diverging_rollout_can_be_learned_from() -> None:
 def test_a_variance_that_overflowed_counts_as_infinite() -> None:
     imagination, _ = make(filtered=True, model=CountingModel())
     variances = torch.tensor([[0.1, 0.2], [0.1, torch.inf], [torch.nan, 0.2]])
-    assert imagination.score(variances).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
+    assert imagination.filter.score(variances).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
 
 
 def test_without_the_filter_uncertain_transitions_are_kept() -> None:
@@ -253,5 +253,5 @@ def test_a_moving_threshold_is_a_quantile_of_real_transitions(
         imagination.rollouts(controller, torch.tensor([first, 0.0]), remembering(8), 0.5).accepted
         for first in (6.9, 7.1)
     ]
-    assert imagination.threshold == threshold
+    assert imagination.filter.threshold == threshold
     assert accepted == kept

@@ -1,0 +1,86 @@
+"""The epistemic filter: which imagined transitions a controller may learn from (thesis 5.2.2).
+
+Weight samples of the dynamics that disagree say that the model has not learned what happens there. Dynamics may be
+certain of a place where no reward was ever seen, so the filter can also read how much samples of the reward network
+disagree there, and how certain the end is.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from imagine_bench.errors import InvalidValueError
+
+from ..replay import RealMemory
+from .mixture import Mixture
+from .settings import Settings
+from .uncertainty import decompose, reduction
+from .world_model import WorldModel
+
+_CALIBRATION = 64
+"""Real transitions whose epistemic variance a moving threshold is read from."""
+
+
+class EpistemicFilter:
+    """Epistemic uncertainty above a threshold discards a transition, and the rollout discards what would follow.
+
+    ``active`` is false for the agents that keep everything, which the filter then lets pass.
+
+    Raises:
+        InvalidValueError: It would compare weight samples, but none differs from another.
+    """
+
+    def __init__(self, settings: Settings, *, active: bool) -> None:
+        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
+        if active and samples * settings.model.members == 1:
+            raise InvalidValueError(
+                "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
+                "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
+                "above 1, or model.members above 1, or choose the agent without the filter."
+            )
+        self.reads_reward = active and settings.imagination.reward_threshold is not None
+        if self.reads_reward and samples == 1:
+            raise InvalidValueError(
+                "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
+                "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
+                "imagination.weight_samples above 1, or imagination.reward_threshold to null."
+            )
+        self.settings, self.active = settings.imagination, active
+        self._reduce = reduction(self.settings.reduction)
+        self.threshold = self.settings.threshold
+
+    def reset(self) -> None:
+        """Take the threshold of the settings again."""
+        self.threshold = self.settings.threshold
+
+    def score(self, variances: Tensor) -> Tensor:
+        """Reduce variances (..., Z) to one number each; one that overflowed is infinite. Shape (...)."""
+        return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
+
+    def passes(self, samples: Mixture, p_terminated: Tensor, reward_std: Tensor | None) -> Tensor:
+        """Which of N transitions pass, all where the filter is not active. Shape (N,), bool.
+
+        Args:
+            samples: What each weight sample predicts of the next state, with leading axes (E T, N).
+            p_terminated: Predicted probability of the end. Shape (N,).
+            reward_std: Standard deviation of the reward over weight samples, where it is read. Shape (N,).
+        """
+        if not self.active:
+            return torch.ones_like(p_terminated, dtype=torch.bool)
+        keep = self.score(decompose(samples).epistemic) <= self.threshold
+        if self.settings.reward_threshold is not None and reward_std is not None:
+            keep &= reward_std <= self.settings.reward_threshold
+        if self.settings.termination_threshold is not None:
+            keep &= torch.minimum(p_terminated, 1.0 - p_terminated) <= self.settings.termination_threshold
+        return keep
+
+    def move_threshold(
+        self, model: WorldModel, real: RealMemory, weights: tuple[Tensor, ...] | None, generator: torch.Generator
+    ) -> None:
+        """Where the settings want it, set the threshold to a quantile of the uncertainty about real transitions."""
+        quantile = self.settings.threshold_quantile
+        if self.active and quantile is not None:
+            known = real.sample(_CALIBRATION, generator)
+            epistemic = self.score(decompose(model.predict(known.z, known.action, weights)).epistemic)
+            self.threshold = float(epistemic.quantile(quantile))
