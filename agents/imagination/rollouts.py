@@ -68,8 +68,8 @@ class Counts:
 class Imagination:
     """A world model, what it imagines, and the filter between the two.
 
-    ``filtered`` says whether the filter is active. ``seeds`` is this imagination's node of the seed tree, ``device`` where
-    networks and memory lie.
+    ``filtered`` says whether the filter is active. ``seeds`` is this imagination's node of the seed tree, ``device``
+    where networks and memory lie.
 
     Raises:
         InvalidValueError: A filter is asked for, but no weight sample would differ from another.
