@@ -228,7 +228,7 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(tmp_path: Path, mo
 
 
 def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None:
-    quick = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1))
+    quick = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1), budgets=(1, 2, 3, 4))
     result = bench_result(tmp_path, protocol=quick)
 
     def solving(run: RunResult, shares: tuple[float, ...]) -> RunResult:
