@@ -87,11 +87,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
-        self._world = make_world(appearance_level(appearance))
+        self.world = make_world(appearance_level(appearance))
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
-        self._agent_camera = agent_camera(self._world.model)
-        self._render_camera = Renderer(self._world.model, human_camera_view(camera, *_image_size(width, height)))
+        self._agent_camera = agent_camera(self.world.model)
+        self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
         self.capture_motion_hz = 0.0
         self._begun, self._macrostate = False, self._starts[0]
@@ -114,9 +114,9 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
         self._begun, self._latest = True, None
-        self._world.place(start, self.np_random)
-        self._world.vary(self.np_random)
-        reading = self._world.read()
+        self.world.place(start, self.np_random)
+        self.world.vary(self.np_random)
+        reading = self.world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
         return self.agent_view(), self._info(success=False, legal=legal, fault=reading.problem)
@@ -137,12 +137,12 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()
-            self._latest = self._world.execute(chosen, intended.macrostate, self.capture_motion_hz)
+            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
-            self._world.set_outcome(chosen, intended.macrostate)
-        self._world.vary(self.np_random)
-        reading = self._world.read()
+            self.world.set_outcome(chosen, intended.macrostate)
+        self.world.vary(self.np_random)
+        reading = self.world.read()
         self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
         if reading.macrostate != intended.macrostate:
@@ -154,7 +154,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self._render_camera.frame(self._world.data)
+        return None if self.render_mode is None else self._render_camera.frame(self.world.data)
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again. Only the thread that drew can: in another they stay."""
@@ -165,14 +165,14 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def shapes(self) -> tuple[Shape3D, ...]:
         """Every drawable part, arm included."""
-        return shapes_of(self._world.model)
+        return shapes_of(self.world.model)
 
     def motion(self) -> Motion:
         """The motion of the latest macro-action as captured, else one sample of the standing scene.
 
         People stand still meanwhile; what they do when it is over is one sample more.
         """
-        latest, model, data = self._latest, self._world.model, self._world.data
+        latest, model, data = self._latest, self.world.model, self.world.data
         standing = poses_of(model, data.qpos[None], *self._mocap())
         if latest is None or not len(latest.time_s):
             return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
@@ -184,7 +184,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self._agent_camera.frame(self._world.data)
+        return self._agent_camera.frame(self.world.data)
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""
@@ -192,8 +192,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         if self._human_camera is None or self._human_camera.view != view:
             if self._human_camera is not None:
                 self._human_camera.close()
-            self._human_camera = Renderer(self._world.model, view)
-        return self._human_camera.frame(self._world.data)
+            self._human_camera = Renderer(self.world.model, view)
+        return self._human_camera.frame(self.world.data)
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
         """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
@@ -204,12 +204,12 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
     @property
     def model(self) -> mujoco.MjModel:
         """The compiled scene."""
-        return self._world.model
+        return self.world.model
 
     @property
     def data(self) -> mujoco.MjData:
         """The scene's state; only to be read."""
-        return self._world.data
+        return self.world.data
 
     def replay(self) -> Iterator[float]:
         """Set the scene to each captured sample of the latest macro-action in turn; at the end it stands as before.
@@ -217,7 +217,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         Yields:
             Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
         """
-        world, latest = self._world, self._latest
+        world, latest = self.world, self._latest
         if latest is None or not len(latest.time_s):
             yield 0.0
             return
@@ -237,7 +237,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""
-        return self._world.data.mocap_pos.copy(), self._world.data.mocap_quat.copy()
+        return self.world.data.mocap_pos.copy(), self.world.data.mocap_quat.copy()
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
         if not isinstance(options, Mapping):

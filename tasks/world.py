@@ -49,10 +49,10 @@ class World(abc.ABC):
         self._level, self._names = level, tuple(objects.values())
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
-        self._object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
+        self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._rest_qpos, self._rest_ctrl = at_rest(model)
         self.data.qpos[:] = self._rest_qpos
-        self._update()
+        self.update()
 
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
@@ -62,7 +62,7 @@ class World(abc.ABC):
         for index, offset in enumerate(rng.uniform(-1.0, 1.0, (len(objects), 3)).tolist()):
             self._put(index, objects[index], offset)
         self._gesture(gesture)
-        self._update()
+        self.update()
 
     def vary(self, rng: np.random.Generator) -> None:
         """Draw this frame's light, colors, camera and hands as the appearance says."""
@@ -73,7 +73,7 @@ class World(abc.ABC):
         if self._hands_vary():
             offset_m = [self._level.hand_offset_m * each for each in wobble]
             self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
-        self._update()
+        self.update()
 
     @abc.abstractmethod
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
@@ -120,18 +120,18 @@ class World(abc.ABC):
             self.data.mocap_pos[mocap] = [nominal + off for nominal, off in zip(place_m, offset_m, strict=True)]
             self.data.mocap_quat[mocap] = orientation.about_vertical(yaw_rad)
 
-    def _update(self) -> None:
+    def update(self) -> None:
         """Bring geoms, sites, cameras and lights up to date with positions."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    def _poses(self) -> NDArray[np.float64]:
+    def object_poses(self) -> NDArray[np.float64]:
         """Positions and quaternions of the objects, copied. Shape (N, 7)."""
-        return np.asarray(self.data.qpos[self._object_qpos])
+        return np.asarray(self.data.qpos[self.object_qpos])
 
     def _objects(self) -> tuple[tuple[int, ...], str | None]:
         """The value of each object, and what is wrong with the first that is not as it should be."""
-        read = [self._read_object(index, pose) for index, pose in enumerate(self._poses().tolist())]
+        read = [self._read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
         return tuple(value for value, _ in read), next((problem for _, problem in read if problem), None)
 
     def _tipped(self, index: int, pose: list[float]) -> str | None:
@@ -142,7 +142,7 @@ class World(abc.ABC):
 
     def _pushed(self, moving: Collection[int], before: NDArray[np.float64], how: str) -> str | None:
         """Which object but the moving ones is elsewhere than in the poses before (N, 7)."""
-        shift_m = np.linalg.norm(self._poses()[:, :3] - before[:, :3], axis=1)
+        shift_m = np.linalg.norm(self.object_poses()[:, :3] - before[:, :3], axis=1)
         for index, name in enumerate(self._names):
             if index not in moving and shift_m[index] > MAX_OTHER_SHIFT_M:
                 return f"{name} was pushed {1e3 * shift_m[index]:.0f} mm {how}"

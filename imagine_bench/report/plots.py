@@ -277,7 +277,7 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     names = sorted(last, key=lambda agent: last[agent])
-    places = _spread([last[agent] for agent in names], step, top=high)
+    places = spread_labels([last[agent] for agent in names], step, top=high)
     for agent, y in zip(names, places, strict=True):
         axes.annotate(
             agent_words(agent).title, xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
@@ -287,7 +287,7 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     axes.set_xlim(right=to_x * 1.04)
 
 
-def _spread(values: Sequence[float], step: float, *, top: float) -> list[float]:
+def spread_labels(values: Sequence[float], step: float, *, top: float) -> list[float]:
     """Ascending values moved as little as it takes to lie ``step`` apart, none above ``top``."""
     places: list[float] = []
     for value in values:

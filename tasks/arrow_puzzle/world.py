@@ -34,7 +34,8 @@ class ArrowWorld(World):
         self._hand = int(self.model.body("hand").mocapid[0])
 
     @functools.cached_property
-    def _executor(self) -> TurnExecutor:
+    def executor(self) -> TurnExecutor:
+        """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
         return TurnExecutor(self.model)
@@ -43,23 +44,23 @@ class ArrowWorld(World):
         """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
         cube = TURNS[action].cube
         self._put(cube, intended[cube])
-        self._update()
+        self.update()
 
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm turns the cube in contact physics, then everything is at rest again."""
         del intended  # the human keeps pointing
-        turn, before = TURNS[action], self._poses()
-        result = self._executor.turn(
+        turn, before = TURNS[action], self.object_poses()
+        result = self.executor.turn(
             self.data, cube=turn.cube, clockwise=turn.clockwise, capture_motion_hz=capture_motion_hz
         )
-        self._executor.executor.rest(self.data)
-        self._update()
+        self.executor.executor.rest(self.data)
+        self.update()
         pushed = self._pushed((turn.cube,), before, f"while cube {turn.cube} was turned")
         return replace(result, fault=result.fault or pushed)
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         (x_m, y_m), (right, up, turn) = c.SLOTS_XY_M[index], offset
-        self.data.qpos[self._object_qpos[index]] = (
+        self.data.qpos[self.object_qpos[index]] = (
             x_m + self._level.object_offset_m * right,
             y_m + self._level.object_offset_m * up,
             c.CUBE_REST_Z_M,

@@ -53,7 +53,8 @@ class PickWorld(World):
         self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
 
     @functools.cached_property
-    def _executor(self) -> CarryExecutor:
+    def executor(self) -> CarryExecutor:
+        """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.carry import CarryExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
         return CarryExecutor(self.model)
@@ -70,7 +71,7 @@ class PickWorld(World):
             self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
             base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
-        self.data.qpos[self._object_qpos[index]] = (
+        self.data.qpos[self.object_qpos[index]] = (
             base_m[0] + share_x * level.object_offset_m * across,
             base_m[1] + share_y * level.object_offset_m * along,
             base_m[2],
@@ -104,7 +105,7 @@ class PickWorld(World):
                 if now == PICKED:
                     self._fingers(REST_OPENING_M, REST_OPENING_M)
         self._gesture(intended[N_OBJECTS])
-        self._update()
+        self.update()
 
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
@@ -112,22 +113,22 @@ class PickWorld(World):
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
         else happened is not what they asked for, so they withdraw.
         """
-        before, poses = self._objects()[0], self._poses()
+        before, poses = self._objects()[0], self.object_poses()
         result = self._act(action, before, capture_motion_hz)
-        self._update()
-        self._executor.rest(self.data, held_object(self._objects()[0]))
-        self._update()
+        self.update()
+        self.executor.rest(self.data, held_object(self._objects()[0]))
+        self.update()
         after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
             as_asked = problem is None and after == intended[:N_OBJECTS]
             self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
-            self._update()
+            self.update()
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
     def _act(self, action: int, objects: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """What the robot does, possible or not: what it cannot do it reaches out for in vain."""
-        held, executor = held_object(objects), self._executor
+        held, executor = held_object(objects), self.executor
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
             if held is not None and self._read_gesture() == OPEN_PALM:

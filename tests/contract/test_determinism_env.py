@@ -27,7 +27,7 @@ def make(task="arrow_puzzle", **options):
 
 
 def full_state(env):
-    model, data = env._world.model, env._world.data
+    model, data = env.world.model, env.world.data
     state = np.empty(mujoco.mj_stateSize(model, STATE))
     mujoco.mj_getState(model, data, state, STATE)
     return state
@@ -77,9 +77,9 @@ def test_a_dirty_reset_is_a_fresh_environment(task, execution):
     dirty, fresh = (make(task, execution=execution, appearance="strong") for _ in range(2))
     dirty.reset(seed=1)
     walk(dirty, (0, 2, 5))
-    dirty._world.data.qvel[:] = 0.3
-    dirty._world.data.qacc_warmstart[:] = 7.0
-    dirty._world.data.ctrl[:] = 0.1
+    dirty.world.data.qvel[:] = 0.3
+    dirty.world.data.qacc_warmstart[:] = 7.0
+    dirty.world.data.ctrl[:] = 0.1
     frames = [env.reset(seed=4)[0] for env in (dirty, fresh)]
     assert np.array_equal(*frames)
     assert np.array_equal(full_state(dirty), full_state(fresh))
@@ -94,12 +94,12 @@ def test_a_macro_action_depends_on_where_the_cubes_stand_alone():
     env, other = make(), make()
     env.reset(seed=2, options={"macrostate": (1, 2, 0, 0)})
     walk(env, (0, 3))
-    cubes = env._world.data.qpos.copy()
+    cubes = env.world.data.qpos.copy()
     *_, states = walk(env, (4,))
     other.reset(seed=9, options={"macrostate": (3, 3, 3, 0)})
     walk(other, (5,))
-    other._world.data.qpos[:] = cubes
-    other._macrostate = other._world.read().macrostate
+    other.world.data.qpos[:] = cubes
+    other._macrostate = other.world.read().macrostate
     *_, again = walk(other, (4,))
     assert np.array_equal(states, again)
     env.close()

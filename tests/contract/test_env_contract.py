@@ -215,7 +215,7 @@ def test_rendering_draws_no_random_number():
 def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
     env = make().unwrapped
-    model = env._world.model
+    model = env.world.model
     arm = np.flatnonzero(model.geom_group == ARM_GROUP)
     model.geom_contype[arm] = model.geom_conaffinity[arm] = 0
     env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
@@ -232,14 +232,14 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
     env = make().unwrapped
     env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
     assert env.step(0)[4]["fault"] is False
-    turn = env._world._executor.turn
+    turn = env.world.executor.turn
 
     def clumsy(data, **arguments):
         result = turn(data, **arguments)
         data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 
-    monkeypatch.setattr(env._world._executor, "turn", clumsy)
+    monkeypatch.setattr(env.world.executor, "turn", clumsy)
     *_, info = env.step(0)
     env.close()
     assert info["fault_reason"] == "cube 2 was pushed 6 mm while cube 0 was turned"
@@ -317,7 +317,7 @@ def test_an_episode_whose_simulation_blew_up_is_over(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     env = make().unwrapped
     env.reset(seed=0)
-    env._world.data.joint("cube_2_joint").qpos[0] = 1e11
+    env.world.data.joint("cube_2_joint").qpos[0] = 1e11
     with pytest.raises(DivergedError):
         env.step(0)
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):

@@ -102,7 +102,7 @@ def test_the_gripper_passes_the_pointing_finger(world, pointed):
     closest = 1.0
     for qpos in result.qpos:
         world.data.qpos[:] = qpos
-        world._update()
+        world.update()
         closest = min(closest, clearance_m())
     assert 0.0 < closest < 0.05  # near, so the check is not vacuous, and free
 

@@ -51,7 +51,7 @@ def rng():
 
 def test_objects_stand_still_on_the_table(world):
     world.place((0, 0, 0, WITHDRAWN), rng())
-    before = world._poses()
+    before = world.object_poses()
     assert before[:, :3] == pytest.approx(np.array([standing_m(index) for index in range(3)]))
     for _ in range(5):  # what sleeps soon touches nothing any more
         mujoco.mj_step(world.model, world.data)
@@ -62,7 +62,7 @@ def test_objects_stand_still_on_the_table(world):
     assert touching == {frozenset(("table", spec.name)) for spec in OBJECTS}
     for _ in range(300):
         mujoco.mj_step(world.model, world.data)
-    assert np.abs(world._poses()[:, :3] - before[:, :3]).max() < 5e-4
+    assert np.abs(world.object_poses()[:, :3] - before[:, :3]).max() < 5e-4
 
 
 def test_only_tips_table_objects_and_palm_touch(world):
@@ -102,7 +102,7 @@ def test_every_macrostate_is_read_back_at_every_level(level):
 def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw_deg, problem):
     world.place((0, 0, 0, 0), rng())
     half_rad = math.radians(yaw_deg) / 2
-    world.data.qpos[world._object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
+    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
     found = world.read().problem
     assert found is None if problem is None else found.startswith(problem)
 
@@ -119,7 +119,7 @@ def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw
 )
 def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, problem):
     world.place((0, 0, 0, 0), rng())
-    row = world._object_qpos[index]
+    row = world.object_qpos[index]
     half_rad = math.radians(tilt_deg) / 2
     world.data.qpos[row[:3]] += moved_m
     world.data.qpos[row[3:]] = [math.cos(half_rad), math.sin(half_rad), 0, 0]
@@ -135,7 +135,7 @@ def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, p
 def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action, intended):
     assert intended in [outcome.macrostate for outcome in RULES.outcomes(state, action)]
     world.place(state, rng())
-    before = world._poses()
+    before = world.object_poses()
     result = world.execute(action, intended, 1 / TIMESTEP_S)
     assert result.fault is None
     assert (world.read().macrostate, world.read().problem) == (intended, None)
@@ -144,7 +144,7 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert (speed_rad_s.max(axis=0) <= ArmModel().speed_limit_rad_s).all()
     assert np.abs(result.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
     untouched = [index for index in range(3) if state[index] == intended[index] == 0]
-    assert np.abs(world._poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
+    assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
 @pytest.mark.parametrize("index", range(3))
@@ -190,7 +190,7 @@ def test_only_friction_lifts(spoil, index):
 def test_what_is_dropped_is_a_fault_and_ends_the_episode():
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
-    slippery_tips(env._world.model)
+    slippery_tips(env.world.model)
     _, reward, terminated, _, info = env.step(HAND_OVER)
     env.close()
     assert info["fault"]
@@ -204,7 +204,7 @@ def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
     """Wherever it lies then, the human does not take it for what they asked for."""
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.reset(seed=0, options={"macrostate": (*(int(each == index) for each in range(3)), (index + 1) % 3)})
-    slippery_tips(env._world.model)
+    slippery_tips(env.world.model)
     _, reward, terminated, _, info = env.step(index)
     env.close()
     assert info["fault"]
@@ -215,21 +215,21 @@ def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
 def test_pushing_another_object_is_a_fault(world, monkeypatch):
     world.place((0, 0, 0, 0), rng())
     world.execute(0, (1, 0, 0, 1), 0.0)
-    place = world._executor.place
+    place = world.executor.place
 
     def clumsy(data, **arguments):
         result = place(data, **arguments)
         data.joint("cup_joint").qpos[0] += 0.007
         return result
 
-    monkeypatch.setattr(world._executor, "place", clumsy)
+    monkeypatch.setattr(world.executor, "place", clumsy)
     assert world.execute(0, (0, 0, 0, 1), 0.0).fault == "the cup was pushed 7 mm by the way"
 
 
 def test_what_is_out_of_reach_is_a_fault(world):
     world.place((0, 0, 0, 0), rng())
-    world.data.qpos[world._object_qpos[0][0]] = 1.4
-    world._update()
+    world.data.qpos[world.object_qpos[0][0]] = 1.4
+    world.update()
     result = world.execute(0, (1, 0, 0, 1), 10.0)
     assert "the ball is out of reach: The gripper cannot reach" in result.fault
     assert result.qpos.shape == (0, world.model.nq)
@@ -239,7 +239,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     """However the arm ended, the object keeps its pose in the gripper, and the arm is at its observation pose."""
     world.place((0, 0, 0, 1), rng())
     world.execute(1, (0, 1, 0, 0), 0.0)
-    row, tcp = world._object_qpos[1], world.model.site("tcp").id
+    row, tcp = world.object_qpos[1], world.model.site("tcp").id
 
     def in_gripper():
         mujoco.mj_kinematics(world.model, world.data)
@@ -254,7 +254,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     mujoco.mj_kinematics(world.model, world.data)
     world.data.qpos[row[:3]] += world.data.site_xpos[tcp] - carried
     tilted = in_gripper()
-    world._executor.rest(world.data, 1)
+    world.executor.rest(world.data, 1)
     after = in_gripper()
     np.testing.assert_allclose(after[0], tilted[0], atol=1e-12)
     np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
@@ -275,7 +275,7 @@ def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, 
     other.execute(2, (0, 0, 1, 3), 0.0)
     other.data.qpos[:], other.data.mocap_pos[:], other.data.mocap_quat[:] = start
     other.data.qvel[:], other.data.qacc_warmstart[:] = 0.3, 7.0
-    other._update()
+    other.update()
     other.execute(action, intended, 0.0)
     np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
     np.testing.assert_array_equal(one.data.ctrl, other.data.ctrl)
@@ -286,12 +286,12 @@ def test_the_handed_over_object_rests_in_the_palm(world):
         state = tuple(1 if each == index else 0 for each in range(3))
         world.place((*state, OPEN_PALM), rng())
         world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM), 0.0)
-        before = world._poses()[index, :3]
+        before = world.object_poses()[index, :3]
         assert math.dist(before[:2], PALM_M[:2]) < 0.015
         assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)
         for _ in range(300):
             mujoco.mj_step(world.model, world.data)
-        assert np.abs(world._poses()[index, :3] - before).max() < 2e-3
+        assert np.abs(world.object_poses()[index, :3] - before).max() < 2e-3
 
 
 @pytest.mark.parametrize("seed", [83393, 3046])
@@ -299,7 +299,7 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
     env = gymnasium.make("imagine_bench/PickPlace-v0", appearance="strong")
     env.reset(seed=seed, options={"macrostate": (0, 1, 0, OPEN_PALM)})
-    data = env.unwrapped._world.data
+    data = env.unwrapped.world.data
     before_m = data.mocap_pos.copy()
     _, reward, terminated, _, info = env.step(HAND_OVER)
     assert (reward, terminated, info["is_success"], info["fault"]) == (5.0, True, True, False)
@@ -387,7 +387,7 @@ def test_a_recording_shows_the_human_s_answer_after_the_motion():
     env.capture_motion_hz = 20.0
     env.reset(seed=0, options={"macrostate": (0, 0, 0, 1)})
     *_, info = env.step(1)
-    data, standing = env._world.data, env.agent_view()
+    data, standing = env.world.data, env.agent_view()
     fields = ("qpos", "mocap_pos", "mocap_quat", "xpos", "xquat")
     before = {name: getattr(data, name).copy() for name in fields}
     motion, film = env.motion(), env.film(64, 48)
