@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -19,7 +20,7 @@ def digest(values: Any) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProtocolData:
+class ProtocolData(ABC):
     """A comparison, completely specified by JSON-like values."""
 
     task: str  #: Registered task
@@ -59,9 +60,9 @@ class ProtocolData:
         """
         return (None,)
 
+    @abstractmethod
     def work(self, agent: str, until: int | None = None) -> int:
         """Parts of work of a run of this agent as far as the budget ``until``, of whatever the protocol counts."""
-        raise NotImplementedError
 
 
 def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
