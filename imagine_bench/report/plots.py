@@ -60,20 +60,23 @@ _REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle":
 
 
 def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg: bool = False, dpi: int = 150) -> Image:
-    """Draw a figure in the style of all reports; as :class:`Image` says, with ``svg`` as inline SVG too.
+    """A figure in the style of all reports; as :class:`Image` says, with ``svg`` as inline SVG too.
 
     ``dpi`` is pixels an inch of the PNG.
     """
-    with mpl.rc_context(STYLE):
-        figure = draw()
-        FigureCanvasAgg(figure).draw()
-        figure.set_layout_engine("none")  # laid out once, for both files
-        vector, png = io.StringIO(), io.BytesIO()
-        if svg:
-            figure.savefig(vector, format="svg", metadata={"Date": None})
-        figure.savefig(png, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
-    inline = _inline(vector.getvalue(), name, alt) if svg else ""
-    return Image(name=name, png=png.getvalue(), alt=alt, caption=caption, svg=inline)
+
+    def drawn() -> tuple[bytes, str]:
+        with mpl.rc_context(STYLE):
+            figure = draw()
+            FigureCanvasAgg(figure).draw()
+            figure.set_layout_engine("none")  # laid out once, for both files
+            vector, png = io.StringIO(), io.BytesIO()
+            if svg:
+                figure.savefig(vector, format="svg", metadata={"Date": None})
+            figure.savefig(png, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+        return png.getvalue(), _inline(vector.getvalue(), name, alt) if svg else ""
+
+    return Image(name=name, draw=drawn, alt=alt, caption=caption)
 
 
 def color(agent: str) -> str:

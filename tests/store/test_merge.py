@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_results import bench_result
-from small_runs import small
+from small_runs import Inline, small
 
 from imagine_bench.bench.bench import bench
-from imagine_bench.bench.launchers import launcher
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
@@ -31,7 +30,7 @@ def load_merged(folders: list[Path], root: Path) -> BenchResult:
 
 def do(root: Path, *agents: str, **changes: Any) -> Path:
     result: BenchResult = bench(
-        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=launcher("local", 1)
+        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=Inline()
     )
     return result.folder
 

@@ -8,6 +8,7 @@ from imagine_bench import registry
 from imagine_bench.tools.speed import _figure, speed_report
 
 
+@pytest.mark.slow
 def test_figures_are_measured_and_kept(tmp_path):
     lines: list[str] = []
     all_met = speed_report(tmp_path / "deep" / "speed.json", turns=100, show=lines.append)

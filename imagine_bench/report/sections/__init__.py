@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,31 @@ DASH = "–"  # printed where there is no number; the table's caption says why
 
 @dataclass(frozen=True, kw_only=True)
 class Image:
-    """A finished image or figure."""
+    """An image or figure, drawn when it is first asked for: a table on a terminal needs none."""
 
     name: str  # file name without ending
-    png: bytes  # the image, on white
+    draw: Callable[[], tuple[bytes, str]]  # draws ``png`` and ``svg``
     alt: str  # what a reader who does not see it should know
     caption: str  # the text below it
-    svg: str = ""  # the same as inline SVG whose text takes the page's color; empty where there is none
+
+    @classmethod
+    def of(cls, png: bytes, *, name: str, alt: str, caption: str) -> Image:
+        """A finished image."""
+        return cls(name=name, draw=lambda: (png, ""), alt=alt, caption=caption)
+
+    @cached_property
+    def _drawn(self) -> tuple[bytes, str]:
+        return self.draw()
+
+    @property
+    def png(self) -> bytes:
+        """The image, on white."""
+        return self._drawn[0]
+
+    @property
+    def svg(self) -> str:
+        """The same as inline SVG whose text takes the page's color; empty where there is none."""
+        return self._drawn[1]
 
     @property
     def base64(self) -> str:

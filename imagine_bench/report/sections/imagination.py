@@ -209,9 +209,9 @@ def _filmstrip(data: ReportData, agent: str, seed: int, index: int, compared: Co
         f"{_capital(agent)}, seed {seed}, start {index + 1}: {int(matches.sum())} of {int(alive.sum())} imagined "
         f"macrostates are what the rules say; {kept}."
     )
-    return Image(
+    return Image.of(
+        png(filmstrip(compared, data.spec.action_names)),
         name=f"rollout_{agent}_{index + 1}",
-        png=png(filmstrip(compared, data.spec.action_names)),
         alt=f"Real frames above, imagined frames below. {caption}",
         caption=caption,
     )
@@ -225,7 +225,7 @@ def _sampled_rollouts(data: ReportData) -> Iterator[Image]:
             caption = f"{_capital(agent)}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
             sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
             alt = f"Only the first image is real. {caption}"
-            yield Image(name=f"sampled_rollouts_{agent}", png=sheet, alt=alt, caption=caption)
+            yield Image.of(sheet, name=f"sampled_rollouts_{agent}", alt=alt, caption=caption)
 
 
 def _capital(agent: str) -> str:
@@ -266,7 +266,7 @@ def _encoders(views: Sequence[EncoderView]) -> Section:
                 content = view.image.read_bytes()
             caption = f"{heading}: real frames the encoder never saw in training, and what it makes of them."
             alt = "Real frames and what the encoder keeps of them"
-            images.append(Image(name=f"encoder-{name}", png=content, alt=alt, caption=caption))
+            images.append(Image.of(content, name=f"encoder-{name}", alt=alt, caption=caption))
         shown = {key: value for key, value in view.card.items() if key not in _CARD_HIDDEN}
         rows = [[_CARD_NAMES.get(key, key), _card_text(key, value)] for key, value in shown.items()]
         missing = "" if rows else "It is not one of the bundled encoders, so its card is beside its file and not here."
