@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy  # its parts load, slowly, when they are first used
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
@@ -61,7 +61,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
         raise InvalidValueError(
             f"{successes} successes in {trials} trials is impossible; give 0 <= successes <= trials."
         )
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence_level=_LEVEL, method="wilson")
+    interval = scipy.stats.binomtest(successes, trials).proportion_ci(confidence_level=_LEVEL, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -128,7 +128,7 @@ def gain(treated: ArrayLike, base: ArrayLike, rng: np.random.Generator) -> Estim
 
 def _summary(scores: Floats, statistic: Statistic) -> Floats:
     """The statistic over the last axis."""
-    return np.asarray(scores.mean(axis=-1) if statistic == "mean" else stats.trim_mean(scores, 0.25, axis=-1))
+    return np.asarray(scores.mean(axis=-1) if statistic == "mean" else scipy.stats.trim_mean(scores, 0.25, axis=-1))
 
 
 def _relative(a: Floats, b: Floats) -> Floats:

@@ -16,10 +16,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.cluster.hierarchy
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.spatial
+import scipy  # its parts load, slowly, when first used: an agent that only sees with an encoder needs none
 import torch
 from numpy.typing import NDArray
 from torch import Tensor

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy  # its parts load, slowly, when they are first used
 from numpy.typing import NDArray
-from scipy import special, stats
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
@@ -28,7 +28,7 @@ def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
     Mixtures of leading axes (...) and outcomes (..., D) give shape (..., D).
     """
     scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
-    return np.asarray((mixtures.weights[..., None] * special.ndtr(scaled)).sum(axis=-2))
+    return np.asarray((mixtures.weights[..., None] * scipy.special.ndtr(scaled)).sum(axis=-2))
 
 
 def coverage(transforms: Floats, level: float) -> float:
@@ -44,7 +44,7 @@ def coverage(transforms: Floats, level: float) -> float:
 
 def transform_distance(transforms: Floats) -> float:
     """Kolmogorov-Smirnov distance of the transforms from uniform, in [0, 1]."""
-    return float(stats.kstest(transforms.ravel(), "uniform").statistic)
+    return float(scipy.stats.kstest(transforms.ravel(), "uniform").statistic)
 
 
 def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
@@ -70,7 +70,7 @@ def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
     scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas
     log_normal = (-0.5 * (scaled**2 + _LOG_2PI) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
     with np.errstate(divide="ignore"):
-        return np.asarray(-special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
+        return np.asarray(-scipy.special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
 
 
 def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
@@ -87,7 +87,7 @@ def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
     n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
     if not n_wrong or not n_right:
         return math.nan
-    ranks = stats.rankdata(scores)
+    ranks = scipy.stats.rankdata(scores)
     return float((ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))
 
 
@@ -96,4 +96,4 @@ def _mean_size(mean: Floats, variance: Floats) -> Floats:
     sigma = np.sqrt(variance)
     ratio = mean / sigma
     density = 2.0 * sigma * np.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi)
-    return np.asarray(density + mean * (2.0 * special.ndtr(ratio) - 1.0))
+    return np.asarray(density + mean * (2.0 * scipy.special.ndtr(ratio) - 1.0))

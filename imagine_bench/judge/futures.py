@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench.capabilities import FutureSampler, SampledFutures
 from imagine_bench.interfaces import Floats, Macrostate, Rules, State, TaskSpec
@@ -98,11 +99,9 @@ def sampling_noise_floor(exact: dict[State, float], count: int) -> float:
 
     Half the sum of the mean absolute deviations of binomial counts, by De Moivre's formula (Diaconis & Zabell 1991).
     """
-    from scipy import stats  # noqa: PLC0415 - loads slowly, and every command imports this module
-
     p = np.minimum(np.array(list(exact.values())), 1.0)
     m = np.floor(count * p)
-    deviation = 2.0 * (m + 1.0) * (1.0 - p) * stats.binom.pmf(m + 1.0, count, p)  # E |X - count p|
+    deviation = 2.0 * (m + 1.0) * (1.0 - p) * scipy.stats.binom.pmf(m + 1.0, count, p)  # E |X - count p|
     return float(0.5 * deviation.sum() / count)
 
 

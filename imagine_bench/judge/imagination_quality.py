@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, State, TaskSpec
+from imagine_bench.judge.calibration import auroc
 from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
@@ -94,8 +95,6 @@ def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTre
 
 def _detection(correct: NDArray[np.bool_], causes: dict[str, Floats]) -> dict[str, Floats]:
     """How well each uncertainty (starts, D) tells wrong transitions from correct ones that began correct, by depth."""
-    from imagine_bench.judge.calibration import auroc  # noqa: PLC0415 - scipy loads slowly
-
     began = np.concatenate([np.ones((len(correct), 1), dtype=np.bool_), correct[:, :-1]], axis=1)
     found = {"judged": began.sum(axis=0).astype(np.float64)}
     for cause, values in causes.items():

@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from imagine_bench import registry
-from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.protocols.task_types import TaskType
 from imagine_bench.regression.protocol import PRESETS, RegressionProtocol, plan
-from imagine_bench.regression.results import RegressionResult, RegressionRun, load_run
+from imagine_bench.regression.results import RegressionResult, load_run
+from imagine_bench.regression.runner import run
 from imagine_bench.store.bench_folder import load_bench
-
-
-def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
-    """Do a run; see :func:`.runner.run`."""
-    from imagine_bench.regression import runner  # noqa: PLC0415 - scipy loads slowly
-
-    return runner.run(spec, folder, on_progress)
-
 
 REGRESSION = TaskType(
     tasks=registry.REGRESSIONS,

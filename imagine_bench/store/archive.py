@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.bench_folder import KEPT, read_protocol
@@ -49,8 +50,6 @@ def archive_files(result: BenchResult) -> dict[str, str]:
 
 def results_csv(result: BenchResult) -> str:
     """One row an agent, seed and budget; every diagnostic the agents report has its column."""
-    from imagine_bench import statistics  # noqa: PLC0415 - scipy loads slowly
-
     names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
     rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, *names]]
     for agent in result.protocol.agents:

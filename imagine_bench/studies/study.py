@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,8 @@ from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import TASKS
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, is_tuning_seed
+from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult
-
-if TYPE_CHECKING:
-    from imagine_bench.statistics import Estimate
 
 BASE = "base"
 """Name of the factor of what the other variants are compared with."""
@@ -131,8 +129,6 @@ def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Enco
 
 
 def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
-    from imagine_bench.statistics import difference  # noqa: PLC0415 - scipy loads slowly, and lists name studies
-
     ours, theirs = success[variant.name], success[str(variant.against)]
     return tuple(
         difference(
