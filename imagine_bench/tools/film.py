@@ -64,12 +64,12 @@ def _episode(task: str, seed: int, appearance: str) -> Iterator[NDArray[np.uint8
         frame, info = env.reset(seed=episode_seed("recording", seed, 0))
         over = False
         while not over:
-            yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(_HOLD))
+            yield from [_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame)] * _HOLD
             action = spec.rules.optimal_action(tuple(int(value) for value in info["macrostate"]))
             after, _, terminated, truncated, info = env.step(action)
             yield from (_side_by_side(image, frame) for image in scene.film(WIDTH_PX, HEIGHT_PX))
             frame, over = after, terminated or truncated
-        yield from (_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame) for _ in range(2 * _HOLD))
+        yield from [_side_by_side(scene.human_view(WIDTH_PX, HEIGHT_PX), frame)] * (2 * _HOLD)
 
 
 def _side_by_side(scene: NDArray[np.uint8], frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -26,6 +26,7 @@ from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression import runner
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.interfaces import SCORES, Dataset, Mixtures, Prediction, RegressorContext
+from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.generalisation import generalisation_report
@@ -234,6 +235,17 @@ def test_a_damaged_result_is_named(toy: RegressionRun, tmp_path: Path) -> None:
         run(tiny("toy_regression"), copy, silent)
 
 
+def test_a_page_shows_every_table_and_figure(toy: RegressionRun, tmp_path: Path) -> None:
+    facts = {"protocol": tiny("toy_regression").protocol, "environment": {}, "folder": tmp_path, "wall_s": 1.0}
+    page = write_report(RegressionResult(runs=(toy,), **facts))
+    html = page.read_text()
+    assert html.count("data:image/png;base64") == len(list(page.parent.glob("*.png"))) > 0
+    for name in ("results", "calibration", "auroc"):
+        assert (page.parent / f"{name}.csv").stat().st_size > 50
+    assert "Calibration" in html and ">nan" not in html
+
+
+@pytest.mark.slow
 def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = [f"{name}={value}".replace(" ", "") for name, value in _overrides("mc_dropout")]
     words = [
