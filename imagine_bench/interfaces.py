@@ -143,7 +143,7 @@ class TaskSpec:
     facts: Callable[[], RuleFacts]  #: what the rules say, as a function (enumerating costs a moment)
     render_macrostates: RenderMacrostates  #: frames of macrostates, kinematic mode
     reference: str | None = None  #: name of the thesis' table in :mod:`imagine_bench.reference`, or None
-    settings: str = "chapter_5"  #: family of settings that learners take: the thesis' chapter that the task is from
+    config_group: str = "chapter_5"  #: config group of learners' settings: the thesis' chapter that the task is from
     #: what each protocol preset changes for this task: fields of the protocol by preset
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned

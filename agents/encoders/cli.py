@@ -31,7 +31,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         DivergedError: The loss became NaN or infinite.
         InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
     """
-    recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
+    recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
     path = out / f"{name}.safetensors"
     refuse_existing(path, path.with_suffix(".json"), path.with_suffix(".png"))

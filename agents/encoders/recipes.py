@@ -99,7 +99,7 @@ RECIPES: dict[str, dict[str, Recipe]] = {
     "chapter_3": {"thesis": _CHAPTER_3, "default": _IMAGE, "codes": _CODES},
     "chapter_5": {"thesis": Recipe(name="thesis"), "default": _STRIPS, "joint": _JOINT, "codes": _CODES},
 }
-"""By the family of settings that a task names."""
+"""By the config group that a task names."""
 
 
 def recipe_named(name: str, family: str) -> Recipe:

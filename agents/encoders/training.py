@@ -122,7 +122,7 @@ def train_encoder(
         DivergedError: The loss became NaN or infinite.
         InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
     """
-    recipe = recipe_named(recipe, spec.settings) if isinstance(recipe, str) else recipe
+    recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     require_known("appearance", appearance, APPEARANCES)
     progress = progress or (lambda stage, done: None)
     prepare_torch("cpu")

@@ -69,7 +69,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
         if name not in known:
             raise UnknownNameError("setting", name, sorted(known))
     found = {
-        agent: registry.settings(agent, wanted.hyperparameters, overrides, wanted.settings) for agent in wanted.agents
+        agent: registry.settings(agent, wanted.hyperparameters, overrides, wanted.config_group) for agent in wanted.agents
     }
     return {agent: dataclasses.asdict(found[agent]) for agent in wanted.agents if registry.agent_entry(agent).learns}
 

@@ -51,7 +51,7 @@ def as_seen(transition: Transition) -> Transition:
 
 
 class LabelOracle:
-    """Labels what actions would bring, from the rules and the true macrostate, where the rules leave no doubt."""
+    """Labels what actions would bring, from the rules and the true macrostate, where the rules allow one outcome only."""
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules

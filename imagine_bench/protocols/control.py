@@ -26,7 +26,7 @@ _LEAST = {"evaluation_episodes": 1, "after_episodes": 1, **dict.fromkeys(_NONE_A
 class Protocol(ProtocolData):
     """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others."""
 
-    settings: str = "chapter_5"  #: Config group of the agents' settings, as the task names it
+    config_group: str = "chapter_5"  #: config group of the agents' settings, as the task names it
     #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
     agents: tuple[str, ...] = _ALL_AGENTS
@@ -134,7 +134,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     """
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
-    values = {"settings": spec.settings, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     return Protocol(task=task_name, preset=preset, **values)

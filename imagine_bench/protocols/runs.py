@@ -42,7 +42,7 @@ class RunSpec(Generic[P_co]):
             preprocessing=task.preprocessing,
             encoder=self.encoder if entry.needs_encoder else None,
             seeds=SeedTree(self.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
-            config_group=protocol.settings,
+            config_group=protocol.config_group,
             hyperparameters=protocol.hyperparameters,
             overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,

@@ -42,7 +42,7 @@ def test_seeds_in_any_order_are_one_bench():
 def test_any_change_changes_the_hash():
     base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
     changes = {
-        "task": "arrow_puzzle_hard", "preset": "smoke", "hyperparameters": "minimal", "settings": "chapter_3",
+        "task": "arrow_puzzle_hard", "preset": "smoke", "hyperparameters": "minimal", "config_group": "chapter_3",
         "agents": ("dqn",),
         "seeds": (5,), "budgets": (7,),
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
@@ -81,10 +81,10 @@ def test_a_preset_that_changes_is_another_bench(
 
 def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
     own = {"quick": {"seeds": (7, 8), "budgets": (5,)}}
-    spec = dataclasses.replace(task("arrow_puzzle"), settings="chapter_3", presets=own)
+    spec = dataclasses.replace(task("arrow_puzzle"), config_group="chapter_3", presets=own)
     monkeypatch.setattr("imagine_bench.protocols.control.task", lambda name: spec)
     wanted = protocol("arrow_puzzle", "quick", budgets=(6,))
-    assert (wanted.settings, wanted.seeds, wanted.budgets) == ("chapter_3", (7, 8), (6,))
+    assert (wanted.config_group, wanted.seeds, wanted.budgets) == ("chapter_3", (7, 8), (6,))
     assert protocol("arrow_puzzle", "smoke").seeds == PRESETS["smoke"]["seeds"]
 
 

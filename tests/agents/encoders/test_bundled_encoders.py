@@ -36,7 +36,7 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
     assert path.stat().st_size < 2_000_000
     assert (encoder.card.task, encoder.card.appearance) == (spec.id, appearance)
     assert encoder.card == EncoderCard.from_json(path.with_suffix(".json").read_text())
-    assert encoder.card.recipe == RECIPES[spec.settings]["default"] and encoder.card.cpu_s["total"] <= 120
+    assert encoder.card.recipe == RECIPES[spec.config_group]["default"] and encoder.card.cpu_s["total"] <= 120
     assert encoder.card.recipe.held_out_frames >= 4000 and encoder.card.probe["mlp"] >= required
     rng = SeedTree(987_654_321).child("encoder_probe", appearance).generator()
     frames, macrostates = draw_frames(spec, appearance, 1000, rng)
