@@ -51,7 +51,7 @@ def as_seen(transition: Transition) -> Transition:
 
 
 class LabelOracle:
-    """Labels what actions would bring, from the rules and the true macrostate, where the rules allow one outcome only."""
+    """Labels what actions would bring, from the rules and the true macrostate, where these allow one outcome."""
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules

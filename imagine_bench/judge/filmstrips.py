@@ -17,8 +17,8 @@ from imagine_bench.store.results import ComparedRollout
 _CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is made up
 _GAP, _SHEET_GAP, _MARGIN = 12, 14, 12
 _LABELS = 108  # width of the column that names the rows
-_HEADER, _FOOTER, _ROW = 62, 92, _CELL + _GAP
-_BOTTOM = _HEADER + 2 * _ROW
+HEADER_PX, _FOOTER, _ROW = 62, 92, _CELL + _GAP
+_BOTTOM = HEADER_PX + 2 * _ROW
 _SHEET_HEADER, _SHEET_LINE = 36, 14
 _LINE = 20  # characters
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
@@ -41,17 +41,17 @@ def filmstrip(
     room = depth if columns is None else columns
     canvas = Image.new("RGB", (_LABELS + (room + 1) * _ROW, _BOTTOM + _FOOTER), PAPER)
     draw = ImageDraw.Draw(canvas)
-    for y, text in ((_HEADER + 54, "real"), (_HEADER + _ROW + 54, "imagined")):
+    for y, text in ((HEADER_PX + 54, "real"), (HEADER_PX + _ROW + 54, "imagined")):
         draw.text((8, y), text, font=font(15, bold=True), fill=INK)
     draw.multiline_text((8, _BOTTOM + 19), "predicted\n(true)", font=font(12), fill=FAINT, spacing=4)
-    _paste(canvas, compared.start_frame, (_left(0), _HEADER))
-    _paste(canvas, rgb(compared.rollout.start_frame), (_left(0), _HEADER + _ROW))
-    draw.text((_left(0), _HEADER - 20), "start", font=font(13, bold=True), fill=INK)
+    _paste(canvas, compared.start_frame, (left_px(0), HEADER_PX))
+    _paste(canvas, rgb(compared.rollout.start_frame), (left_px(0), HEADER_PX + _ROW))
+    draw.text((left_px(0), HEADER_PX - 20), "start", font=font(13, bold=True), fill=INK)
     for index in range(min(depth, room)):
         _column(canvas, draw, compared, index, action_names)
     cut = first_cut(compared)
     if cut is not None and cut < room:
-        _mark_cut(draw, _left(cut + 1) - _GAP // 2 - 1)
+        _mark_cut(draw, left_px(cut + 1) - _GAP // 2 - 1)
     return np.asarray(canvas)
 
 
@@ -121,7 +121,7 @@ def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
 def _column(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, index: int, names: tuple[str, ...]
 ) -> None:
-    rollout, left = compared.rollout, _left(index + 1)
+    rollout, left = compared.rollout, left_px(index + 1)
     kept, happened = bool(rollout.accepted[index]), index < len(compared.real_frames)
     over = 0 < index <= len(compared.real_frames) and bool(compared.real_terminated[index - 1])
     right = happened and np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
@@ -129,14 +129,14 @@ def _column(
     lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
     draw.multiline_text((left, 8), "\n".join(lines), font=font(12, bold=True), fill=ink, spacing=3)
     if happened:
-        _paste(canvas, compared.real_frames[index], (left, _HEADER), pale=over)
+        _paste(canvas, compared.real_frames[index], (left, HEADER_PX), pale=over)
     if over:
         width = draw.textlength("episode over", font=font(13, bold=True))
-        corner = (left + (_CELL - width) / 2, _HEADER + _CELL / 2 - 8)
+        corner = (left + (_CELL - width) / 2, HEADER_PX + _CELL / 2 - 8)
         draw.text(corner, "episode over", font=font(13, bold=True), fill=INK)
-    _paste(canvas, rgb(rollout.frames[index]), (left, _HEADER + _ROW), pale=not kept)
+    _paste(canvas, rgb(rollout.frames[index]), (left, HEADER_PX + _ROW), pale=not kept)
     if happened and not over:
-        words, top = "as the rules say" if right else "not what happens", _HEADER + _ROW
+        words, top = "as the rules say" if right else "not what happens", HEADER_PX + _ROW
         draw.rectangle([left - 3, top - 3, left + _CELL + 2, top + _CELL + 2], outline=verdict, width=3)
     truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
     draw.text((left, _BOTTOM), words, font=font(12, bold=True), fill=verdict)
@@ -182,7 +182,8 @@ def _paste(canvas: Image.Image, pixels: NDArray[np.uint8], corner: tuple[int, in
     canvas.paste(image, corner)
 
 
-def _left(column: int) -> int:
+def left_px(column: int) -> int:
+    """Where a column begins; column 0 is the start."""
     return _LABELS + column * _ROW
 
 

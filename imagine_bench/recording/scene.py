@@ -96,7 +96,7 @@ def _drawable(shape: Shape3D) -> rr.AsComponents:
     if shape.kind == "cylinder":
         return rr.Cylinders3D(lengths=[length], radii=radius, centers=center, quaternions=quaternion, **style)
     if shape.kind == "capsule":  # Rerun's begins at its origin, ours has it in the middle
-        begin = center + _rotate(shape.pose_in_body[3:], np.array([0.0, 0.0, -length / 2]))
+        begin = center + rotated(shape.pose_in_body[3:], np.array([0.0, 0.0, -length / 2]))
         return rr.Capsules3D(lengths=[length], radii=radius, translations=begin, quaternions=quaternion, **style)
     raise InvalidValueError(f"Shape {shape.name!r} is of kind {shape.kind!r}, which a recording cannot draw.")
 
@@ -105,7 +105,7 @@ def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
     """Flat-shaded: every face has its own three corners, so that edges stay sharp."""
     if shape.vertices is None or shape.faces is None:
         raise InvalidValueError(f"Shape {shape.name!r} is a mesh without vertices or faces.")
-    corners = _rotate(shape.pose_in_body[3:], shape.vertices[shape.faces]) + shape.pose_in_body[:3]  # [F, 3, 3]
+    corners = rotated(shape.pose_in_body[3:], shape.vertices[shape.faces]) + shape.pose_in_body[:3]  # [F, 3, 3]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return rr.Mesh3D(
@@ -116,7 +116,7 @@ def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
     )
 
 
-def _rotate(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotated(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate vectors (..., 3) by a unit quaternion (w, x, y, z)."""
     w, axis = quaternion_wxyz[0], quaternion_wxyz[1:]
     twice = 2.0 * np.cross(axis, vectors)

@@ -65,7 +65,7 @@ class Figure:
     met: bool
 
 
-def _figure(what: str, value: float, sign: str, target: float, form: str, more: str = "") -> Figure:
+def figure_of(what: str, value: float, sign: str, target: float, form: str, more: str = "") -> Figure:
     """A figure; ``sign`` (``"<"``, ``"<="`` or ``">="``) says how it must stand to its target, ``more`` follows it."""
     required = f"{target:.1%}" if form.endswith("%") else f"{target:,g}"
     met = _SIGNS[sign](value, target)
@@ -139,12 +139,12 @@ def _child(code: str) -> dict[str, float]:
 def _fresh_interpreters() -> Iterator[Figure]:
     runs = [_child(_START_UP) for _ in range(5)]
     imported, first_reset = (min(run[key] for run in runs) for key in ("import", "reset"))
-    yield _figure("import imagine_bench, s", imported, "<=", 0.5, ".2f")
-    yield _figure("import + make + first reset, s", first_reset, "<=", 2, ".2f")
+    yield figure_of("import imagine_bench, s", imported, "<=", 0.5, ".2f")
+    yield figure_of("import + make + first reset, s", first_reset, "<=", 2, ".2f")
     if Path("/proc/self/status").exists():
         memory = _child(_MEMORY)
-        yield _figure("memory of one env, MB", memory["rss"], "<=", 300, ".0f")
-        yield _figure("its growth over 2,000 resets, MB", memory["growth"], "<=", 2, ".1f")
+        yield figure_of("memory of one env, MB", memory["rss"], "<=", 300, ".0f")
+        yield figure_of("its growth over 2,000 resets, MB", memory["growth"], "<=", 2, ".1f")
 
 
 def _weight_samples() -> Iterator[Figure]:
@@ -155,10 +155,10 @@ def _weight_samples() -> Iterator[Figure]:
     worst = max(ratios, key=lambda rows: ratios[rows])
     what = f"50 weight samples in one pass, share of a loop's CPU time, worst of batches of 1 to {_BATCHES[-1]:,}"
     note = f" at {worst:,}, {ratios[1]:.2f} at 1, {ratios[64]:.2f} at 64"
-    yield _figure(what, ratios[worst], "<=", 1, ".2f", note)
+    yield figure_of(what, ratios[worst], "<=", 1, ".2f", note)
     together_s, alone_s = registry.load("imagine_bench.agents.speed:training")(10, 250, 3, 4)
     what = "training 10 networks of chapter 4 as one batch, times faster than one after another"
-    yield _figure(what, alone_s / together_s, ">=", 1.5, ".2f")
+    yield figure_of(what, alone_s / together_s, ">=", 1.5, ".2f")
 
 
 def _model_updates() -> Iterator[Figure]:
@@ -167,7 +167,7 @@ def _model_updates() -> Iterator[Figure]:
         speed = registry.load("imagine_bench.agents.speed:model_update")(hyperparameters)
         what = f"a model update ({hyperparameters} settings), times faster than plain torch"
         note = f": {speed.own_ms:.1f} CPU ms in {speed.precision} against {speed.plain_ms:.1f}"
-        yield _figure(what, speed.plain_ms / speed.own_ms, ">=", required, ".2f", note)
+        yield figure_of(what, speed.plain_ms / speed.own_ms, ">=", required, ".2f", note)
 
 
 def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
@@ -187,10 +187,10 @@ def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     thousand_steps()
     rate = 1_000 / _best_cpu_s(thousand_steps, 9)
     what = f"{spec.id}: kinematic macro-actions with frame, through gym.make, per CPU s"
-    yield _figure(what, rate, ">=", targets.kinematic_per_cpu_s, ",.0f")
+    yield figure_of(what, rate, ">=", targets.kinematic_per_cpu_s, ",.0f")
     frame_ms = _best_cpu_s(lambda: [scene.agent_view() for _ in range(1_000)], 9)
     env.close()
-    yield _figure(f"{spec.id}: 64x64 frame, hot, CPU ms", frame_ms, "<=", 0.15, ".3f")
+    yield figure_of(f"{spec.id}: 64x64 frame, hot, CPU ms", frame_ms, "<=", 0.15, ".3f")
 
 
 def _encoders(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
@@ -199,25 +199,25 @@ def _encoders(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     for appearance, required in targets.encoders.items():
         card = json.loads((folder / f"{spec.encoder}-{appearance}.json").read_text())
         what = f"probe on {card['recipe']['held_out_frames']:,} held-out frames (from its card)"
-        yield _figure(f"{spec.id}: bundled encoder {appearance}: {what}", card["probe"]["mlp"], ">=", required, ".2%")
+        yield figure_of(f"{spec.id}: bundled encoder {appearance}: {what}", card["probe"]["mlp"], ">=", required, ".2%")
         what = f"{spec.id}: bundled encoder {appearance}: training, CPU s (from its card)"
-        yield _figure(what, card["cpu_s"]["total"], "<=", 120, ".0f")
+        yield figure_of(what, card["cpu_s"]["total"], "<=", 120, ".0f")
 
 
 def _physics(spec: TaskSpec, targets: PerformanceTargets, turns: int) -> Iterator[Figure]:
     found = measure_fidelity(spec, targets, turns)
     what = f"{spec.id}: macro-actions exactly as the rules say, of {turns:,}"
-    yield _figure(what, found.as_ruled / found.actions, ">=", targets.as_ruled, ".2%")
+    yield figure_of(what, found.as_ruled / found.actions, ">=", targets.as_ruled, ".2%")
     what = f"{spec.id}: other objects moved, worst, mm"
-    yield _figure(what, found.other_objects_mm, "<", targets.other_objects_mm, ".3f")
+    yield figure_of(what, found.other_objects_mm, "<", targets.other_objects_mm, ".3f")
     if targets.error_mm is not None:
         p99_mm = float(np.percentile(found.error_mm, 99))
-        yield _figure(f"{spec.id}: position error, p99, mm", p99_mm, "<", targets.error_mm, ".2f")
+        yield figure_of(f"{spec.id}: position error, p99, mm", p99_mm, "<", targets.error_mm, ".2f")
     if targets.error_deg is not None:
         p99_deg = float(np.percentile(found.error_deg, 99))
-        yield _figure(f"{spec.id}: yaw error, p99, degrees", p99_deg, "<", targets.error_deg, ".2f")
+        yield figure_of(f"{spec.id}: yaw error, p99, degrees", p99_deg, "<", targets.error_deg, ".2f")
     # The first block warms up.
     blocks_s = [sum(found.cpu_s[first : first + _BLOCK]) for first in range(_BLOCK, turns - _BLOCK + 1, _BLOCK)]
     rate, mean_rate = _BLOCK / min(blocks_s), _BLOCK * len(blocks_s) / sum(blocks_s)
     what = f"{spec.id}: mink + physics + frame, macro-actions per CPU s, best {_BLOCK} (mean)"
-    yield _figure(what, rate, ">=", targets.physics_per_cpu_s, ".0f", f" ({mean_rate:.0f})")
+    yield figure_of(what, rate, ">=", targets.physics_per_cpu_s, ".0f", f" ({mean_rate:.0f})")

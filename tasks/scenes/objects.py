@@ -73,14 +73,14 @@ def standing_m(index: int) -> tuple[float, float, float]:
     return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + OBJECTS[index].grip_height_m)
 
 
-def _car_body() -> Mesh:
+def car_body() -> Mesh:
     """Chassis and bonnet, its nose toward the human (+x)."""
     x, y, z = _CAR_HALF_M
     return merge([box((-x, -y, _CAR_CLEARANCE_M - _CAR_GRIP_Z_M), (x, y, _CAR_CLEARANCE_M + 2 * z - _CAR_GRIP_Z_M)),
                   box((-0.024, -0.019, 0.006), (0.012, 0.019, 0.021), taper=0.82)])  # fmt: skip
 
 
-def _car_trim() -> Mesh:
+def car_trim() -> Mesh:
     """Windows and wheels."""
     wheel_z = _WHEEL_M - _CAR_GRIP_Z_M
     wheels = [
@@ -95,7 +95,7 @@ def _car_trim() -> Mesh:
     return merge([*wheels, *windows])
 
 
-def _cup_body() -> Mesh:
+def cup_body() -> Mesh:
     """A mug, its handle toward the robot."""
     low, high = _CUP_FOOT_M - _CUP_GRIP_Z_M, _CUP_HEIGHT_M - _CUP_GRIP_Z_M
     wall = turned_profile([(0.85 * _CUP_RADIUS_M, low), (_CUP_RADIUS_M, low + 0.01), (_CUP_RADIUS_M, high)], sides=14)
@@ -103,7 +103,7 @@ def _cup_body() -> Mesh:
     return merge([wall, handle])
 
 
-def _cup_inside() -> Mesh:
+def cup_inside() -> Mesh:
     """The dark hole, a disc just above the rim's height."""
     high = _CUP_HEIGHT_M - _CUP_GRIP_Z_M
     return turned_profile([(0.74 * _CUP_RADIUS_M, high), (0.74 * _CUP_RADIUS_M, high + 0.0006)], sides=12)
@@ -124,16 +124,16 @@ def add_objects(spec: mujoco.MjSpec) -> None:
     car.add_geom(name="car_box", type=kind.mjGEOM_BOX, size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG,
                  **_TOUCH)  # fmt: skip
     _add_supports(car, "car_wheel", _WHEEL_M, (0.021, 0.014, _WHEEL_M - _CAR_GRIP_Z_M))
-    _skin(spec, car, "car_skin", _car_body(), "car")
-    _skin(spec, car, "car_trim", _car_trim(), "car_dark")
+    _skin(spec, car, "car_skin", car_body(), "car")
+    _skin(spec, car, "car_trim", car_trim(), "car_dark")
 
     half_m = (_CUP_HEIGHT_M - _CUP_FOOT_M) / 2
     middle_z = _CUP_FOOT_M + half_m - _CUP_GRIP_Z_M
     cup.add_geom(name="cup_wall", type=kind.mjGEOM_CYLINDER, size=(_CUP_RADIUS_M, half_m, 0), pos=(0, 0, middle_z),
                  mass=0.8 * _MASS_KG, **_TOUCH)  # fmt: skip
     _add_supports(cup, "cup_foot", _CUP_FOOT_M, (0.014, 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M))
-    _skin(spec, cup, "cup_skin", _cup_body(), "cup")
-    _skin(spec, cup, "cup_hole", _cup_inside(), "cup_inside")
+    _skin(spec, cup, "cup_skin", cup_body(), "cup")
+    _skin(spec, cup, "cup_hole", cup_inside(), "cup_inside")
 
 
 def _body(spec: mujoco.MjSpec, index: int) -> mujoco.MjsBody:

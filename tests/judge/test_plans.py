@@ -48,7 +48,7 @@ class Dreamer:
     ) -> ImaginedRollout:
         assert actions is None
         self.frames.append(frame)
-        state: State = self.env.unwrapped._macrostate
+        state: State = self.env.unwrapped.world.read().macrostate
         chosen, states = [], []
         for _ in range(depth):
             chosen.append(self.choose(state))

@@ -22,7 +22,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, U
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.judge.imagination_quality import compare_rollout
 from imagine_bench.recording import episodes, open_in_viewer, q_table, record_run, recording_file, stream
-from imagine_bench.recording.scene import _rotate, entity_name, log_motion, log_shapes
+from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, rotated
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -263,7 +263,7 @@ def test_rotation_against_the_matrix() -> None:
             ]
         )
         vectors = rng.normal(size=(5, 3))
-        np.testing.assert_allclose(_rotate(quaternion, vectors), vectors @ matrix.T, atol=1e-12)
+        np.testing.assert_allclose(rotated(quaternion, vectors), vectors @ matrix.T, atol=1e-12)
 
 
 def shape(kind: str, **changes: object) -> Shape3D:

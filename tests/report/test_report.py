@@ -402,7 +402,7 @@ def test_strip_marks_cut_error_and_end() -> None:
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
     compared = compared_rollout(np.random.default_rng(0), cut=None)
     strip = filmstrips.filmstrip(compared, tuple("abcdef"))
-    left, top = filmstrips._left(0), filmstrips._HEADER
+    left, top = filmstrips.left_px(0), filmstrips.HEADER_PX
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
 

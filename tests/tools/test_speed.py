@@ -5,7 +5,7 @@ import json
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.tools.speed import _figure, speed_report
+from imagine_bench.tools.speed import figure_of, speed_report
 
 
 @pytest.mark.slow
@@ -32,6 +32,6 @@ def test_figures_are_measured_and_kept(tmp_path):
     ("sign", "met"), [(">=", (False, True, True)), ("<=", (True, True, False)), ("<", (True, False, False))]
 )
 def test_a_figure_meets_its_target_or_not(sign: str, met: tuple[bool, ...]) -> None:
-    found = [_figure("what", value, sign, 0.5, ".2f") for value in (0.4, 0.5, 0.6)]
+    found = [figure_of("what", value, sign, 0.5, ".2f") for value in (0.4, 0.5, 0.6)]
     assert tuple(figure.met for figure in found) == met
     assert (found[0].required, found[0].measured) == (f"{sign} 0.5", "0.40")

@@ -22,9 +22,7 @@ PARTS = {
     "arrow": prism(arrow_outline(), 0.0, 0.001),
     **hand.hand_meshes(),
     **open_hand.open_hand_meshes(),
-    **{
-        part.__name__: part() for part in (objects._car_body, objects._car_trim, objects._cup_body, objects._cup_inside)
-    },
+    **{part.__name__: part() for part in (objects.car_body, objects.car_trim, objects.cup_body, objects.cup_inside)},
 }
 
 
