@@ -56,7 +56,7 @@ _FACTORS = (
     _variant("filter", "mean below 0.3", {"imagination.reduction": "mean"}),
     _variant("filter", "dynamics below the 90 % quantile", {"imagination.threshold_quantile": 0.9}),
     _variant(
-        "filter", "MC-dropout, reward uncertainty below 2.5",
+        "filter", "MC-dropout, reward_std below 2.5",
         {**_MC_DROPOUT, "imagination.reward_threshold": 2.5, "imagination.termination_threshold": None},
     ),
     *_pair("targets", "target network", {"controller.target_rate": 0.02}),
