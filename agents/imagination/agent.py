@@ -128,8 +128,9 @@ class ImaginingAgent(DQN):
     def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """The likeliest results of actions; see :class:`imagine_bench.capabilities.MapPredictor`."""
         z = torch.stack([self.perception.posterior(frame)[0] for frame in frames])  # [N, Z]
-        weights = self.imagination.draw_weights(torch.Generator(z.device).manual_seed(int(rng.integers(2**63))))
-        likeliest = self.imagination.likeliest(z, torch.as_tensor(actions, device=z.device), weights)
+        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
+        weights, action = self.imagination.draw_weights(generator), torch.as_tensor(actions, device=z.device)
+        likeliest = self.imagination.likeliest(z, action, weights, generator)
         return self.perception.encoder.read_macrostate(likeliest)
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

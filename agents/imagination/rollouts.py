@@ -102,13 +102,13 @@ class Imagination:
         return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self.filter.reads_reward else None)
 
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
-        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): average over weight samples, then sample z'.
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): sample z' from what :attr:`settings` predict with.
 
         DivergedError if what the model predicts is NaN.
         """
         model = self.model
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
-        predicted = mdn.average(samples, model.members)
+        predicted = self._predicted(samples, z, action, weights, generator)
         _require_numbers(predicted.log_weights)
         next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-LATENT_LIMIT, LATENT_LIMIT)
         _require_numbers(next_z)
@@ -116,9 +116,23 @@ class Imagination:
         reward_std = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, reward_std)
 
-    def likeliest(self, z: Tensor, action: Tensor, weights: Weights) -> Tensor:
+    def likeliest(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Tensor:
         """The mean of the likeliest component of what :meth:`step` samples from. Shape (N, Z)."""
-        return mdn.likeliest(mdn.average(self.model.predict(z, action, weights.dynamics), self.model.members))
+        samples = self.model.predict(z, action, weights.dynamics)
+        return mdn.likeliest(self._predicted(samples, z, action, weights, generator))
+
+    def _predicted(
+        self, samples: Mixture, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator
+    ) -> Mixture:
+        """The mixtures (N, E K) that z' is sampled from, of what the weight samples (E T, N) say."""
+        members = self.model.members
+        if self.settings.predicts_with == "network" and weights.dynamics is not None:
+            samples = self.model.predict(z, action, None)
+        elif self.settings.predicts_with == "sample":
+            rows, count = torch.arange(len(z), device=z.device), len(samples.means) // members
+            chosen = torch.randint(count, (len(z),), generator=generator, device=z.device)
+            samples = samples.map(lambda values: values.unflatten(0, (members, count))[:, chosen, rows])
+        return mdn.average(samples, members)
 
     def keeps(self, step: Imagined) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
@@ -140,7 +154,8 @@ class Imagination:
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
         settings, generator = self.settings, self.generators["rollouts"]
-        weights = self.draw_weights(self.generators["dropout"])
+        sampled = self.filter.active or settings.predicts_with != "network"
+        weights = self.draw_weights(self.generators["dropout"]) if sampled else Weights(None, None)
         self.filter.move_threshold(self.model, real, weights.dynamics, self.generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
         for _ in range(settings.depth):

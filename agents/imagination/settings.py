@@ -101,6 +101,10 @@ class ImaginationSettings:
     updates_per_step: int = setting(1, NOT_NEGATIVE)  #: controller updates on imagined transitions a real step, N_I
     #: Scale of the component's standard deviation when z' is sampled: 1 the thesis, 0 its mean.
     temperature: float = setting(1.0, NOT_NEGATIVE)
+    #: Whose ``p(z' | z, a)`` is imagined: ``"average"``, that of the T weight samples (thesis 4.4, of chapter 4's
+    #: predictions); ``"network"``, that of the whole network, which drops nothing (chapter 5 turns dropout on for the
+    #: uncertainty of transitions that are there already); or ``"sample"``, that of one weight sample, drawn anew.
+    predicts_with: str = setting("average", ("average", "network", "sample"))
     #: Smallest exploration probability inside rollouts; the real one counts where it is larger.
     exploration: float = setting(0.0, PROBABILITY)
     #: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).

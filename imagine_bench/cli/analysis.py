@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from imagine_bench.cli.options import ANY, NEWEST, shown
+from imagine_bench.cli.benches import parse_settings
+from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, shown
 from imagine_bench.interfaces import EXECUTIONS
 
 
@@ -71,11 +72,17 @@ class _OfBench:
 class Generalise(_OfBench):
     """Ask the models of a bench, finished or not, for every transition: also those that no training can contain."""
 
+    set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
+    """Settings that replace those the agents ran with, as name=value, such as imagination.temperature=0."""
+
     def __call__(self) -> None:
         """Ask and report."""
         from imagine_bench.report.generalisation import generalisation_report  # noqa: PLC0415 - as above
 
-        print(generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
+        overrides = parse_settings(added_up("set", self.set))
+        print(
+            generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder, overrides=overrides)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from imagine_bench import registry
 from imagine_bench.bench.progress import counted
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.machine import describe_environment
 from imagine_bench.protocols.task_types import task_type
@@ -112,12 +112,14 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]
 
 
 def analyse(
-    analysis: type[Analysis[Value]], folder: Path | None, *, root: Path, task: str | None, encoder: str | None
-) -> str:
+    analysis: type[Analysis[Value]], folder: Path | None, *, root: Path, task: str | None, encoder: str | None,
+    overrides: Sequence[tuple[str, Any]] = (),
+) -> str:  # fmt: skip
     """Measure every learner of a bench, and leave the analysis in its folder.
 
     An unfinished bench will do: every run is measured as its last checkpoint left it. The bench is as in
-    :func:`chosen`, the ``encoder`` as in :func:`imagine_bench.store.trained.load_trained`. Returns what to print.
+    :func:`chosen`, ``encoder`` and ``overrides`` are as in :func:`imagine_bench.store.trained.load_trained`; what was
+    measured with overrides has a folder of its own. Returns what to print.
 
     Raises:
         ImagineBenchError: No bench, or none with an agent that can be taken up again and has something to measure.
@@ -125,20 +127,25 @@ def analyse(
         SetupError: The bench's folder cannot be written.
     """
     bench = chosen(folder, root, task)
-    protocol, where = protocol_of_agents(bench), bench / analysis.name
-    with lock(bench / f".{analysis.name}.lock", f"The folder {where}"):
+    protocol = protocol_of_agents(bench)
+    for name, _ in overrides:
+        require_known("setting", name, {name for agent in protocol.agents for name in registry.setting_names(agent)})
+    where = bench / "-".join([analysis.name, *(f"{name}={value}" for name, value in overrides)]).replace("/", "_")
+    with lock(bench / f".{where.name}.lock", f"The folder {where}"):
         spec, appearance, folders = registry.task(protocol.task), protocol.appearance, learners(bench)
         found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         runs = []
         for run in counted(folders, "runs", total=len(folders)):
-            trained = load_trained(run, encoder=encoder)
+            trained = load_trained(run, encoder=encoder, overrides=overrides)
             value = found.measure(trained)
             if value is not None:
                 name, seed = trained.spec.agent, trained.spec.seed
                 runs.append(Measured(agent=name, seed=seed, episodes=trained.episodes, value=value))
         if not runs:
             raise ArtefactError(f"No agent of {bench} imagines; give a bench with one that does.")
-        found.write(where, runs, {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic"})
+        settings = {"settings": dict(overrides)} if overrides else {}
+        facts = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic", **settings}
+        found.write(where, runs, facts)
     return f"{spec.title}, {appearance}\n\n{found.table(runs)}\n\nAll rows:   {where / found.rows_file}"
 
 

@@ -32,9 +32,11 @@ _ROWS = {
 """The figures of summary.json: where they are found in a :class:`.Generalisation`, and their row of the table."""
 
 
-def generalisation_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+def generalisation_report(
+    folder: Path | None, *, root: Path, task: str | None, encoder: str | None, overrides: Sequence[tuple[str, Any]] = ()
+) -> str:
     """Let the model of every imagining run of a bench predict all transitions: :func:`.analysis.analyse`."""
-    return analyse(GeneralisationAnalysis, folder, root=root, task=task, encoder=encoder)
+    return analyse(GeneralisationAnalysis, folder, root=root, task=task, encoder=encoder, overrides=overrides)
 
 
 class GeneralisationAnalysis(Analysis[Found]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.interfaces import Agent, AgentState, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.protocols.task_types import Result
@@ -43,11 +43,12 @@ class Trained:
         return self.agent
 
 
-def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
+def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequence[tuple[str, Any]] = ()) -> Trained:
     """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
 
     ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
-    path, where the run used an encoder that is not bundled.
+    path, where the run used an encoder that is not bundled; ``overrides`` replace settings it ran with, those that it
+    has.
 
     Raises:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
@@ -57,7 +58,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     config = read_json(path, what)
     with reading(path, what):
         task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
-        settings = tuple(sorted(_flat(config["settings"]).items()))
+        settings = _flat(config["settings"])
     require_control(task, str(folder))
     with reading(path, what):
         protocol = Protocol.from_dict(config["protocol"])
@@ -65,9 +66,10 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
-    as_it_ran = dataclasses.replace(protocol, overrides=settings)  # whatever the presets say by now
+    settings.update((name, value) for name, value in overrides if name in settings)
+    as_it_ran = dataclasses.replace(protocol, overrides=tuple(sorted(settings.items())))  # whatever presets say by now
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
-    agent.restore(snapshot.agent)
+    agent.restore(_with_settings(snapshot.agent, overrides))
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
         while agent.train_in_model():
             pass
@@ -143,6 +145,13 @@ def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool
     """Whether an encoder was given for the agents of the bench that see through another kind than this one."""
     found = encoders.identity(encoders.resolve(task, protocol.appearance, given))
     return found != used and found in (protocol.encoder, protocol.codes)
+
+
+def _with_settings(state: AgentState, overrides: Sequence[tuple[str, Any]]) -> AgentState:
+    """A snapshot that names other settings, as an agent does that is to take it up with them."""
+    held = state.values.get("settings", {})
+    changed = {name: value for name, value in overrides if name in held}
+    return dataclasses.replace(state, values={**state.values, "settings": {**held, **changed}}) if changed else state
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -247,6 +247,8 @@ def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: py
     said = capsys.readouterr().out
     assert "imaginer, 9 episodes (2 seed(s))" in said and str(folder / "generalisation") in said
     assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 2 * 192 * 6
+    assert main(["generalise", str(folder), "--set", "imagination.temperatur=0"]) == 2
+    assert "No setting 'imagination.temperatur'" in capsys.readouterr().err
 
 
 def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None:

@@ -53,6 +53,26 @@ def test_the_filter_ends_a_rollout_at_an_uncertain_transition() -> None:
     assert dataclasses.astuple(counts) == (3, 15, 12)
 
 
+@pytest.mark.parametrize("how", ["average", "network", "sample"])
+def test_what_is_imagined_is_of_the_chosen_weights(how: str) -> None:
+    """Means of one component each: over all weight samples, of the network without dropout, or of one sample a row."""
+    model = WorldModelSettings(components=1, dropout=0.5, dynamics_hidden=(16,))
+    settings = Settings(model=model, imagination=ImaginationSettings(temperature=0.0, predicts_with=how))
+    imagination = Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
+    generator = torch.Generator().manual_seed(0)
+    z, action = torch.ones(500, 2), torch.zeros(500, dtype=torch.int64)
+    weights = imagination.draw_weights(generator)
+    found = imagination.step(z, action, weights, generator).next_z
+    means = imagination.model.predict(z, action, weights.dynamics).means[..., 0, :]  # [T, N, Z]
+    whole = imagination.model.predict(z, action, None).means[0, :, 0]
+    near = [torch.isclose(found, mean, atol=1e-6).all(dim=-1) for mean in (means.mean(dim=0), whole)]
+    of_one = torch.isclose(found, means, atol=1e-6).all(dim=-1)  # [T, N]
+    assert [bool(each.all()) for each in near] == [how == "average", how == "network"]
+    assert bool(of_one.any(dim=0).all()) == (how == "sample")
+    if how == "sample":
+        assert of_one.any(dim=1).all(), "all of them are drawn"
+
+
 @pytest.mark.parametrize("part", ["log_weights", "means", "log_sigmas"])
 def test_imagination_that_is_no_number_is_not_stored(part: str) -> None:
     class Diverged(CountingModel):
