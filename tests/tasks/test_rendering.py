@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import multiprocessing
 import os
 import pickle
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -199,6 +201,19 @@ def test_a_headless_script_draws_and_exits_in_silence(before, after):
     assert done.returncode == 0
     assert done.stdout.strip() == "True"
     assert done.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="triton is a Linux matter")
+def test_the_llvm_of_triton_is_loaded_before_mesa_s(tmp_path):
+    """In the other order an optimiser of a CUDA build of torch ends the process; triton itself is not imported."""
+    (tmp_path / "triton" / "_C").mkdir(parents=True)
+    (tmp_path / "triton" / "__init__.py").write_text("raise ImportError('nobody needs triton here')")
+    library = tmp_path / "triton" / "_C" / "libtriton.so"
+    library.write_bytes(Path(importlib.util.find_spec("_ctypes").origin).read_bytes())
+    loaded = "from pathlib import Path; loaded = 'libtriton' in Path('/proc/self/maps').read_text()"
+    before = f"import sys; sys.path.insert(0, {str(tmp_path)!r})"
+    done = run_script(_FRAME.format(before=before, after=f"{loaded}; assert loaded; env.close()"))
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
