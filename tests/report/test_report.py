@@ -24,6 +24,7 @@ from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
 from imagine_bench.report.data import _nan_mean, collect
 from imagine_bench.report.sections.imagination import encoder_views
+from imagine_bench.report.sections.success import gain
 from imagine_bench.report.text import percent, signed_percent
 from imagine_bench.store.results import BenchResult
 
@@ -309,9 +310,9 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "so at this budget it is ahead"),
-        ([50, 52, 54], "so at this budget it is behind"),
-        ([80, 100, 140], "which includes zero, so at this budget no difference is shown"),
+        ([150, 152, 154], "corrected): at this budget it is ahead."),
+        ([50, 52, 54], "corrected): at this budget it is behind."),
+        ([80, 100, 140], "corrected): at this budget no difference is shown."),
     ],
 )
 def test_the_answer_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
@@ -360,15 +361,21 @@ def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult)
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("count", "warned"), [(1, False), (2, True), (4, True), (5, False)])
-def test_few_seeds_are_called_few(count: int, warned: bool) -> None:
-    assert bool(words.few_words(count)) is warned
-
-
-@pytest.mark.parametrize("agents", [("dqn", "imagination"), ("imagination", "imagination_uncertainty"), ("dqn",)])
-def test_few_seeds_are_called_few_whoever_is_compared(agents: tuple[str, ...], tmp_path: Path) -> None:
-    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, budgets=(5, 10))
-    assert words.few_words(3)[0] in words.answers(collect(bench_result(tmp_path, protocol=protocol)))
+def test_a_difference_is_shown_only_after_holm_s_correction(result: BenchResult) -> None:
+    """The same difference counts less among more comparisons, and what could have been shown stands below the table."""
+    changed = shifted(shifted(result, "dqn", [90, 100, 110]), "imagination", [116, 126, 136])
+    data = collect(changed)
+    one, budgets = data.comparisons["imagination"][2000], len(data.budgets)
+    assert (
+        one.difference.p < 0.05 < one.p_adjusted <= budgets * len(data.comparisons) * one.difference.p
+        and one.shown == 0
+    )
+    assert "no difference is shown" in "".join(words.answers(data))
+    said = words.detectable_words(data.comparisons)
+    sizes = [each.detectable for by_budget in data.comparisons.values() for each in by_budget.values()]
+    assert f"{percent(min(sizes))} to {percent(max(sizes))} points" in said
+    assert f"all {len(sizes)} comparisons" in said
+    assert said in " ".join(table.caption for table in gain(data).tables)
 
 
 def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(result: BenchResult) -> None:

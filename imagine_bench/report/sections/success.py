@@ -9,7 +9,7 @@ from imagine_bench import statistics
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
-from imagine_bench.report.text import agent_words, interval_text, lasting, percent, signed_percent
+from imagine_bench.report.text import agent_words, detectable_words, interval_text, lasting, percent, signed_percent
 
 
 def compared(data: ReportData) -> Section:
@@ -163,7 +163,7 @@ def gain(data: ReportData) -> Section:
     figure = plots.image(
         "gain", lambda: plots.gain_figure(data), svg=True, dpi=180,
         alt="Gain over DQN against real training episodes, with the thesis' gains.",
-        caption="Gain of the means over seeds; bands: 95 % interval over seeds (bootstrap). Diamonds: the thesis (its "
+        caption="Gain of the means over seeds; bands: 95 % interval over seeds (Fieller). Diamonds: the thesis (its "
         "means alone).",
     ) if near else None  # fmt: skip
     why_dash = "DQN solved nothing to compare with"
@@ -178,12 +178,17 @@ def gain(data: ReportData) -> Section:
         title="Gain over DQN",
         words=(
             "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / "
-            "DQN, the thesis' measure. An interval that includes zero shows no difference; one seed has none, nor has "
-            "a gain over a DQN that may have solved nothing.",
+            "DQN, the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved "
+            "nothing. Runs of one seed are not paired: what training makes of them does not agree.",
         ),
         images=[figure] if figure else [],
         tables=(
-            Table(name="differences", header=_heads("difference (points) after", data), rows=differences),
+            Table(
+                name="differences",
+                header=_heads("difference (points) after", data),
+                rows=differences,
+                caption=detectable_words(data.comparisons),
+            ),
             Table(name="gains", header=_heads("gain (%) after", data), rows=gains, why_dash=why_dash),
         ),
     )
