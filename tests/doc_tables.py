@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
+from imagine_bench.store import encoders
+from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
 
 ROOT = Path(__file__).parents[1]
@@ -102,8 +104,8 @@ def _caption(tests: Sequence[Compared]) -> list[str]:
     if not sizes:
         return []
     least, most = (f"{size:.1f}" if size < 9.95 else f"{size:.0f}" for size in (min(sizes), max(sizes)))
-    could = f"{least} to {most} points, by cell" if least != most else f"{least} points"
-    return ["", f"*Bold: p < 0.05 (Holm, {len(tests)} tests). Shown with probability 80 %: {could}.*"]
+    could = f"{least} to {most} points" if least != most else f"{least} points"
+    return ["", f"*Bold: shown (Holm, {len(tests)} tests). Detectable: {could}.*"]
 
 
 def _cells(line: str) -> list[str]:
@@ -235,6 +237,39 @@ def reached(where: str, level: str) -> np.ndarray:
     table = np.stack([scores(str(each), where) for each in budgets], axis=1)
     found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
     return np.array([np.nan if each is None else each for each in found])
+
+
+def price(budget: str, where: str, what: str) -> str:
+    """What one run has had until a budget, mean over seeds: a column, or frames its encoder saw before."""
+    folder, _, agent = where.rpartition("/")
+    if what == "frames":
+        entry, protocol = registry.agent_entry(agent), read_protocol(RESULTS / folder)
+        card = encoders.card(protocol.encoder_of(entry.encoder_kind)) if entry.needs_encoder else None
+        return "0" if not entry.needs_encoder else "–" if card is None else f"{card['recipe']['frames']:,}"
+    values = [row.get(what) or "nan" for row in runs(where)[int(budget)]]
+    mean = np.mean([float(value) for value in values])
+    return "–" if np.isnan(mean) else f"{mean:,.0f}"
+
+
+def price_to(where: str, level: str, what: str) -> str:
+    """The same until the test from which on all reach a level, mean over seeds."""
+    if what == "frames":
+        return price("0", where, what)
+    budgets = reached(where, level)
+    if np.isnan(budgets).any():
+        return "–"
+    rows = [runs(where)[int(budget)][index] for index, budget in enumerate(budgets)]
+    return f"{np.mean([float(row[what]) for row in rows]):,.0f}"
+
+
+def coverage(seeds_and_stuck: str, what: str) -> str:
+    """A rate of the simulation of intervals and tests, %."""
+    count, stuck = seeds_and_stuck.split("/")
+    (row,) = (
+        row for row in _json("coverage/coverage.json")["rows"]
+        if (row["seeds"], row["stuck"]) == (int(count), float(stuck))
+    )  # fmt: skip
+    return percent(row[what])
 
 
 def episodes_to(where: str, level: str) -> str:
@@ -429,7 +464,7 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, goals_and_starts, chance_exact, shortest,
+        claim, speed, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
     )
 }  # fmt: skip
 

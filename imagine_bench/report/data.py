@@ -9,6 +9,7 @@ import numpy as np
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
+from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
@@ -63,6 +64,15 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Price:
+    """What one run had had until a budget, means over seeds."""
+
+    env_steps: float  # real training macro-actions
+    updates: float  # gradient updates of all networks; NaN where the agent counts none
+    train_cpu_s: float  # CPU seconds of training
+
+
+@dataclass(frozen=True, kw_only=True)
 class FuturesSummary:
     """Sampled futures against the rules, means over all pairs of macrostate and macro-action and over seeds.
 
@@ -90,7 +100,8 @@ class ReportData:
 
     ``reached`` holds for each seed the first budget from which on success never falls below the task's
     ``success_threshold``, or None.
-    ``prices`` holds, for each budget, real macro-actions and CPU seconds of training until then, means over seeds.
+    ``prices`` holds what each agent had had until each budget, and ``frames_before`` the frames that its encoder was
+    trained on, None where that is not known.
     ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
     budget, divided by the budget: the mean success until then, with its interval over seeds.
     """
@@ -106,7 +117,8 @@ class ReportData:
     reached: dict[str, tuple[int | None, ...]]
     areas: dict[str, dict[int, statistics.Estimate]]
     timing: dict[str, Timing]
-    prices: dict[str, dict[int, tuple[float, float]]]
+    prices: dict[str, dict[int, Price]]
+    frames_before: dict[str, int | None]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_gains: dict[str, dict[int, float]]
     thesis_source: str
@@ -155,6 +167,7 @@ def collect(result: BenchResult) -> ReportData:
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
+        frames_before={agent: _frames_before(result, agent) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_gains={agent: gains for agent, gains in thesis_gains.items() if gains},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
@@ -349,10 +362,25 @@ def _timing(runs: tuple[RunResult, ...], *, learns: bool) -> Timing:
     )
 
 
-def _prices(runs: tuple[RunResult, ...]) -> dict[int, tuple[float, float]]:
-    costs = np.array([[(row.env_steps, row.train_cpu_s) for row in run.checkpoints] for run in runs])  # [runs, B, 2]
-    budgets = [row.episodes for row in runs[0].checkpoints]
-    return {budget: (float(steps), float(cpu_s)) for budget, (steps, cpu_s) in zip(budgets, costs.mean(0), strict=True)}
+def _prices(runs: tuple[RunResult, ...]) -> dict[int, Price]:
+    rows = zip(*(run.checkpoints for run in runs), strict=True)
+    return {
+        seeds[0].episodes: Price(
+            env_steps=float(np.mean([row.env_steps for row in seeds])),
+            updates=float(np.mean([row.diagnostics.get("gradient_updates", float("nan")) for row in seeds])),
+            train_cpu_s=float(np.mean([row.train_cpu_s for row in seeds])),
+        )
+        for seeds in rows
+    }
+
+
+def _frames_before(result: BenchResult, agent: str) -> int | None:
+    """Frames that the encoder of an agent was trained on, by its card; 0 for an agent that has none."""
+    entry = registry.agent_entry(agent)
+    if not entry.needs_encoder:
+        return 0
+    card = encoders.card(result.protocol.encoder_of(entry.encoder_kind))
+    return None if card is None else int(card["recipe"]["frames"])
 
 
 def _learner_cpu_s(run: RunResult) -> float:

@@ -49,7 +49,7 @@ def success(data: ReportData, interval_words: str) -> Section:
         f"interquartile mean over {seeds} (independent trainings, the same {protocol.evaluation_episodes:,} test "
         f"starts for all); bands: {interval_words}.{thesis}",
     )  # fmt: skip
-    tables = (_scores(data, interval_words), *_thesis_only(data), _seeds(data))
+    tables = (_scores(data, interval_words), _prices(data), *_thesis_only(data), _seeds(data))
     return Section(title="Success against real experience", images=(figure,), tables=tables)
 
 
@@ -58,17 +58,33 @@ def _scores(data: ReportData, interval_words: str) -> Table:
         [
             agent_words(agent).title,
             *(_score(score, agent, budget, data.thesis.get(agent, {})) for budget, score in scores.items()),
-            *(f"{price:,.0f}" for price in data.prices[agent][data.budgets[-1]]),
         ]
         for agent, scores in data.scores.items()
     ]
     for name, share in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
-        rows.append([name, *[percent(share)] * len(data.budgets), DASH, DASH])
+        rows.append([name, *[percent(share)] * len(data.budgets)])
     return Table(
-        name="scores", header=[*_heads("solved (%) after", data), "real macro-actions", "training (CPU s)"], rows=rows,
-        caption=f"Columns: real training episodes; in brackets: {interval_words}. The last two columns are the price "
-        f"of the {data.budgets[-1]:,} episodes, means over seeds.",
-        why_dash="chance level and optimum are computed from the rules, not trained",
+        name="scores", header=_heads("solved (%) after", data), rows=rows,
+        caption=f"Columns: real training episodes; in brackets: {interval_words}.",
+    )  # fmt: skip
+
+
+def _prices(data: ReportData) -> Table:
+    """What each agent had had at the last budget."""
+    rows = []
+    for agent, by_budget in data.prices.items():
+        price, frames = by_budget[data.budgets[-1]], data.frames_before[agent]
+        counts = (price.env_steps, math.nan if frames is None else frames, price.updates)
+        cells = [DASH if math.isnan(count) else f"{count:,.0f}" for count in counts]
+        rows.append([agent_words(agent).title, *cells, seconds(price.train_cpu_s)])
+    return Table(
+        name="prices", rows=rows,
+        header=[
+            f"price of {data.budgets[-1]:,} episodes", "real macro-actions", "frames its encoder saw before",
+            "gradient updates", "training (CPU s)",
+        ],
+        caption="Means over seeds. Frames before training are drawn from all macrostates alike.",
+        why_dash="not counted by the agent, or an encoder that is not bundled",
     )  # fmt: skip
 
 
