@@ -157,6 +157,12 @@ def average(budget: str, where: str) -> str:
     return percent(scores(budget, where).mean())
 
 
+def macro_actions(budget: str, where: str) -> str:
+    """Real training macro-actions so far, mean over seeds; an en dash for who is not trained."""
+    mean = scores(budget, where, "env_steps").mean()
+    return f"{mean:,.0f}" if mean else "–"
+
+
 def worst_best(budget: str, where: str) -> str:
     """Mean [worst, best seed], %."""
     values = scores(budget, where)
@@ -384,7 +390,7 @@ def shortest(task: str) -> str:
 CELLS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
+        iqm, ahead, mean_std, average, macro_actions, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
         claim, speed, goals_and_starts, chance_exact, shortest,
