@@ -19,11 +19,11 @@ from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import require_writable, write_json
 
 SWEEPS: dict[str, tuple[float, ...]] = {
-    "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003),
+    "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001),
     "finger_force_n": (30, 10, 5, 3, 2, 1.5, 1, 0.9, 0.7, 0.5, 0.3, 0.1),
-    "object_mass": (1, 3, 5, 10, 15, 20, 30, 40, 60),
+    "object_mass": (1, 3, 5, 10, 15, 20, 30, 35, 40, 60),
     "plan_error_mm": (0, 2, 4, 6, 8, 10, 12, 14, 17, 20, 25, 30, 40),
-    "plan_error_deg": (0, 5, 10, 15, 20, 25, 30, 35, 40, 45),
+    "plan_error_deg": (0, 5, 10, 15, 20, 25, 30, 32, 35, 40, 45),
 }
 """Values of each setting, the first as built. Beyond 45 degrees a cube looks as if turned the other way."""
 _WALKS, _WALK_ACTIONS = 5, 200
