@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,15 +17,15 @@ from imagine_bench.interfaces import AgentContext, AgentState, Observation, Tran
 from imagine_bench.seeding import SeedTree
 
 from . import snapshot
-from .dqn_settings import HYPERPARAMETERS, ControllerSettings, DQNSettings
+from .dqn_settings import HYPERPARAMETERS, MORE_UPDATES, ControllerSettings, DQNSettings, GreedySettings
 from .encoders.perception import Perception, load_perception, prepare_torch
 from .meters import Meters
 from .networks.mlp import mlp
 from .replay import Batch, RealMemory, Transitions
-from .settings import flatten
+from .settings import Hyperparameters, flatten
 
 
-def epsilon(step: int, settings: ControllerSettings) -> float:
+def epsilon(step: int, settings: GreedySettings) -> float:
     """Exploration probability at real step ``step``: equation 3.3, from the maximum down to the minimum."""
     span = settings.epsilon_max - settings.epsilon_min
     return settings.epsilon_min + span * math.exp(-settings.epsilon_decay * step)
@@ -166,8 +167,14 @@ class DQN:
         self.rng.bit_generator.state, self.steps = values["exploration"], values["steps"]
 
 
-def make(context: AgentContext) -> DQN:
-    """The ``dqn`` agent."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+def build(hyperparameters: Hyperparameters[DQNSettings], context: AgentContext) -> DQN:
+    """A DQN with its settings from one of the tables of :mod:`.dqn_settings`."""
+    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
     device = prepare_torch(context.device)
     return DQN(load_perception(context), context.n_actions, settings, context.seeds, device)
+
+
+make = partial(build, HYPERPARAMETERS)
+"""The ``dqn`` agent."""
+make_more_updates = partial(build, MORE_UPDATES)
+"""The control ``dqn_more_updates``; see :data:`.dqn_settings.MORE_UPDATES`."""

@@ -22,18 +22,11 @@ from .settings import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControllerSettings:
-    """The action-value network, its updates and its exploration (thesis 5.2.2), which must not rise."""
+class GreedySettings:
+    """How an epsilon-greedy agent values and explores (thesis 5.2.2); exploration must not rise."""
 
-    hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
-    learning_rate: float = setting(1e-3, POSITIVE)
-    batch_size: int = setting(64, COUNT)  #: transitions an update, real or imagined
-    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: updates on real transitions a real step, N_R
     #: Gamma in [0, 1], a macro-action. The thesis gives none; see docs/explanation/deviations.md.
     discount: float = setting(0.95, PROBABILITY)
-    #: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no target network
-    #: (thesis).
-    target_rate: float = setting(1.0, RATE)
     #: Exploration probability in the limit; ``epsilon_max`` that at step 0.
     epsilon_min: float = setting(0.001, PROBABILITY)
     epsilon_max: float = setting(0.8, PROBABILITY)
@@ -45,6 +38,19 @@ class ControllerSettings:
                 f"controller.epsilon_min {self.epsilon_min} is above controller.epsilon_max {self.epsilon_max}: "
                 "exploration would rise. Set it to that or less."
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerSettings(GreedySettings):
+    """The action-value network, its updates and its exploration (thesis 5.2.2)."""
+
+    hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
+    learning_rate: float = setting(1e-3, POSITIVE)
+    batch_size: int = setting(64, COUNT)  #: transitions an update, real or imagined
+    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: updates on real transitions a real step, N_R
+    #: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no target network
+    #: (thesis).
+    target_rate: float = setting(1.0, RATE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +80,28 @@ FAST_5: dict[str, Override] = {
     "controller.epsilon_decay": Override(0.003, "0.03 ends exploration after 100 episodes: 13 points less (factors)"),
 }
 
-HYPERPARAMETERS = Hyperparameters(
-    {
-        "chapter_3": ConfigGroup(
-            DQNSettings(controller=CONTROLLER_3), {"minimal": FAST_3, "fast": FAST_3, "published": {}}
-        ),
-        "chapter_5": ConfigGroup(DQNSettings(), {"minimal": FAST_5, "fast": FAST_5, "published": {}}),
-    }
+_Sets = dict[str, dict[str, Override]]
+_SETS_3: _Sets = {"minimal": FAST_3, "fast": FAST_3, "published": {}}
+_SETS_5: _Sets = {"minimal": FAST_5, "fast": FAST_5, "published": {}}
+
+
+def _hyperparameters(sets_3: _Sets, sets_5: _Sets) -> Hyperparameters[DQNSettings]:
+    """Those of a DQN with these sets of either chapter."""
+    published_3 = DQNSettings(controller=CONTROLLER_3)
+    return Hyperparameters(
+        {"chapter_3": ConfigGroup(published_3, sets_3), "chapter_5": ConfigGroup(DQNSettings(), sets_5)}
+    )
+
+
+def _with_updates(sets: _Sets, **updates: int) -> _Sets:
+    """The sets, with N_R + N_I updates a real step by name of a set."""
+    reason = "as many updates of the controller as the agent imagination makes once it imagines, N_R + N_I"
+    return {name: {**sets[name], "controller.updates_per_step": Override(updates[name], reason)} for name in sets}
+
+
+HYPERPARAMETERS = _hyperparameters(_SETS_3, _SETS_5)
+MORE_UPDATES = _hyperparameters(
+    _with_updates(_SETS_3, minimal=2, fast=2, published=2), _with_updates(_SETS_5, minimal=5, fast=5, published=2)
 )
+"""Of the control ``dqn_more_updates``: as many updates a real step as ``imagination`` makes of its controller once it
+imagines, one on real transitions and N_I on imagined ones (four at ``fast`` and ``minimal`` of chapter 5, else one)."""

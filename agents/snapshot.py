@@ -65,7 +65,7 @@ def jsonable(values: dict[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(values))
 
 
-_ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/")
+_ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/", "table/")
 
 
 def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = ("filtered", "settings")) -> None:

@@ -63,6 +63,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }  # fmt: skip
 
+_COUNT_TABLE_SETTINGS = "imagine_bench.agents.count_table.settings:HYPERPARAMETERS"
 _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
 AGENTS: dict[str, AgentEntry] = {
@@ -116,6 +117,21 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty", title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
+    ),
+    "dqn_more_updates": AgentEntry(
+        make="imagine_bench.agents.dqn:make_more_updates", settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
+        title="DQN, more updates",
+        description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
+    ),
+    "count_table": AgentEntry(
+        make="imagine_bench.agents.count_table.agent:make", encoder_kind="codes", settings=_COUNT_TABLE_SETTINGS,
+        description="A control: counts what followed each action in each code of a frame, and plans by value "
+        "iteration; explores by chance as DQN does.",
+    ),
+    "count_table_directed": AgentEntry(
+        make="imagine_bench.agents.count_table.agent:make_directed", encoder_kind="codes",
+        settings=_COUNT_TABLE_SETTINGS, title="count table, directed",
+        description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
     ),
 }  # fmt: skip
 

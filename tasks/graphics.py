@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import ctypes.util
+import functools
+import importlib.util
 import os
 import sys
+from pathlib import Path
 
 from imagine_bench.errors import SetupError
 
@@ -31,3 +36,18 @@ def choose_platform() -> None:
         raise SetupError("MUJOCO_GL is 'osmesa', but libOSMesa is not installed; install it or unset MUJOCO_GL.")
     os.environ["MUJOCO_GL"] = chosen or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    _load_triton()
+
+
+@functools.cache
+def _load_triton() -> None:
+    """Load the LLVM of triton, which CUDA builds of torch bring, before the one that Mesa draws with.
+
+    Mesa shares its symbols with whatever is loaded later: an optimiser of torch, which imports triton, would end the
+    process. Loading takes 0.03 s; it is too late where somebody has drawn before.
+    """
+    found = importlib.util.find_spec("triton")
+    if found is not None and found.origin and "LLVM" not in Path("/proc/self/maps").read_text():
+        for library in Path(found.origin).parent.glob("_C/libtriton*.so"):
+            with contextlib.suppress(OSError):  # of another platform, or damaged: torch says so where it needs it
+                ctypes.CDLL(str(library))

@@ -11,15 +11,12 @@ import atexit
 import contextlib
 import copy
 import ctypes
-import functools
-import importlib.util
 import os
 import sys
 import threading
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -53,23 +50,8 @@ class View:
     sky: bool = False  # whether to draw the skybox
 
 
-@functools.cache
-def _load_triton() -> None:
-    """Load the LLVM of triton, which CUDA builds of torch bring, before the one that Mesa draws with.
-
-    Mesa shares its symbols with whatever is loaded later: an optimiser of torch, which imports triton, would end the
-    process. Loading takes 0.03 s; too late where somebody has drawn before.
-    """
-    found = importlib.util.find_spec("triton") if sys.platform == "linux" else None
-    if found is not None and found.origin and "LLVM" not in Path("/proc/self/maps").read_text():
-        for library in Path(found.origin).parent.glob("_C/libtriton*.so"):
-            with contextlib.suppress(OSError):  # of another platform or damaged: torch will say so where it needs it
-                ctypes.CDLL(str(library))
-
-
 def _new_gl_context(width: int, height: int) -> Any:
     """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one."""
-    _load_triton()
     try:
         if sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl":
             from mujoco.egl import GLContext  # noqa: PLC0415  (also where MuJoCo was imported before we chose)

@@ -6,19 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
-from ..encoders.encoder import Encoder
-from ..encoders.perception import load_perception, prepare_torch
+from ..encoders.perception import prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .exploration import last_step, query
 from .factors import Code, CodeReplay, CodeTransition
 from .model import FactoredModel
-from .perception import CodePerception, ImaginedStep
+from .perception import CodePerception, ImaginedStep, load_code_perception
 from .planner import Planner
 from .settings import HYPERPARAMETERS, FactoredSettings
 
@@ -32,10 +30,10 @@ _TIE = 1e-9
 class FactoredAgent:
     """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
-    def __init__(self, encoder: Encoder, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
+    def __init__(self, perception: CodePerception, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
         self.n_actions, self.settings = n_actions, settings
         self.rng = seeds.child("exploration").generator()
-        self.perception = CodePerception(encoder, factored=settings.dynamics.factored)
+        self.perception = perception
         self.replay = CodeReplay(len(self.perception.sizes))
         self.meters = Meters()
         self._reset_model()
@@ -203,10 +201,5 @@ def make(context: AgentContext) -> FactoredAgent:
     """The ``factored`` agent; InvalidValueError if the context's encoder gives no codes."""
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
     prepare_torch(context.device)
-    encoder = load_perception(context).encoder
-    if not encoder.card.code_sizes:
-        raise InvalidValueError(
-            f"Agent 'factored' reads codes of factors, and encoder {encoder.card.recipe.name!r} gives continuous "
-            "latents; give one made with `imagine-bench encoder --recipe codes`."
-        )
-    return FactoredAgent(encoder, context.n_actions, settings, context.seeds)
+    perception = load_code_perception(context, factored=settings.dynamics.factored)
+    return FactoredAgent(perception, context.n_actions, settings, context.seeds)

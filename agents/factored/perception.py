@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from imagine_bench.capabilities import ImaginedRollout
-from imagine_bench.interfaces import Floats, Frame
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, Floats, Frame
 
 from ..encoders.encoder import Encoder
+from ..encoders.perception import load_perception
 from .factors import Code
 
 ACCEPTED = 0.5
@@ -85,3 +87,14 @@ class CodePerception:
             accepted=np.logical_and.accumulate(unknown <= ACCEPTED),
             macrostates=self.macrostates(codes[1:]),
         )
+
+
+def load_code_perception(context: AgentContext, *, factored: bool) -> CodePerception:
+    """The perception of an agent that reads codes; InvalidValueError if the context's encoder gives none."""
+    encoder = load_perception(context).encoder
+    if not encoder.card.code_sizes:
+        raise InvalidValueError(
+            f"This agent reads codes of factors, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
+            "give one made with `imagine-bench encoder --recipe codes`."
+        )
+    return CodePerception(encoder, factored=factored)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from imagine_bench.agents.imagination.settings import Settings
 from imagine_bench.agents.regressors import settings as regressor_settings
-from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten
+from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten, replaced
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -240,3 +240,14 @@ def test_an_unknown_set_lists_what_exists() -> None:
 def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
     with pytest.raises((InvalidValueError, UnknownNameError), match=message):
         resolve("fast", {name: value})
+
+
+@pytest.mark.parametrize("group", CONFIG_GROUPS)
+@pytest.mark.parametrize("name", SETS)
+def test_more_updates_are_those_of_imagination(group: str, name: str) -> None:
+    """Real and imagined updates together; all else is the DQN's."""
+    more, plain, imagining = (
+        ALL[agent].resolve(name, {}, group) for agent in ("dqn_more_updates", "dqn", "imagination")
+    )
+    as_many = imagining.controller.updates_per_step + imagining.imagination.updates_per_step
+    assert more == replaced(plain, {"controller.updates_per_step": as_many})

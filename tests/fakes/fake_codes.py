@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from imagine_bench.agents.factored.agent import FactoredAgent
+from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS
 from torch.nn import functional
 
@@ -78,7 +79,8 @@ def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
     settings = HYPERPARAMETERS.resolve(
         "fast", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5"
     )
-    return FactoredAgent(FakeCodes(), ACTIONS, settings, SeedTree(seed))  # type: ignore[arg-type]
+    perception = CodePerception(FakeCodes(), factored=settings.dynamics.factored)  # type: ignore[arg-type]
+    return FactoredAgent(perception, ACTIONS, settings, SeedTree(seed))
 
 
 def live(learner: FactoredAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
