@@ -68,12 +68,7 @@ class PhysicsSettings:
 
     @classmethod
     def of(cls, given: PhysicsSettings | Mapping[str, Any]) -> PhysicsSettings:
-        """From settings, or a mapping of some fields' names to values.
-
-        Raises:
-            InvalidValueError: Neither, or a number out of its range.
-            UnknownNameError: An unknown field or ``sense``.
-        """
+        """From settings, or a mapping of some fields' names to values; errors as above, and for an unknown name."""
         if isinstance(given, PhysicsSettings):
             return given
         if not isinstance(given, Mapping):

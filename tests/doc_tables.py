@@ -364,26 +364,18 @@ def speed(machine: str, what: str) -> str:
     return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
 
 
-def margin(task: str, setting: str, value: str = "") -> str:
-    """Macro-actions as ruled at a value of a setting, %: [95 %, Wilson]; without a value, the value as built."""
+def margin(task: str, setting: str, value: str) -> str:
+    """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
     points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
-    point = points[value] if value else next(iter(points.values()))
+    point = points[value]
     return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
 
 
-def margin_ends(task: str, setting: str) -> str:
-    """From where on under 99 %, and from where on under 1 %, of macro-actions end as ruled."""
-    points = _json(f"margins/{task}.json")["curves"][setting]
-    shares = [(point["value"], point["as_ruled"] / point["trials"]) for point in points]
-    return "; ".join(next((f"{value:g}" for value, share in shares if share < bound), "–") for bound in (0.99, 0.01))
-
-
 def walked(task: str, sense: str) -> str:
-    """Macro-actions as ruled without a reset, walks that failed, and the furthest drift of an object."""
+    """Macro-actions as ruled without a reset; furthest drift of an object; every length where a fault ended a walk."""
     (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
-    lengths = found["lengths"]
     text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
-    return f"{text}; failed at the {', '.join(map(str, lengths))}th" if found["faults"] else text
+    return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
 
 
 _TASK = "arrow_puzzle: "
@@ -409,7 +401,7 @@ CELLS: dict[str, Callable[..., str]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, margin, margin_ends, walked, goals_and_starts, chance_exact, shortest,
+        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest,
     )
 }  # fmt: skip
 

@@ -127,7 +127,7 @@ def margins() -> None:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     every[0].set_ylabel("macro-actions as ruled (%)")
-    every[0].legend(loc="lower right", frameon=False)
+    every[-1].legend(loc="center left", frameon=False)
     figure.savefig(HERE / "margins.png", dpi=110)
 
 

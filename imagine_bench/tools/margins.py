@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry, statistics
 from imagine_bench.errors import DivergedError, InvalidValueError
@@ -27,19 +26,8 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 """Values of each setting, the first as built. Beyond 45 degrees a cube looks as if turned the other way."""
 _WALKS, _WALK_ACTIONS = 5, 200
-
-
-@dataclass
-class Walks:
-    """Macro-actions without a reset, so that errors accumulate."""
-
-    sense: str  #: as in PhysicsSettings
-    actions: int = 0  #: macro-actions done
-    as_ruled: int = 0  #: how many ended as the rules say, without a fault
-    #: macro-actions of each walk, the one that failed and ended it included
-    lengths: list[int] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)  #: why walks ended early
-    drift_mm: float = 0.0  #: the furthest that a standing object came from where it stood at first
+_STANDS_M = 0.02
+"""An object so near to its first height stands."""
 
 
 def measure_margins(task: str, out: Path, trials: int = 200, show: Callable[[str], None] = print) -> None:
@@ -48,20 +36,11 @@ def measure_margins(task: str, out: Path, trials: int = 200, show: Callable[[str
     A trial is one macro-action from a start that moves an object if it succeeds. The same starts, actions and seeds
     serve every value.
 
-    Args:
-        task: Name of a task with targets.
-        out: The JSON file to write.
-        trials: Macro-actions of each value.
-        show: Takes one line of text.
-
     Raises:
-        InvalidValueError: A task without targets, or no trials.
-        SetupError: The file cannot be written.
+        InvalidValueError: No trials.
+        SetupError: The file ``out`` cannot be written.
     """
     spec = registry.task(task)
-    if spec.targets is None:
-        known = [name for name in registry.TASKS if registry.task(name).targets is not None]
-        raise InvalidValueError(f"The margins of {task} are those of its family; give one of {', '.join(known)}.")
     if trials < 1:
         raise InvalidValueError(f"trials is {trials}; give at least 1 macro-action a value.")
     require_writable(out.parent)
@@ -76,9 +55,8 @@ def measure_margins(task: str, out: Path, trials: int = 200, show: Callable[[str
             show(f"| {name} | {value:g} | {right} of {trials} | {low:.3f} to {high:.3f} |")
     walks = [walk(spec, sense) for sense in SENSES]
     for each in walks:
-        show(f"| sense | {each.sense} | {each.as_ruled} of {each.actions} | {len(each.faults)} faults |")
-    built = {each.name: each.default for each in fields(PhysicsSettings)}
-    kept = {"task": task, "trials": trials, "seed": 0, "built": built, "curves": curves, "walks": [*map(asdict, walks)]}
+        show(f"| sense | {each['sense']} | {each['as_ruled']} of {each['actions']} | {len(each['faults'])} faults |")
+    kept = {"task": task, "seed": 0, "built": asdict(PhysicsSettings()), "curves": curves, "walks": walks}
     write_json(out, {**kept, "environment": describe_environment()})
 
 
@@ -99,27 +77,31 @@ def as_ruled(spec: TaskSpec, settings: PhysicsSettings, trials: int) -> int:
     return right
 
 
-def walk(spec: TaskSpec, sense: str) -> Walks:
-    """Walk at random among actions that move an object and leave one to move; a fault ends a walk."""
-    env, found = _env(spec, PhysicsSettings(sense=sense)), Walks(sense=sense)
-    rng = SeedTree(0).child("margins", "walk", spec.id).generator()
+def walk(spec: TaskSpec, sense: str) -> dict[str, Any]:
+    """Walk at random, without a reset, among actions that move an object and leave one to move; a fault ends a walk.
+
+    Returns:
+        The sense; macro-actions done, and as ruled; of each walk its length and what ended it early; and in mm the
+        furthest that a standing object came from where it stood at first.
+    """
+    env, rng = _env(spec, PhysicsSettings(sense=sense)), SeedTree(0).child("margins", "walk", spec.id).generator()
+    lengths, faults, drift_m = [], [], 0.0
     for number in range(_WALKS):
         _, info = env.reset(seed=episode_seed("tuning", 1, number))
-        state, at_first, length = tuple(info["macrostate"].tolist()), _positions_m(env, spec), 0
-        while length < _WALK_ACTIONS:
+        at_first, length = env.world.object_poses(), 0
+        while length < _WALK_ACTIONS and not info["fault"]:
+            state = tuple(info["macrostate"].tolist())
             going_on = [a for a in _moves(spec, state) if all(_moves(spec, then) for then in _after(spec, state, a))]
             *_, info = env.step(int(rng.choice(going_on)))
-            state, length = tuple(info["macrostate"].tolist()), length + 1
-            found.actions, found.as_ruled = found.actions + 1, found.as_ruled + (not info["fault"])
-            if info["fault"]:
-                found.faults.append(info["fault_reason"])
-                break
-            off_m = _positions_m(env, spec) - at_first
-            standing = np.abs(off_m[:, 2]) < 0.02  # [N]
-            found.drift_mm = max(found.drift_mm, 1e3 * float(np.linalg.norm(off_m[standing, :2], axis=1).max()))
-        found.lengths.append(length)
+            length += 1
+            off_m = env.world.object_poses() - at_first  # [N, 7]
+            standing = (np.abs(off_m[:, 2]) < _STANDS_M) & (not info["fault"])  # [N]
+            drift_m = max(drift_m, float(np.linalg.norm(off_m[standing, :2], axis=1).max(initial=0.0)))
+        lengths.append(length)
+        faults += [info["fault_reason"]] if info["fault"] else []
     env.close()
-    return found
+    done = {"sense": sense, "actions": sum(lengths), "as_ruled": sum(lengths) - len(faults)}
+    return {**done, "lengths": lengths, "faults": faults, "drift_mm": 1e3 * drift_m}
 
 
 def _env(spec: TaskSpec, settings: PhysicsSettings) -> Any:
@@ -131,14 +113,6 @@ def _after(spec: TaskSpec, state: State, action: int) -> list[State]:
 
 
 def _moves(spec: TaskSpec, state: State) -> Sequence[int]:
-    """Actions that change an object's coordinate, whatever people answer."""
-    assert spec.targets is not None
-    n = len(spec.targets.objects)
+    """Actions that change an object's coordinate, whatever people answer; people's is the last one."""
+    n = len(state) - 1
     return [a for a in range(spec.n_actions) if all(then[:n] != state[:n] for then in _after(spec, state, a))]
-
-
-def _positions_m(env: Any, spec: TaskSpec) -> NDArray[np.float64]:
-    """Where the objects are now. Shape (N, 3)."""
-    assert spec.targets is not None
-    motion = env.motion()
-    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in spec.targets.objects], :3])

@@ -129,7 +129,7 @@ def test_blind_moves_work_from_good_places(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_errors_do_not_accumulate_where_poses_are_measured(task):
     found = walk(registry.task(task), "true")
-    assert found.as_ruled == found.actions == 1000
+    assert found["as_ruled"] == found["actions"] == 1000
 
 
 # --- clearance ---------------------------------------------------------------------------------------------------
