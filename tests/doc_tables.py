@@ -173,8 +173,10 @@ def iqm(budget: str, where: str) -> str:
     return interval(statistics.iqm(values), *statistics.interval(values, trials=trials(budget, where)))
 
 
-def ahead(budget: str, treated: str, base: str) -> list[Compared]:
-    """The same; bold where it is ahead of the base."""
+def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
+    """The same; bold where it is ahead of the base. The base itself, and who does not learn, are not tested."""
+    if treated == base or not registry.agent_entry(treated.rpartition("/")[2]).learns:
+        return iqm(budget, treated)
     pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
     return [_compared(iqm(budget, treated), *pair, tests, only_ahead=True)]
 
@@ -441,6 +443,20 @@ def speed(machine: str, what: str) -> str:
     return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
 
 
+def margin(task: str, setting: str, value: str) -> str:
+    """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
+    points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
+    point = points[value]
+    return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
+
+
+def walked(task: str, sense: str) -> str:
+    """Macro-actions as ruled without a reset; furthest drift of an object; every length where a fault ended a walk."""
+    (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
+    text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
+    return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
+
+
 _TASK = "arrow_puzzle: "
 
 
@@ -464,7 +480,7 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
+        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
     )
 }  # fmt: skip
 
