@@ -12,7 +12,7 @@ import tyro
 from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
 from imagine_bench.cli.benches import Bench, List, Report, Study, parse_settings
-from imagine_bench.cli.tools import Doctor, Encoder, Film, Speed, View
+from imagine_bench.cli.tools import Doctor, Encoder, Film, Margins, Speed, View
 from imagine_bench.errors import ImagineBenchError
 
 __all__ = ["INTERRUPTED", "main", "parse_settings"]
@@ -20,7 +20,7 @@ __all__ = ["INTERRUPTED", "main", "parse_settings"]
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
-Command = Bench | Report | Plan | Generalise | Policy | Study | View | Encoder | Film | Speed | Doctor | List
+Command = Bench | Report | Plan | Generalise | Policy | Study | View | Encoder | Film | Speed | Margins | Doctor | List
 
 
 def main(words: Sequence[str] | None = None) -> int:
