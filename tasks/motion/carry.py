@@ -29,7 +29,6 @@ _PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
 _LOST_M = 0.003
 """Fingers that close so much further than the object is wide have lost it."""
 _MAX_TILT_RAD = math.radians(12)
-_HALF_TURN_RAD = math.pi
 
 
 class CarryExecutor:
