@@ -175,3 +175,10 @@ def test_gain_over_nothing_is_not_a_number() -> None:
 def test_scores_must_be_numbers(scores: list[float]) -> None:
     with pytest.raises(InvalidValueError, match="only finite ones"):
         statistics.iqm(scores)
+
+
+def test_a_success_that_is_lost_again_does_not_last() -> None:
+    budgets = (10, 20, 40, 80)
+    assert statistics.first_lasting(budgets, [0.9, 0.2, 0.1, 0.95], 0.9) == 80
+    assert statistics.first_lasting(budgets, [0.2, 0.9, 0.1, 0.1], 0.9) is None
+    assert statistics.first_lasting(budgets, [0.2, 0.9, 0.95, 0.9], 0.9) == 20

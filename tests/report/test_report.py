@@ -26,6 +26,7 @@ from imagine_bench.report.data import _nan_mean, collect
 from imagine_bench.report.sections.imagination import encoder_views
 from imagine_bench.report.sections.success import gain
 from imagine_bench.report.text import percent, signed_percent
+from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult
 
 
@@ -442,3 +443,52 @@ def test_no_two_registered_agents_share_a_color() -> None:
 def test_infinite_uncertainty_stays_and_unknown_is_left_out() -> None:
     table = np.array([[1.0, np.inf, np.nan, np.nan], [3.0, 2.0, 4.0, np.nan]])
     np.testing.assert_array_equal(_nan_mean(table), [2.0, np.inf, 4.0, np.nan])
+
+
+def _with(result: BenchResult, agent: str, shares: list[float], diagnostics: list[dict[str, float]]) -> BenchResult:
+    """The result, in which each seed of an agent always succeeds in a given share of tests and says something."""
+    values = iter(zip(shares, diagnostics, strict=True))
+    runs = []
+    for run in result.runs:
+        if run.agent == agent:
+            share, said = next(values)
+            rows = [
+                dataclasses.replace(row, successes=round(share * row.test_episodes), diagnostics=said)
+                for row in run.checkpoints
+            ]
+            run = dataclasses.replace(run, checkpoints=tuple(rows))  # noqa: PLW2901
+        runs.append(run)
+    return dataclasses.replace(result, runs=tuple(runs))
+
+
+def test_acceptance_is_the_mean_over_seeds(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1, 2))
+    said = [{"imagination/acceptance_rate": rate} for rate in (0.2, 0.9, 0.4)]
+    data = collect(_with(bench_result(tmp_path, protocol=protocol), "imagination_uncertainty", [0.5] * 3, said))
+    assert data.acceptance["imagination_uncertainty"] == pytest.approx(dict.fromkeys(protocol.budgets, 0.5))
+
+
+def test_the_area_begins_at_the_chance_level(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1))
+    data = collect(_with(bench_result(tmp_path, protocol=protocol), "dqn", [1.0, 1.0], [{}, {}]))
+    chance, first = data.facts.chance_level, protocol.budgets[0]
+    assert 0.0 < chance < 0.2
+    assert data.areas["dqn"][first].value == pytest.approx((chance + 1.0) / 2.0)
+    last = protocol.budgets[-1]
+    assert data.areas["dqn"][last].value == pytest.approx(1.0 - (1.0 - chance) / 2.0 * first / last)
+
+
+def test_an_interval_that_touches_zero_shows_no_difference(result: BenchResult) -> None:
+    def say(low: float, high: float) -> str:
+        data = collect(result)
+        rows = data.comparisons["imagination"]
+        row = dataclasses.replace(rows[data.decisive_budget], difference=Estimate(0.1, low, high))
+        changed = {**data.comparisons, "imagination": dict.fromkeys(rows, row)}
+        answers = words.answers(dataclasses.replace(data, comparisons=changed))
+        return next(answer for answer in answers if answer.startswith("“imagination” "))
+
+    for low, high in [(0.0, 0.2), (-0.2, 0.0), (0.0, 0.0)]:
+        said = say(low, high)
+        assert "no difference is shown" in said and "does the interval exclude zero" in said
+        assert "ahead" not in said and "behind" not in said
+    assert "ahead" in say(0.001, 0.2) and "behind" in say(-0.2, -0.001)
