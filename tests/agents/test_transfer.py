@@ -61,7 +61,9 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
     assert learner.model.outcomes.causes is None
     assert not learner.q_values(Observation(frame=frame((0, 1, 0)))).any(), "nothing is known of the new task"
     measured = learner.diagnostics()
-    assert set(measured) == {"real_transitions", "oracle/labels", "model/outcomes"}, "nothing yet of this task"
+    assert set(measured) == {"real_transitions", "gradient_updates", "oracle/labels", "model/outcomes"}, (
+        "nothing yet of this task"
+    )
     assert measured["real_transitions"] == 0
 
 

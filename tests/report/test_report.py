@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fake_results import bench_result, compared_rollout
 
-from imagine_bench import reference, registry
+from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.judge import filmstrips
 from imagine_bench.protocols.control import Protocol
@@ -478,17 +478,19 @@ def test_the_area_begins_at_the_chance_level(tmp_path: Path) -> None:
     assert data.areas["dqn"][last].value == pytest.approx(1.0 - (1.0 - chance) / 2.0 * first / last)
 
 
-def test_an_interval_that_touches_zero_shows_no_difference(result: BenchResult) -> None:
-    def say(low: float, high: float) -> str:
+def test_a_p_value_of_just_5_percent_shows_no_difference(result: BenchResult) -> None:
+    def say(value: float, p_adjusted: float) -> str:
         data = collect(result)
         rows = data.comparisons["imagination"]
-        row = dataclasses.replace(rows[data.decisive_budget], difference=Estimate(0.1, low, high))
+        row = dataclasses.replace(
+            rows[data.decisive_budget], difference=Estimate(value, value - 0.1, value + 0.1), p_adjusted=p_adjusted
+        )
         changed = {**data.comparisons, "imagination": dict.fromkeys(rows, row)}
         answers = words.answers(dataclasses.replace(data, comparisons=changed))
         return next(answer for answer in answers if answer.startswith("“imagination” "))
 
-    for low, high in [(0.0, 0.2), (-0.2, 0.0), (0.0, 0.0)]:
-        said = say(low, high)
-        assert "no difference is shown" in said and "does the interval exclude zero" in said
+    for value in (0.2, -0.2):
+        said = say(value, 1.0 - statistics.LEVEL)
+        assert said.count("no difference is shown") == 1 and "is a difference shown" in said
         assert "ahead" not in said and "behind" not in said
-    assert "ahead" in say(0.001, 0.2) and "behind" in say(-0.2, -0.001)
+    assert say(0.2, 0.049).count("ahead") == 2 and say(-0.2, 0.049).count("behind") == 2

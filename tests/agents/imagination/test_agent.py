@@ -255,13 +255,15 @@ def test_diagnostics_are_means_since_the_last_call(monkeypatch: pytest.MonkeyPat
     names = {f"loss/{name}" for name in ("dynamics", "reward", "termination", "bellman")}
     names |= {f"time/{name}_s" for name in ("model", "controller", "imagination")}
     names |= {"imagination/acceptance_rate", "imagination/mean_depth", "epsilon"}
-    assert set(read) == names | {"real_transitions", "imagined_transitions"}
+    assert set(read) == names | {"real_transitions", "gradient_updates", "imagined_transitions"}
     assert read["real_transitions"] == 8.0
     assert read["imagination/acceptance_rate"] == 1.0
     steps, rollouts, depth = 4, 3, 3
+    every = agent.settings.controller.updates_per_step + agent.settings.model.updates_per_step
+    assert read["gradient_updates"] == 8 * every + steps * agent.settings.imagination.updates_per_step
     assert rollouts <= read["imagined_transitions"] / steps <= rollouts * depth
     assert read["imagination/mean_depth"] == pytest.approx(read["imagined_transitions"] / (steps * rollouts))
-    assert set(agent.diagnostics()) == {"epsilon", "real_transitions", "imagined_transitions"}
+    assert set(agent.diagnostics()) == {"epsilon", "real_transitions", "gradient_updates", "imagined_transitions"}
 
 
 def test_a_dqn_beats_chance_on_a_small_contextual_task(monkeypatch: pytest.MonkeyPatch) -> None:
