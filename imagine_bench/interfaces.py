@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.seeding import SeedTree
 
 Frame = NDArray[np.uint8]  #: what the agent sees. Shape (64, 64, 3), upright, RGB.
@@ -24,7 +25,58 @@ Floats = NDArray[np.float64]
 
 APPEARANCES = ("clean", "mild", "strong")
 EXECUTIONS = ("physics", "kinematic")
+SENSES = ("true", "nominal")
 DEVICES = ("cpu", "cuda")
+
+
+PHYSICS_RANGES: Mapping[str, tuple[float, float]] = {
+    "pad_friction": (0.0, 10.0),
+    "finger_force_n": (0.0, 100.0),
+    "object_mass": (0.01, 100.0),
+    "plan_error_mm": (0.0, 100.0),
+    "plan_error_deg": (0.0, 90.0),
+}
+"""Lowest and highest value of each number in :class:`PhysicsSettings`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsSettings:
+    """What decides whether a grasp holds. The defaults are the scene as it is built, to the bit.
+
+    Errors of the planner are drawn from the environment's generator, anew for each macro-action and only where they
+    are not 0. How far each may go is measured by ``imagine-bench margins``.
+
+    Raises:
+        InvalidValueError: A number out of its range in :data:`PHYSICS_RANGES`.
+        UnknownNameError: An unknown ``sense``.
+    """
+
+    pad_friction: float = 1.2  #: sliding friction coefficient of the fingertips; that against twisting in proportion
+    finger_force_n: float = 30.0  #: the most that each finger's servo exerts, N; a grip asks for 12 to 13 N
+    object_mass: float = 1.0  #: times the mass of every loose object
+    plan_error_mm: float = 0.0  #: the planner takes the object to be so far aside, mm, in a direction that is drawn
+    plan_error_deg: float = 0.0  #: and turned by so much about the vertical, degrees, to a side that is drawn
+    #: the planner uses true poses of objects, or ("nominal") where a perfect execution would have left them
+    sense: str = SENSES[0]
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in PHYSICS_RANGES.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+                raise InvalidValueError(f"Physics setting {name} is {value!r}; give a number from {low:g} to {high:g}.")
+        require_known("sense", self.sense, SENSES)
+
+    @classmethod
+    def of(cls, given: PhysicsSettings | Mapping[str, Any]) -> PhysicsSettings:
+        """From settings, or a mapping of some fields' names to values; errors as above, and for an unknown name."""
+        if isinstance(given, PhysicsSettings):
+            return given
+        if not isinstance(given, Mapping):
+            raise InvalidValueError(f"Physics {given!r} is no mapping; give some of {', '.join(cls.__annotations__)}.")
+        for name in given:
+            if name not in cls.__annotations__:
+                raise UnknownNameError("physics setting", name, cls.__annotations__)
+        return cls(**given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, Shape3D, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 
 from .motion.executor import MacroResult
 from .rendering import Renderer, View
@@ -60,10 +60,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render`, by name.
+        physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
 
     Raises:
-        UnknownNameError: An unknown execution, appearance, render mode or camera.
-        InvalidValueError: An image size out of range.
+        UnknownNameError: An unknown execution, appearance, render mode, camera or physics setting.
+        InvalidValueError: An image size or a physics setting out of range.
 
     Version History: v0, the first.
     """
@@ -81,6 +82,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
+        physics: PhysicsSettings | Mapping[str, Any] = PhysicsSettings(),  # noqa: B008 - frozen
     ) -> None:
         modes = self.metadata["render_modes"]
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
@@ -88,7 +90,9 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
+        settings = PhysicsSettings.of(physics)
         self.world = make_world(appearance_level(appearance))
+        self.world.set_physics(settings)
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._agent_camera = agent_camera(self.world.model)
@@ -135,6 +139,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
+        self.world.sensing.draw(self.np_random)
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()

@@ -11,9 +11,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.interfaces import PhysicsSettings
+
 from .motion import orientation
 from .motion.executor import MacroResult, at_rest
+from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler
+from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
 
 MAX_TILT_RAD = math.radians(10.0)
@@ -46,6 +50,8 @@ class World(abc.ABC):
         self, model: mujoco.MjModel, level: Appearance, *, objects: Mapping[str, str], materials: tuple[str, ...]
     ) -> None:
         self.model, self.data = model, mujoco.MjData(model)
+        self.sensing = Sensing()
+        self._bodies = [model.body(body).id for body in objects]
         self._level, self._names = level, tuple(objects.values())
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
@@ -53,6 +59,20 @@ class World(abc.ABC):
         self._rest_qpos, self._rest_ctrl = at_rest(model)
         self.data.qpos[:] = self._rest_qpos
         self.update()
+
+    def set_physics(self, settings: PhysicsSettings) -> None:
+        """Change what decides whether a grasp holds; once, before the first macro-action."""
+        self.sensing.settings, model, built = settings, self.model, PhysicsSettings()
+        if settings.pad_friction != built.pad_friction:
+            tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
+            model.geom_friction[tips, :2] *= settings.pad_friction / built.pad_friction
+        for name in FINGER_JOINTS:
+            force_range = (-settings.finger_force_n, settings.finger_force_n)
+            model.actuator_forcerange[model.actuator(name.replace("_slide", "_servo")).id] = force_range
+        if settings.object_mass != built.object_mass:
+            model.body_mass[self._bodies] *= settings.object_mass
+            model.body_inertia[self._bodies] *= settings.object_mass
+            mujoco.mj_setConst(model, mujoco.MjData(model))
 
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""

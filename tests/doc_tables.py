@@ -364,6 +364,20 @@ def speed(machine: str, what: str) -> str:
     return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
 
 
+def margin(task: str, setting: str, value: str) -> str:
+    """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
+    points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
+    point = points[value]
+    return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
+
+
+def walked(task: str, sense: str) -> str:
+    """Macro-actions as ruled without a reset; furthest drift of an object; every length where a fault ended a walk."""
+    (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
+    text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
+    return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
+
+
 _TASK = "arrow_puzzle: "
 
 
@@ -387,7 +401,7 @@ CELLS: dict[str, Callable[..., str]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, goals_and_starts, chance_exact, shortest,
+        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest,
     )
 }  # fmt: skip
 

@@ -1,6 +1,7 @@
 """Draws the plots of the pages from docs/results: ``python docs/img/draw.py``."""
 
 import csv
+import json
 from pathlib import Path
 
 import matplotlib as mpl
@@ -101,7 +102,37 @@ def mild() -> None:
     figure.savefig(HERE / "mild.png", dpi=150)
 
 
+def margins() -> None:
+    """Share of macro-actions as ruled against what decides whether a grasp holds, with Wilson's intervals."""
+    labels = {
+        "pad_friction": "friction of the fingertips",
+        "finger_force_n": "most force of a finger (N)",
+        "object_mass": "mass of an object (times)",
+        "plan_error_mm": "planner's error (mm)",
+        "plan_error_deg": "planner's error (degrees)",
+    }
+    figure, every = plt.subplots(1, len(labels), figsize=(13, 3), sharey=True, layout="constrained")
+    for axes, (name, label) in zip(every, labels.items(), strict=True):
+        for task, said, color in (("arrow_puzzle", "turning", "#0072b2"), ("pick_place", "picking", "#d55e00")):
+            points = json.loads((RESULTS / "margins" / f"{task}.json").read_text())["curves"][name]
+            values = [point["value"] for point in points]
+            axes.plot(values, [100 * point["as_ruled"] / point["trials"] for point in points], "o-", color=color,
+                      label=said, markersize=3)  # fmt: skip
+            ends = [[100 * point[end] for point in points] for end in ("low", "high")]
+            axes.fill_between(values, *ends, color=color, alpha=0.15, linewidth=0)
+        if not name.startswith("plan"):
+            axes.set_xscale("log")
+        axes.set_xlabel(label)
+        axes.set_ylim(-2, 104)
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    every[0].set_ylabel("macro-actions as ruled (%)")
+    every[-1].legend(loc="center left", frameon=False)
+    figure.savefig(HERE / "margins.png", dpi=110)
+
+
 if __name__ == "__main__":
     learning_curves()
     thesis_settings()
     mild()
+    margins()

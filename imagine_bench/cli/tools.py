@@ -100,6 +100,24 @@ class Speed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Margins:
+    """Measure how far friction, force, mass and the planner's errors may go before macro-actions fail."""
+
+    task: str
+    """Task whose scene is measured."""
+    trials: int = 200
+    """Macro-actions of each value."""
+    out: Path = Path("runs/margins.json")
+    """Where the figures are kept, with the machine's description."""
+
+    def __call__(self) -> None:
+        """Measure."""
+        from imagine_bench.tools.margins import measure_margins  # noqa: PLC0415 - nothing else needs it
+
+        measure_margins(self.task, self.out, self.trials)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Say what this machine and installation have, and in words what is wrong with them."""
 

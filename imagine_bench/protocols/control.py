@@ -67,7 +67,9 @@ class Protocol(ProtocolData):
         require_different("agents", self.agents)
         for name, least in _LEAST.items():
             if not least <= getattr(self, name) <= MOST:
-                raise InvalidValueError(f"{name} is {brief(getattr(self, name))}; give from {least} to {MOST:,}.")
+                raise InvalidValueError(
+                    f"{name} is {brief(getattr(self, name))}; give at least {least} and at most {MOST:,}."
+                )
         require_same_world(self.task, self.after)
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(

@@ -7,7 +7,7 @@ import functools
 
 import mujoco
 
-from ..scenes.arm import arm_spec
+from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.constants import SLOTS_XY_M
 from ..scenes.hand import add_pointing_hand, fingertip_m
 from ..scenes.tabletop import add_tabletop
@@ -21,6 +21,7 @@ def _compiled() -> mujoco.MjModel:
     add_tabletop(spec)
     add_cubes(spec)
     add_pointing_hand(spec, fingertip_m(SLOTS_XY_M[1]))
+    let_arm_touch(spec)
     return spec.compile()
 
 

@@ -38,7 +38,7 @@ class ArrowWorld(World):
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return TurnExecutor(self.model)
+        return TurnExecutor(self.model, self.sensing)
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""

@@ -18,6 +18,7 @@ from .arm_model import ArmModel
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
+from .sensing import Sensing
 from .trajectory import Waypoint
 
 _LIFT_M = 0.075
@@ -32,13 +33,15 @@ _HALF_TURN_RAD = math.pi
 
 
 class CarryExecutor:
-    """Carries objects by friction alone: mink plans, the servos move the arm, contact moves the object.
+    """Carries objects, which friction alone holds: mink plans, the servos move the arm, contact moves the object.
 
+    The planner knows the objects' true poses, unless ``sensing`` says otherwise.
     Every action starts and ends with the arm at its observation pose, an object that is held included: then the
     outcome is a pure function of the positions of objects, hands and fingers, and of the arguments, bit for bit.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
+        self._sensing = sensing or Sensing()
         self.executor = MacroExecutor(model)
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
@@ -49,7 +52,7 @@ class CarryExecutor:
 
     def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Lift object ``index`` from where it stands and bring it to the observation pose."""
-        spec, pose = OBJECTS[index], self._measure(data, index)
+        spec, pose = OBJECTS[index], self._measure(data, index, np.array(standing_m(index)))
         if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, None, f"the {spec.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         yaw_rad = _nearest_to_zero(pose.yaw_rad) if spec.upright else 0.0
@@ -109,7 +112,7 @@ class CarryExecutor:
         self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
     ) -> MacroResult:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
-        spec, pose = OBJECTS[index], self._measure(data, index)
+        spec, pose = OBJECTS[index], self._measure(data, index, self._rest_tcp_m)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
         turn_rad = 0.0 if yaw_rad is None or not spec.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
@@ -122,8 +125,9 @@ class CarryExecutor:
         waypoints = _waypoints(reach, spec.squeeze_m, REST_OPENING_M)
         return self._run(data, waypoints, reach, index, capture_motion_hz)[0]
 
-    def _measure(self, data: mujoco.MjData, index: int) -> ObjectPose:
-        return ObjectPose.of(data.qpos[self._qpos[index] : self._qpos[index] + 7])
+    def _measure(self, data: mujoco.MjData, index: int, nominal_m: Floats) -> ObjectPose:
+        row = self._qpos[index]
+        return self._sensing.erring(self._sensing.pose(data.qpos[row : row + 7], nominal_m))
 
     def _solve(self, place_m: Floats, yaw_rad: float, start: Reach | None) -> Reach:
         """Configurations with the tool centre point at ``place_m`` (3,), and above it."""

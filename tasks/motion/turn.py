@@ -16,6 +16,7 @@ from .arm_model import ArmModel
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
+from .sensing import Sensing
 from .trajectory import Waypoint
 
 _QUARTER_RAD = math.pi / 2
@@ -30,13 +31,20 @@ _SQUEEZE_M = 0.004
 """Each finger's command lies so far inside the cube: about 13 N."""
 _CLOSE_S, _OPEN_S, _SETTLE_S = 0.10, 0.07, 0.03
 _MAX_TILT_RAD = math.radians(10)
-_MIN_GRIP_M = CUBE_EDGE_M / 2 - _SQUEEZE_M / 2
+_SQUEEZED_M = CUBE_EDGE_M / 2 - _SQUEEZE_M
+_MISSED_M = 0.0001
+"""Fingers that come so near to their command, on the average, have nothing between them; smooth ones sink in deep."""
 
 
 class TurnExecutor:
-    """Turns the cubes of a compiled scene by friction alone: mink plans, the servos move the arm, contact the cube."""
+    """Turns the cubes of a compiled scene: mink plans, the servos move the arm, and contact alone moves the cube.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    The jaws are flat, so a cube turns with them by its shape and hardly needs friction. The planner knows the cubes'
+    true poses, unless ``sensing`` says otherwise.
+    """
+
+    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
+        self._sensing = sensing or Sensing()
         self.executor = MacroExecutor(model)
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
@@ -54,8 +62,11 @@ class TurnExecutor:
         """
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
-        poses = [ObjectPose.of(data.qpos[start : start + 7]) for start in self._cube_qpos]
-        pose, slot = poses[cube], self._slots[cube]
+        poses = [
+            self._sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
+            for start, place_m in zip(self._cube_qpos, SLOTS_XY_M, strict=True)
+        ]
+        pose, slot = self._sensing.erring(poses[cube]), self._slots[cube]
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         try:
@@ -72,7 +83,7 @@ class TurnExecutor:
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         turned = qpos[trajectory.last_step["turn"] + 1]
-        if self.executor.opening_m(turned).min() < _MIN_GRIP_M:
+        if self.executor.opening_m(turned).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")
         return result
 
@@ -110,12 +121,11 @@ def _waypoints(grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other
     before, after = np.zeros(7), np.zeros(7)
     before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skew_rad
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2
-    squeezed_m = CUBE_EDGE_M / 2 - _SQUEEZE_M
     return [
         Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M),
-        Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=squeezed_m, min_duration_s=_CLOSE_S),
-        Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=squeezed_m),
+        Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=_SQUEEZED_M, min_duration_s=_CLOSE_S),
+        Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=_SQUEEZED_M),
         Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
         Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         *back_to_rest(REST_OPENING_M, _SETTLE_S),

@@ -9,7 +9,7 @@ import math
 import mujoco
 
 from ..scenes import constants as c
-from ..scenes.arm import arm_spec
+from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.hand import add_pointing_hand
 from ..scenes.objects import add_objects
 from ..scenes.tabletop import add_tabletop
@@ -43,6 +43,7 @@ def _compiled() -> mujoco.MjModel:
     add_open_hand(spec, IDLE_PALM_M)
     for geom in spec.geoms:
         geom.solref, geom.solimp[:2] = (2 * TIMESTEP_S, 1.0), _SOLIMP
+    let_arm_touch(spec)
     camera = spec.camera(c.AGENT_CAMERA)
     camera.fovy = _FOVY_DEG
     camera.alt.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))

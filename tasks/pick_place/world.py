@@ -57,7 +57,7 @@ class PickWorld(World):
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.carry import CarryExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return CarryExecutor(self.model)
+        return CarryExecutor(self.model, self.sensing)
 
     # --- putting -------------------------------------------------------------------------------------------------
 

@@ -12,11 +12,32 @@ ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
 FINGER_JOINTS = ("finger_left_slide", "finger_right_slide")
 """Slides in metres: each pad's distance from the grip's middle, 0 (closed) to 0.045."""
 
+TIP_IN_NAME = "_tip_"
+"""In the names of the geoms that grip: two rubber tips a finger."""
+
 TCP_SITE = "tcp"
 """Between the pads: +z along the tool, the fingers open along y."""
 
 JOINT_SPEED_LIMITS_RAD_S = (1.74, 1.328, 1.957, 1.957, 3.485, 3.485, 4.545)
 """Per arm joint, from the same URDF as ``assets/sawyer.xml``."""
+
+
+_TOUCHING = ("l4_", "l5_", "l6_", "hand_mount", "hand_rail", "finger_left_back", "finger_right_back")
+_GRIPS, _ARM = 1, 2
+"""Bits of collision: of fingertips and all that they touch, and of the rest of the arm."""
+
+
+def let_arm_touch(spec: mujoco.MjSpec) -> None:
+    """Let forearm, wrist, hand and the fingers' backs run into whatever the fingertips may touch, at the very end.
+
+    The planner keeps them clear of it, so nothing changes while it does. They do not collide with each other; links
+    before the forearm stay over 100 mm above the table, and the pointing hand gives way to everything.
+    """
+    for geom in spec.geoms:
+        if geom.name.startswith(_TOUCHING):
+            geom.contype, geom.conaffinity = _ARM, 0
+        elif geom.contype == _GRIPS and TIP_IN_NAME not in geom.name:
+            geom.conaffinity = _GRIPS | _ARM
 
 
 def arm_spec() -> mujoco.MjSpec:

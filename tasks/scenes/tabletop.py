@@ -18,7 +18,7 @@ _DRAWN_ONLY = {"contype": 0, "conaffinity": 0, "group": c.SETTING_GROUP}
 
 
 def set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
-    """Solver settings that hold an object by friction alone; `make speed` measures how well."""
+    """Solver settings in which friction alone holds what is lifted; `make speed` measures how well."""
     option = spec.option
     option.timestep = timestep_s
     option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtSolver.mjSOL_NEWTON

@@ -217,7 +217,7 @@ def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     """Fingers that touch nothing: the arm turns, the cube stays, and the environment says so."""
     env = make().unwrapped
     model = env.world.model
-    arm = np.flatnonzero(model.geom_group == ARM_GROUP)
+    arm = np.flatnonzero((model.geom_group == ARM_GROUP) | (model.geom_contype == 2))
     model.geom_contype[arm] = model.geom_conaffinity[arm] = 0
     env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
     _, reward, terminated, _, info = env.step(0)  # a good turn would reach the goal

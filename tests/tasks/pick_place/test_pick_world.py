@@ -65,13 +65,15 @@ def test_objects_stand_still_on_the_table(world):
     assert np.abs(world.object_poses()[:, :3] - before[:, :3]).max() < 5e-4
 
 
-def test_only_tips_table_objects_and_palm_touch(world):
+def test_tips_hand_table_objects_and_palm_touch(world):
     names = {world.model.geom(index).name for index in np.flatnonzero(world.model.geom_contype)}
-    tips = {f"finger_{side}_tip_{end}" for side in ("left", "right") for end in ("front", "back")}
-    assert names == {
+    tips = {f"finger_{side}_{end}" for side in ("left", "right") for end in ("tip_front", "tip_back", "back")}
+    links = {"l4_arm", "l4_wrist", "l5_housing", "l5_wrist", "l5_ring", "l6_flange", "hand_mount", "hand_rail"}
+    assert names - links == {
         "table_top", "ball_skin", "car_box", "cup_wall", "palm_plate", *tips, *(f"car_wheel_{i}" for i in range(4)),
         *(f"cup_foot_{i}" for i in range(4)), *(f"palm_rim_{i}" for i in range(4)),
     }  # fmt: skip
+    assert links <= names
     assert world.model.neq == 0  # no weld anywhere
     assert world.model.opt.timestep == TIMESTEP_S
 
@@ -167,6 +169,7 @@ def test_gripper_and_object_pass_the_pointing_hand(world, index):
 def ghost_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
+    model.geom_contype[model.geom_contype == 2] = 0  # the fingers' backs
 
 
 def slippery_tips(model):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, arm_spec
-from imagine_bench.tasks.scenes.constants import ARM_GROUP, HOME_QPOS_RAD, OBSERVATION_QPOS_RAD
+from imagine_bench.tasks.scenes.constants import ARM_GROUP, COLLISION_GROUP, HOME_QPOS_RAD, OBSERVATION_QPOS_RAD
 
 # RethinkRobotics/sawyer_robot, sawyer_base.urdf.xacro, commit 2fe61d9: origin xyz (m) and rpy (rad), limits (rad),
 # effort (N m), speed (rad/s), mass (kg), centre of mass (m) and inertia xx yy zz xy xz yz (kg m2) per joint and link.
@@ -123,10 +123,12 @@ def test_arm_carries_itself(model):
     assert np.abs(data.qpos[:7] - OBSERVATION_QPOS_RAD).max() < 1e-6
 
 
-def test_only_the_fingertips_touch(model):
+def test_of_the_arm_alone_only_the_fingertips_touch(model):
     touching = {model.geom(index).name for index in range(model.ngeom) if model.geom_contype[index]}
     assert touching == {f"finger_{side}_tip_{end}" for side in ("left", "right") for end in ("front", "back")}
-    assert set(model.geom_group) == {ARM_GROUP}
+    backs = {model.geom(f"finger_{side}_back").id for side in ("left", "right")}
+    assert {index for index in range(model.ngeom) if model.geom_group[index] != ARM_GROUP} == backs  # not drawn
+    assert set(model.geom_group[list(backs)]) == {COLLISION_GROUP}
 
 
 def test_wrist_camera_sees_the_human_above_and_right_as_right(model):
