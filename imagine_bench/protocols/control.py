@@ -66,10 +66,9 @@ class Protocol(ProtocolData):
         require_seeds(self.seeds)
         require_different("agents", self.agents)
         for name, least in _LEAST.items():
-            if not least <= getattr(self, name) <= MOST:
-                raise InvalidValueError(
-                    f"{name} is {brief(getattr(self, name))}; give at least {least} and at most {MOST:,}."
-                )
+            if not least <= (value := getattr(self, name)) <= MOST:
+                allowed = f"at least {least}" if value < least else f"at most {MOST:,}"
+                raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
         require_same_world(self.task, self.after)
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(
