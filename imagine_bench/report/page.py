@@ -80,11 +80,7 @@ def write_page(folder: Path, page: Page) -> Path:
 
 def markdown_text(value: object) -> str:
     """A text as Markdown shows it unchanged: in a line, its special characters escaped."""
-    return re.sub(r"([\\`*_<>|&~\[\]]|^(?:[#+=-]|\d+(?=[.)])))", _escaped, " ".join(str(value).split()))
-
-
-def _escaped(found: re.Match[str]) -> str:
-    return f"{found[0]}\\" if found[0].isdigit() else f"\\{found[0]}"
+    return re.sub(r"([\\`*_<>|&~]|^#|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
 
 
 def markdown_code(value: object) -> str:
