@@ -99,7 +99,7 @@ class DQN:
         self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
         self.real = RealMemory(settings.memory.real, perception.latent_size, device)
         self.meters = Meters()
-        self.steps = 0
+        self.steps = self.updates = 0
 
     @property
     def tested(self) -> Controller:
@@ -139,11 +139,12 @@ class DQN:
             for _ in range(updates if len(memory) else 0):
                 batch = memory.sample(self.settings.controller.batch_size, self._replay)
                 self.meters.add("loss/bellman", self.controller.update(batch))
+                self.updates += 1
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
-        now = {"epsilon": epsilon(self.steps, self.settings.controller), "real_transitions": float(self.real.added)}
-        return {**self.meters.read(), **now}
+        counters = {"real_transitions": float(self.real.added), "gradient_updates": float(self.updates)}
+        return {**self.meters.read(), "epsilon": epsilon(self.steps, self.settings.controller), **counters}
 
     def state(self) -> AgentState:
         """A snapshot: weights, moments, memories, generators, counters, measurements."""
@@ -151,8 +152,9 @@ class DQN:
         arrays |= snapshot.prefixed("real", self.real.arrays())
         arrays["generator/replay"] = snapshot.generator_array(self._replay)
         values = {
-            "steps": self.steps, "real_added": self.real.added, "exploration": self.rng.bit_generator.state,
-            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
+            "steps": self.steps, "updates": self.updates, "real_added": self.real.added,
+            "exploration": self.rng.bit_generator.state, "meters": self.meters.state(),
+            "settings": snapshot.jsonable(flatten(self.settings)),
         }  # fmt: skip
         return AgentState(arrays=arrays, values=values)
 
@@ -164,7 +166,8 @@ class DQN:
         snapshot.load_generator(self._replay, arrays["generator/replay"])
         self.real.load(snapshot.below("real", arrays), values["real_added"])
         self.meters.restore(values["meters"])
-        self.rng.bit_generator.state, self.steps = values["exploration"], values["steps"]
+        self.rng.bit_generator.state = values["exploration"]
+        self.steps, self.updates = values["steps"], values["updates"]
 
 
 def build(hyperparameters: Hyperparameters[DQNSettings], context: AgentContext) -> DQN:

@@ -5,7 +5,8 @@ A comment before a table names its folders and says what its cells are, in the w
     <!-- table: A=arrow_puzzle-quick; iqm(@,A/dqn)|average(@,A/random) -->
 
 ``@`` is the number in the row's first cell or, where the comment has ``rows: ...|...;``, the row's own arguments.
-``text`` is a column of words. ``python tests/doc_tables.py`` writes all cells anew.
+``text`` is a column of words. Below a table that compares stands what its bold cells mean and the smallest difference
+that it could have shown. ``python tests/doc_tables.py`` writes all that anew.
 """
 
 from __future__ import annotations
@@ -23,14 +24,27 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
+from imagine_bench.store import encoders
+from imagine_bench.store.bench_folder import read_protocol
+from imagine_bench.studies.catalogue import STUDIES
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "report")]
 """All but the reports that somebody has written of kept results, which git ignores."""
-_MARKED = re.compile(r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+)", re.DOTALL)
+_MARKED = re.compile(r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+(?:\n\*Bold: [^\n]*\*\n)?)", re.DOTALL)
 
 Runs = dict[int, list[dict[str, str]]]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A cell that compares two sets of runs: bold where the table's tests, taken together, show a difference."""
+
+    text: str
+    p: float
+    detectable: Callable[..., float]  # of the number of tests
+    bold: bool = True  # false where a difference to that side is no finding
 
 
 @dataclass(frozen=True)
@@ -48,16 +62,19 @@ class Table:
         folders = dict(pair.split("=") for part in before if not part.startswith("rows:") for pair in part.split())
         named = [part.removeprefix("rows: ").split("|") for part in before if part.startswith("rows:")]
         entries, specs = (named[0] if named else []), columns.split("|")
-        if entries and len(entries) != len(self.lines) - 2:
-            raise ValueError(f"{len(entries)} rows are named and {len(self.lines) - 2} are there: {self.lines[0]}")
-        rows = [_cells(line) for line in self.lines[2:]]
+        rows: list[list[Any]] = [_cells(line) for line in self.lines[2:] if line.startswith("|")]
+        if entries and len(entries) != len(rows):
+            raise ValueError(f"{len(entries)} rows are named and {len(rows)} are there: {self.lines[0]}")
         for index, row in enumerate(rows):
             key = entries[index] if entries else re.sub(r"[^\d]", "", row[0])
             if len(row) != len(specs) + 1:
                 raise ValueError(f"{len(specs)} columns are named and {len(row) - 1} are there: {row}")
             values = [_cell(spec.replace("@", key), folders) for spec in specs]
             rows[index] = [row[0], *(old if new is None else new for old, new in zip(row[1:], values, strict=True))]
-        return [*self.lines[:2], *("| " + " | ".join(row) + " |" for row in rows)]
+        tests = [part for row in rows for cell in row if isinstance(cell, list) for part in cell]
+        adjusted = iter(statistics.holm([test.p for test in tests]).tolist())
+        texts = [[_text(cell, adjusted) if isinstance(cell, list) else cell for cell in row] for row in rows]
+        return [*self.lines[:2], *("| " + " | ".join(row) + " |" for row in texts), *_caption(tests)]
 
 
 def tables(text: str) -> Iterator[Table]:
@@ -74,11 +91,28 @@ def unmarked(text: str) -> list[str]:
     return [block.split("\n")[0] for block in plain if re.search(r"\d\.\d|\d ?%", block)]
 
 
+def _text(parts: list[Compared], adjusted: Iterator[float]) -> str:
+    texts = []
+    for part in parts:
+        shown = next(adjusted) < 1.0 - statistics.LEVEL and part.bold
+        texts.append(f"**{part.text}**" if shown else part.text)
+    return "; ".join(texts)
+
+
+def _caption(tests: Sequence[Compared]) -> list[str]:
+    sizes = [min(100.0 * test.detectable(cells=len(tests)), 100.0) for test in tests if not np.isnan(test.p)]
+    if not sizes:
+        return []
+    least, most = (f"{size:.1f}" if size < 9.95 else f"{size:.0f}" for size in (min(sizes), max(sizes)))
+    could = f"{least} to {most} points" if least != most else f"{least} points"
+    return ["", f"*Bold: shown (Holm, {len(tests)} tests). Detectable: {could}.*"]
+
+
 def _cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip().strip("|").split("|")]
 
 
-def _cell(spec: str, folders: Mapping[str, str]) -> str | None:
+def _cell(spec: str, folders: Mapping[str, str]) -> str | list[Compared] | None:
     if spec == "text":
         return None
     name, _, arguments = spec.removesuffix(")").partition("(")
@@ -111,8 +145,17 @@ def scores(budget: str, where: str, column: str = "success_rate") -> np.ndarray:
     return np.array([float(row[column]) for row in rows])
 
 
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(0)
+def trials(budget: str, where: str) -> int:
+    """Test episodes of every seed."""
+    return int(runs(where)[int(budget)][0]["test_episodes"])
+
+
+def _compared(
+    text: str, treated: np.ndarray, base: np.ndarray, tests: int | None, *, only_ahead: bool = False
+) -> Compared:
+    found = statistics.difference(treated, base, trials=tests)
+    size = functools.partial(statistics.detectable, treated, base, trials=tests)
+    return Compared(text, found.p, size, bold=found.value > 0 or not only_ahead)
 
 
 def percent(share: float) -> str:
@@ -127,14 +170,15 @@ def points(share: float) -> str:
 def iqm(budget: str, where: str) -> str:
     """Interquartile mean of the success rate, % [95 % interval over seeds]."""
     values = scores(budget, where)
-    return interval(statistics.iqm(values), *statistics.bootstrap_interval(values, _rng()))
+    return interval(statistics.iqm(values), *statistics.interval(values, trials=trials(budget, where)))
 
 
-def ahead(budget: str, treated: str, base: str) -> str:
-    """The same; bold where the interval of the difference to the base lies above zero."""
-    text = iqm(budget, treated)
-    better = statistics.difference(scores(budget, treated), scores(budget, base), _rng()).low > 0
-    return f"**{text}**" if better else text
+def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
+    """The same; bold where it is ahead of the base. The base itself, and who does not learn, are not tested."""
+    if treated == base or not registry.agent_entry(treated.rpartition("/")[2]).learns:
+        return iqm(budget, treated)
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(iqm(budget, treated), *pair, tests, only_ahead=True)]
 
 
 def interval(value: float, low: float, high: float) -> str:
@@ -142,8 +186,9 @@ def interval(value: float, low: float, high: float) -> str:
 
 
 def signed(estimate: statistics.Estimate) -> str:
-    text = f"{points(estimate.value)} [{points(estimate.low)}, {points(estimate.high)}]"
-    return f"**{text}**" if estimate.low > 0 or estimate.high < 0 else text
+    if np.isnan(estimate.low):
+        return points(estimate.value)
+    return f"{points(estimate.value)} [{points(estimate.low)}, {points(estimate.high)}]"
 
 
 def mean_std(budget: str, where: str) -> str:
@@ -168,14 +213,16 @@ def seeds(budget: str, where: str) -> str:
     return ", ".join(percent(value) for value in scores(budget, where))
 
 
-def difference(budget: str, treated: str, base: str) -> str:
-    """Difference of interquartile means, points [95 %]; bold if clear of zero."""
-    return signed(statistics.difference(scores(budget, treated), scores(budget, base), _rng()))
+def difference(budget: str, treated: str, base: str) -> list[Compared]:
+    """Difference of interquartile means, points [95 %]."""
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests)]
 
 
-def gain(budget: str, treated: str, base: str) -> str:
-    """Gain of the means relative to the base, % [95 %]; bold if clear of zero."""
-    return signed(statistics.gain(scores(budget, treated), scores(budget, base), _rng()))
+def gain(budget: str, treated: str, base: str) -> list[Compared]:
+    """Gain of the means relative to the base, % [95 %]; tested as the difference."""
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(signed(statistics.gain(*pair, trials=tests)), *pair, tests)]
 
 
 def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
@@ -183,7 +230,7 @@ def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
     budgets = sorted(runs(where))
     table = np.stack([scores(str(each), where) for each in budgets], axis=1)
     means = statistics.running_means(budgets, table, _facts(task).chance_level)[:, budgets.index(int(budget))]
-    return interval(statistics.iqm(means), *statistics.bootstrap_interval(means, _rng()))
+    return interval(statistics.iqm(means), *statistics.interval(means, trials=trials(budget, where)))
 
 
 def reached(where: str, level: str) -> np.ndarray:
@@ -192,6 +239,39 @@ def reached(where: str, level: str) -> np.ndarray:
     table = np.stack([scores(str(each), where) for each in budgets], axis=1)
     found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
     return np.array([np.nan if each is None else each for each in found])
+
+
+def price(budget: str, where: str, what: str) -> str:
+    """What one run has had until a budget, mean over seeds: a column, or frames its encoder saw before."""
+    folder, _, agent = where.rpartition("/")
+    if what == "frames":
+        entry, protocol = registry.agent_entry(agent), read_protocol(RESULTS / folder)
+        card = encoders.card(protocol.encoder_of(entry.encoder_kind)) if entry.needs_encoder else None
+        return "0" if not entry.needs_encoder else "–" if card is None else f"{card['recipe']['frames']:,}"
+    values = [row.get(what) or "nan" for row in runs(where)[int(budget)]]
+    mean = np.mean([float(value) for value in values])
+    return "–" if np.isnan(mean) else f"{mean:,.0f}"
+
+
+def price_to(where: str, level: str, what: str) -> str:
+    """The same until the test from which on all reach a level, mean over seeds."""
+    if what == "frames":
+        return price("0", where, what)
+    budgets = reached(where, level)
+    if np.isnan(budgets).any():
+        return "–"
+    rows = [runs(where)[int(budget)][index] for index, budget in enumerate(budgets)]
+    return f"{np.mean([float(row[what]) for row in rows]):,.0f}"
+
+
+def coverage(seeds_and_stuck: str, what: str) -> str:
+    """A rate of the simulation of intervals and tests, %."""
+    count, stuck = seeds_and_stuck.split("/")
+    (row,) = (
+        row for row in _json("coverage/coverage.json")["rows"]
+        if (row["seeds"], row["stuck"]) == (int(count), float(stuck))
+    )  # fmt: skip
+    return percent(row[what])
 
 
 def episodes_to(where: str, level: str) -> str:
@@ -251,14 +331,14 @@ def study(budget: str, folder: str, *variants: str) -> str:
     return "; ".join(percent(statistics.iqm(_success(folder, variant, budget))) for variant in variants)
 
 
-def study_difference(budget: str, folder: str, *variants: str) -> str:
-    """Against what each is compared with, points [95 %]; bold if clear of zero."""
-    texts = []
+def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]:
+    """Against what each is compared with, points [95 %]."""
+    found, tests = [], STUDIES["factors"].evaluation_episodes
     for variant in variants:
         against = _study(folder)[variant, int(budget)][0]["against"]
-        pair = _success(folder, variant, budget), _success(folder, against, budget)
-        texts.append(signed(statistics.difference(*pair, _rng())))
-    return "; ".join(texts)
+        pair = np.array(_success(folder, variant, budget)), np.array(_success(folder, against, budget))
+        found.append(_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests))
+    return found
 
 
 def _success(folder: str, variant: str, budget: str) -> list[float]:
@@ -280,8 +360,7 @@ def _answers(folder: str, agent: str, path: str) -> np.ndarray:
 def answers(folder: str, agent: str, path: str) -> str:
     """What the models of a bench answered, %: mean [95 % over seeds]."""
     values = _answers(folder, agent, path)
-    low, high = statistics.bootstrap_interval(values, _rng(), statistic="mean")
-    return interval(values.mean(), low, high)
+    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
 
 
 def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
@@ -301,7 +380,7 @@ def policy_failure(agent: str, episodes: str) -> str:
     groups = _json("arrow_puzzle_hard-policy/policy.json")
     chosen = [run for group in groups for run in group["runs"]]
     values = np.array([run["failure"] for run in chosen if (run["agent"], str(run["episodes"])) == (agent, episodes)])
-    return interval(values.mean(), *statistics.bootstrap_interval(values, _rng(), statistic="mean"))
+    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
 
 
 def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
@@ -395,13 +474,13 @@ def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 
 
-CELLS: dict[str, Callable[..., str]] = {
+CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     function.__name__: function
     for function in (
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest,
+        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
     )
 }  # fmt: skip
 

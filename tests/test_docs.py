@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 import tyro
 from doc_tables import PAGES, ROOT
@@ -80,6 +81,7 @@ def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch
     variables: dict[str, object] = {}
     exec(compile(code, str(page), "exec"), variables)
     variables["env"].close()  # type: ignore[attr-defined]
+    assert isinstance(variables["env"], gymnasium.Env)
 
 
 def test_the_twelve_lines_bench_an_agent(tmp_path: Path) -> None:

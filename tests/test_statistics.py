@@ -1,4 +1,4 @@
-"""Statistics against answers worked out by hand."""
+"""Statistics against answers worked out by hand, against scipy's, and against what defines them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from imagine_bench import statistics
 from imagine_bench.errors import InvalidValueError
-
-
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
 
 
 def test_iqm_drops_a_quarter_at_each_end() -> None:
@@ -36,13 +33,6 @@ def test_wilson_refuses_impossible_counts() -> None:
         statistics.wilson(6, 5)
 
 
-def test_bootstrap_of_two_runs_has_the_three_possible_means() -> None:
-    # Resamples of (0, 1): mean 0 with 1/4, 1/2 with 1/2, 1 with 1/4; so 95 % spans everything.
-    assert statistics.bootstrap_interval([0.0, 1.0], rng(), statistic="mean") == (0.0, 1.0)
-    # Of five runs, one of them 1, a mean above 0.6 has 0.67 %, one of at least 0.6 has 5.8 %: 95 % ends at 0.6.
-    assert statistics.bootstrap_interval([0.0] * 4 + [1.0], rng(), statistic="mean") == (0.0, 0.6)
-
-
 def test_running_means_by_hand() -> None:
     # 0.1 at episode 0, 0.3 at 10, 0.5 at 30: areas 2 and 2 + 8.
     means = statistics.running_means((10, 30), [[0.3, 0.5], [0.1, 0.1]], 0.1)
@@ -59,77 +49,136 @@ def test_running_means_need_one_score_a_budget() -> None:
         statistics.running_means((10, 30), [[0.1, 0.2, 0.3]], 0.0)
 
 
-def test_bootstrap_repeats_and_brackets_the_point() -> None:
-    scores = [0.2, 0.5, 0.55, 0.6, 0.9]
-    first = statistics.bootstrap_interval(scores, rng())
-    assert first == statistics.bootstrap_interval(scores, rng())
-    assert first[0] < statistics.iqm(scores) < first[1]
+FIVE, OTHERS = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.8, 0.25, 0.2, 0.35]
 
 
-def test_bootstrap_covers_as_often_as_it_says() -> None:
-    draw = np.random.default_rng(3)
-    hits = 0
-    for _ in range(200):
-        low, high = statistics.bootstrap_interval(draw.normal(size=20), draw, statistic="mean")
-        hits += low <= 0.0 <= high
-    assert 0.87 <= hits / 200 <= 0.98  # percentile bootstrap of 20 undercovers slightly
+def test_an_interval_is_student_s() -> None:
+    low, high = statistics.interval(FIVE, trim=0.0)
+    assert (low, high) == pytest.approx(tuple(stats.ttest_1samp(FIVE, 0.0).confidence_interval(0.95)), abs=1e-12)
+
+
+def test_an_interval_of_a_trimmed_mean_is_tukey_s() -> None:
+    """Of eight, two at each end; scipy's has the winsorised spread of the same four."""
+    expected = stats.mstats.trimmed_mean_ci(OTHERS, limits=(0.25, 0.25), alpha=0.05)
+    spread = stats.mstats.winsorize(np.array(OTHERS), limits=(0.25, 0.25)).std(ddof=1)
+    half = stats.t.ppf(0.975, 3) * spread * math.sqrt(7 / (4 * 3))  # Yuen (1974)
+    low, high = statistics.interval(OTHERS)
+    assert (low + high) / 2 == pytest.approx(statistics.iqm(OTHERS)) == pytest.approx(float(np.mean(expected)))
+    assert (high - low) / 2 == pytest.approx(half, abs=1e-12)
+
+
+def test_one_stuck_seed_in_five_does_not_decide() -> None:
+    low, high = statistics.interval([0.16, 0.95, 0.96, 0.97, 0.99], trials=200)
+    assert 0.85 < low < 0.96 < high <= 1.0
+    assert statistics.interval([0.16, 0.95, 0.96], trials=200)[0] == 0.0, "of three it is not trimmed, and says so"
+
+
+def test_equal_scores_are_as_sure_as_their_tests() -> None:
+    low, high = statistics.interval([1.0, 1.0, 1.0], trials=200)
+    assert high == 1.0 and 0.985 < low < 0.995
+    few_tests, _ = statistics.interval([1.0, 1.0, 1.0], trials=10)
+    assert few_tests < 0.9
+    assert statistics.interval([0.5, 0.5, 0.5]) == (0.5, 0.5)
+
+
+def test_intervals_of_shares_stay_shares() -> None:
+    assert statistics.interval([0.0, 0.1], trim=0.0)[0] < 0.0
+    assert statistics.interval([0.0, 0.1], trim=0.0, share=True)[0] == 0.0
 
 
 def test_one_run_gives_no_interval() -> None:
-    assert all(math.isnan(end) for end in statistics.bootstrap_interval([0.3], rng()))
-    assert math.isnan(statistics.gain([0.3], [0.2], rng()).low)
+    assert all(math.isnan(end) for end in statistics.interval([0.3], trials=200))
+    assert math.isnan(statistics.gain([0.3], [0.2]).low)
+    assert all(math.isnan(part) for part in statistics.difference([0.3], [0.2])[1:])
+    assert math.isnan(statistics.detectable([0.3], [0.2], cells=1))
 
 
-def test_difference_by_hand() -> None:
-    assert statistics.difference([3.0, 3.0], [1.0, 1.0, 1.0], rng()) == (2.0, 2.0, 2.0)
-    value, low, high = statistics.difference([0.0, 1.0], [0.0, 1.0], rng())
-    assert (value, low, high) == (0.0, -1.0, 1.0)  # either side is 0 or 1 with 1/4 each: both ends have 1/16
+def test_a_difference_of_means_is_welch_s() -> None:
+    found, expected = statistics.difference(FIVE, OTHERS, trim=0.0), stats.ttest_ind(FIVE, OTHERS, equal_var=False)
+    assert found.p == pytest.approx(expected.pvalue, abs=1e-12)
+    assert found[1:3] == pytest.approx(tuple(expected.confidence_interval(0.95)), abs=1e-11)
+
+
+def test_a_difference_of_trimmed_means_is_yuen_s() -> None:
+    found = statistics.difference(FIVE, OTHERS)
+    expected = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=0.25)
+    assert found.p == pytest.approx(expected.pvalue, abs=1e-12)
+    assert found.value == pytest.approx(statistics.iqm(FIVE) - statistics.iqm(OTHERS))
 
 
 def test_a_difference_of_nothing_is_nothing() -> None:
-    """Success rates lie on a lattice: an end at exactly 0 must not be ahead by the rounding of its sums."""
-    ours, theirs = np.array([997, 999, 998]) / 1000, np.array([998, 995, 994]) / 1000
-    lows = [statistics.difference(ours, theirs, np.random.default_rng(seed)).low for seed in range(20)]
-    assert 0.0 in lows and all(low == 0.0 or abs(low) > 1e-6 for low in lows)
-    assert statistics.difference([0.1, 0.2, 0.3], [0.3, 0.1, 0.2], np.random.default_rng(0)).value == 0.0
+    found = statistics.difference([0.1, 0.2, 0.3], [0.3, 0.1, 0.2])
+    assert found.value == 0.0 and found.p == 1.0 and found.low == -found.high
+
+
+def test_equal_runs_differ_by_more_than_their_tests() -> None:
+    far = statistics.difference([1.0, 1.0, 1.0], [0.16, 0.16, 0.16], trials=200)
+    assert far.value == 0.84 and 0.0 < far.p < 0.01 and 0.7 < far.low < 0.84 < far.high
+    near = statistics.difference([1.0, 1.0, 1.0], [0.995, 0.995, 0.995], trials=200)
+    assert near.p > 0.2
+    assert statistics.difference([3.0, 3.0], [1.0, 1.0, 1.0]) == (2.0, 2.0, 2.0, 0.0), "without tests there is no doubt"
+
+
+def test_holm_by_hand() -> None:
+    assert statistics.holm([0.04, 0.01, math.nan, 0.03]).tolist()[:2] == pytest.approx([0.06, 0.03])
+    assert statistics.holm([0.04, 0.01, math.nan, 0.03])[3] == pytest.approx(0.06), "never below a smaller one's"
+    assert math.isnan(statistics.holm([0.04, 0.01, math.nan, 0.03])[2])
+    assert statistics.holm([0.9, 0.8]).tolist() == [1.0, 1.0]
+    assert statistics.holm([]).shape == (0,)
+
+
+def test_a_detectable_difference_is_found_four_times_in_five() -> None:
+    draw = np.random.default_rng(0)
+    found = sizes = 0.0
+    for _ in range(400):
+        a, b = draw.normal(size=(2, 12))
+        size = statistics.detectable(a, b, cells=1)
+        sizes += size / 400
+    for _ in range(400):
+        a, b = draw.normal(size=(2, 12))
+        found += statistics.difference(a + sizes, b).p < 0.05
+    assert 0.7 < found / 400 < 0.93
+    assert statistics.detectable(a, b, cells=9) > 1.2 * statistics.detectable(a, b, cells=1)
 
 
 def test_gain_is_the_thesis_table() -> None:
-    value, _, _ = statistics.gain([62.17], [42.18], rng())
-    assert value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes
+    assert statistics.gain([62.17], [42.18]).value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes
 
 
-def test_gain_resamples_both_sides() -> None:
-    assert statistics.gain([0.6, 0.6, 0.6], [0.4, 0.4], rng()) == pytest.approx((0.5, 0.5, 0.5))
-    # Base means 0.2, 0.3, 0.4 with 1/4, 1/2, 1/4: gains 2, 1, 0.5.
-    assert statistics.gain([0.6, 0.6], [0.2, 0.4], rng()) == pytest.approx((1.0, 0.5, 2.0))
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_ratio_s_ends_are_fieller_s(paired: bool) -> None:
+    """A ratio r lies inside where a - r b is not clear of zero; at the ends it is just that."""
+    a, b = np.array([0.6, 0.7, 0.9, 0.75]), np.array([0.4, 0.5, 0.55, 0.5])
+    found = statistics.ratio(a, b, paired=paired)
+    assert found.low < found.value == a.mean() / b.mean() < found.high
+    for end in found[1:3]:
+        if paired:
+            p = stats.ttest_1samp(a - end * b, 0.0).pvalue
+            assert p == pytest.approx(0.05, abs=1e-9)
+        else:
+            errors = np.array([a.var(ddof=1), b.var(ddof=1)]) / 4
+            freedom = errors.sum() ** 2 / (errors**2 / 3).sum()  # of the difference, which stands for all ratios
+            t = (a.mean() - end * b.mean()) / math.sqrt(errors[0] + end**2 * errors[1])
+            assert abs(t) == pytest.approx(stats.t.ppf(0.975, freedom), abs=1e-9)
 
 
-def test_a_gain_boundless_in_just_its_tail_has_no_interval(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def resampled(values: np.ndarray, _: object) -> np.ndarray:
-        draws = np.full((statistics.RESAMPLES, *values.shape), 0.5)
-        draws[: statistics.RESAMPLES // 40] = 0.0  # 2.5 %
-        return draws
-
-    monkeypatch.setattr(statistics, "_resample", resampled)
-    assert math.isnan(statistics.gain([0.5, 0.5], [0.5, 0.5], rng()).high)
-
-
-def test_a_gain_without_bound_has_no_interval() -> None:
-    """8 of 27 resamples of the base never succeed: leaving them out would cut off the upper end."""
-    value, low, high = statistics.gain([0.3, 0.4, 0.5], [0.0, 0.0, 0.1], rng())
+def test_a_gain_over_perhaps_nothing_has_no_interval() -> None:
+    value, low, high, _ = statistics.gain([0.3, 0.4, 0.5], [0.0, 0.0, 0.1])
     assert value == pytest.approx(11.0) and math.isnan(low) and math.isnan(high)
-    scarce = statistics.gain([0.3] * 8, [0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1], rng())
-    assert 0.0 < scarce.low < scarce.high < math.inf, "so few that the upper end is not among them"
 
 
 def test_gain_over_nothing_is_not_a_number() -> None:
-    assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0], rng()).value)
+    assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0]).value)
 
 
 @pytest.mark.parametrize("scores", [[], [float("nan"), 1.0]])
 def test_scores_must_be_numbers(scores: list[float]) -> None:
     with pytest.raises(InvalidValueError, match="only finite ones"):
         statistics.iqm(scores)
+
+
+def test_a_success_that_is_lost_again_does_not_last() -> None:
+    budgets = (10, 20, 40, 80)
+    assert statistics.first_lasting(budgets, [0.9, 0.2, 0.1, 0.95], 0.9) == 80
+    assert statistics.first_lasting(budgets, [0.2, 0.9, 0.1, 0.1], 0.9) is None
+    assert statistics.first_lasting(budgets, [0.2, 0.9, 0.95, 0.9], 0.9) == 20

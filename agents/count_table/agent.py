@@ -82,7 +82,8 @@ class CountTableAgent:
 
     def diagnostics(self) -> dict[str, float]:
         """CPU seconds a real step since the last call, and the counters now."""
-        counters = {"real_transitions": self.steps, "table/states": self.table.states, "table/pairs": self.table.pairs}
+        counters = {"real_transitions": self.steps, "gradient_updates": 0}
+        counters |= {"table/states": self.table.states, "table/pairs": self.table.pairs}
         now = {name: float(value) for name, value in counters.items()}
         return {**self.meters.read(), "epsilon": epsilon(self.steps, self.settings.controller), **now}
 

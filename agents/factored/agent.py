@@ -168,7 +168,9 @@ class FactoredAgent:
         began = self.tasks[-1] if self.tasks else 0
         real, labels = self.replay.count_real(began), self.replay.count_labels(began)
         outcomes = len(self.model.outcomes.outcomes)
-        counters = {"real_transitions": real, "oracle/labels": labels, "model/outcomes": outcomes}
+        counters = {
+            "real_transitions": real, "gradient_updates": 0, "oracle/labels": labels, "model/outcomes": outcomes
+        }  # fmt: skip
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
     def state(self) -> AgentState:

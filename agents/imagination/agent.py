@@ -70,6 +70,7 @@ class ImaginingAgent(DQN):
                 losses = model.update(batch, draws["dropout"])
                 for name, value in asdict(losses).items():
                     self.meters.add(f"loss/{name}", value)
+                self.updates += 1
         self.meters.count("time/model_s")
 
     def _imagine(self, z: Tensor) -> None:
@@ -105,7 +106,7 @@ class ImaginingAgent(DQN):
         self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
         self.real.clear()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
-        self.steps = 0
+        self.steps = self.updates = 0
 
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator

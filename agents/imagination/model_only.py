@@ -155,8 +155,10 @@ class ModelOnlyAgent(ImaginingAgent):
             self.training.begin(self.steps)
         if self.training.episodes >= self.settings.imagination.model_only_episodes:
             return False
+        before = self.training.steps
         with self.meters.cpu_time("time/model_only_s"):
             self.training.episode(self._starts, self.real, self.meters)
+        self.updates += (self.training.steps - before) * self.settings.controller.updates_per_step
         return True
 
     def diagnostics(self) -> dict[str, float]:

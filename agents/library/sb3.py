@@ -74,7 +74,11 @@ class LibraryAgent:
     def diagnostics(self) -> dict[str, float]:
         """What the library logged last, and its exploration probability."""
         logged = {} if self._model is None else dict(self._model.logger.name_to_value)
-        values = {"loss/bellman": logged.get("train/loss"), "epsilon": getattr(self._model, "exploration_rate", None)}
+        values = {
+            "loss/bellman": logged.get("train/loss"),
+            "epsilon": getattr(self._model, "exploration_rate", None),
+            "gradient_updates": logged.get("train/n_updates"),
+        }
         return {name: float(value) for name, value in values.items() if value is not None}
 
     def state(self) -> AgentState:

@@ -16,7 +16,7 @@ import tyro
 from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
 from imagine_bench.cli.benches import Bench, List, Report, Study, parse_settings
-from imagine_bench.cli.tools import Doctor, Encoder, Film, Margins, Speed, View
+from imagine_bench.cli.tools import Coverage, Doctor, Encoder, Film, Margins, Speed, View
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, brief, plain
 from imagine_bench.store.files import reason
 
@@ -26,7 +26,22 @@ _LONGEST_WORD = 1000
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
-Command = Bench | Report | Plan | Generalise | Policy | Study | View | Encoder | Film | Speed | Margins | Doctor | List
+Command = (
+    Bench
+    | Report
+    | Plan
+    | Generalise
+    | Policy
+    | Study
+    | View
+    | Encoder
+    | Film
+    | Speed
+    | Margins
+    | Coverage
+    | Doctor
+    | List
+)
 
 
 def main(words: Sequence[str] | None = None) -> int:

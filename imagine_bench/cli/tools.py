@@ -100,6 +100,24 @@ class Speed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """Simulate whether intervals and tests keep their promise on scores such as the kept ones."""
+
+    results: Path = Path("docs/results")
+    """Folder of kept results."""
+    draws: int = 2_000
+    """Benches of every kind."""
+    out: Path = Path("runs/coverage.json")
+    """Where the rates are kept."""
+
+    def __call__(self) -> None:
+        """Simulate."""
+        from imagine_bench.tools.coverage import coverage_report  # noqa: PLC0415 - nothing else needs it
+
+        coverage_report(self.results, self.out, self.draws)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Margins:
     """Measure how far friction, force, mass and the planner's errors may go before macro-actions fail."""
 

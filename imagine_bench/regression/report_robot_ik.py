@@ -16,8 +16,6 @@ from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Section, Table, mean_std
-from imagine_bench.report.text import few_words
-from imagine_bench.seeding import SeedTree
 
 Values = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -26,7 +24,7 @@ Ratios = dict[str, statistics.Estimate]
 """Error as a ratio to a random choice, by criterion."""
 _JOINTS = ("q1", "q2", "q3")
 _UNPRINTED = "not in the thesis"
-_INTERVALS = "In brackets: 95 % interval over networks (bootstrap)."
+_INTERVALS = "In brackets: 95 % interval over networks (Fieller)."
 _KINDS = ("epistemic", "modal", "aleatoric")
 
 
@@ -57,25 +55,16 @@ def by_criterion(result: RegressionResult, agent: str, variant: str, part: str, 
     return {name: values.sum(axis=1) for name, values in by.items()}
 
 
-def ratio_to_random(values: Values, random: Values, rng: np.random.Generator) -> statistics.Estimate:
-    """Ratio of mean cumulated errors (E,) to those of a random choice (E,) by the same networks.
-
-    The 95 % interval resamples networks with both of their errors; ``rng`` draws the resamples.
-    """
-    value = float(values.mean() / random.mean())
-    if len(values) < 2:
-        return statistics.Estimate(value, np.nan, np.nan)
-    picks = rng.integers(len(values), size=(statistics.RESAMPLES, len(values)))
-    low, high = np.percentile(values[picks].mean(axis=1) / random[picks].mean(axis=1), [2.5, 97.5])
-    return statistics.Estimate(value, float(low), float(high))
+def ratio_to_random(values: Values, random: Values) -> statistics.Estimate:
+    """Ratio of mean cumulated errors (E,) to those of a random choice (E,) by the same networks, with its interval."""
+    return statistics.ratio(values, random, paired=True)
 
 
 def _decisions(result: RegressionResult) -> Section:
     protocol, columns = result.protocol, (*SCORES, "min", "max", "random", "mink")
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
-    rng = SeedTree(int(protocol.hash, 16)).child("report").generator()
     found = {pair: totals(result, *pair) for pair in result.pairs}
-    against, errors, ratios = _rows(found, columns, rng)
+    against, errors, ratios = _rows(found, columns)
     answers = []
     for (agent, variant), estimates in against.items():
         known = variant in printed["random"]
@@ -102,7 +91,6 @@ def _decisions(result: RegressionResult) -> Section:
             "misses is cumulated over 50 choices. Mean (standard deviation) over networks, in metres; lower is better. "
             "Random is the expectation of a choice by chance, min and max are the best and the worst choice in "
             "hindsight, mink is the error of inverse kinematics with a known model of the arm, the ceiling.",
-            *few_words(len(protocol.seeds) * protocol.networks, "networks"),
             "Every predicted configuration is carried out by the simulated arm, and the place its tip comes to rest at "
             "is measured. Here no place outside of the workspace is asked for; the maps below show where it ends.",
         ),
@@ -118,9 +106,8 @@ def _decisions(result: RegressionResult) -> Section:
 def _beyond(result: RegressionResult) -> Section:
     """The same choices among points of the whole disc of the stretched arm."""
     columns = (*SCORES, "min", "max", "random")
-    rng = SeedTree(int(result.protocol.hash, 16)).child("report_disc").generator()
     found = {pair: by_criterion(result, *pair, "disc", "error") for pair in result.pairs}
-    against, errors, ratios = _rows(found, columns, rng)
+    against, errors, ratios = _rows(found, columns)
     answers = []
     for (agent, variant), estimates in against.items():
         outside = by_criterion(result, agent, variant, "disc", "outside_m")
@@ -157,12 +144,10 @@ def _label(agent: str, variant: str) -> str:
 
 
 def _rows(
-    found: Mapping[Pair, Mapping[str, Values]], columns: Sequence[str], rng: np.random.Generator
+    found: Mapping[Pair, Mapping[str, Values]], columns: Sequence[str]
 ) -> tuple[dict[Pair, Ratios], list[list[str]], list[list[str]]]:
     """Ratios of errors to a random choice; rows of the errors and of these, one a regressor and dataset."""
-    against = {
-        pair: {name: ratio_to_random(by[name], by["random"], rng) for name in SCORES} for pair, by in found.items()
-    }
+    against = {pair: {name: ratio_to_random(by[name], by["random"]) for name in SCORES} for pair, by in found.items()}
     errors = [[_label(*pair), *(mean_std(by[name].tolist()) for name in columns)] for pair, by in found.items()]
     ratios = [[_label(*pair), *(_interval(by[name]) for name in SCORES)] for pair, by in against.items()]
     return against, errors, ratios
@@ -182,7 +167,7 @@ def _ratio_image(result: RegressionResult, against: Mapping[Pair, Ratios]) -> Im
         axes = figure.add_subplot()
         places, shades = np.arange(len(SCORES), dtype=float), ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
         for index, ((agent, variant), estimates) in enumerate(against.items()):
-            values = np.array([estimates[name] for name in SCORES])
+            values = np.array([estimates[name][:3] for name in SCORES])
             off = places + 0.8 * ((index + 0.5) / len(against) - 0.5)
             marker = "osDv^"[protocol.agents.index(agent) % 5]
             shade = shades[protocol.variants.index(variant) % 5]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -14,13 +14,14 @@ from imagine_bench.errors import ArtefactError, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.machine import describe_environment
 from imagine_bench.protocols.task_types import task_type
-from imagine_bench.report.text import agent_words, few_words, mean_text, origin, percent
-from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
+from imagine_bench.report.text import agent_words, origin
+from imagine_bench.seeding import Purpose, evaluation_split
 from imagine_bench.store.bench_folder import newest_bench, require_either
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json
 from imagine_bench.store.trained import Trained, learners, load_trained, protocol_of_agents, require_control
 
 Value = TypeVar("Value")
+MEANS = "mean over seeds [95 % interval over seeds]."  # what the figures of a table are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +40,9 @@ class Measured(Generic[Value]):
 
 
 class Groups(dict[tuple[str, int], list[Value]]):
-    """The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these.
+    """The seeds of an agent after so many real episodes; runs of an unfinished bench may differ in these."""
 
-    Intervals are drawn from a generator of the analysis' own, by its ``name``.
-    """
-
-    def __init__(self, runs: Sequence[Measured[Value]], name: str) -> None:
-        self._seeds = SeedTree(0).child("report", name)
+    def __init__(self, runs: Sequence[Measured[Value]]) -> None:
         for run in runs:
             self.setdefault((run.agent, run.episodes), []).append(run.value)
 
@@ -53,16 +50,6 @@ class Groups(dict[tuple[str, int], list[Value]]):
     def titles(self) -> list[str]:
         """What each group is called."""
         return [f"{agent_words(agent).title}, {episodes:,} episodes" for agent, episodes in self]
-
-    @property
-    def caution(self) -> str:
-        """What the figures are, and a warning where few seeds carry an interval."""
-        fewest = min((len(seeds) for seeds in self.values() if len(seeds) > 1), default=1)
-        return " ".join(["mean over seeds [95 % interval over seeds].", *few_words(fewest)])
-
-    def cell(self, values: Sequence[float], name: str, words: Callable[[float], str] = percent) -> str:
-        """Mean over seeds with its interval."""
-        return mean_text(values, self._seeds.child(name).generator(), words)
 
 
 class Analysis(ABC, Generic[Value]):

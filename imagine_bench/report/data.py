@@ -9,7 +9,7 @@ import numpy as np
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
-from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
 
@@ -17,8 +17,8 @@ BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 
 _SUMMARY_COLUMNS = (
     *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
-    *("difference_to_dqn", "difference_low_95", "difference_high_95", "gain", "gain_low_95", "gain_high_95"),
-    *("thesis_gain", "area", "area_low_95", "area_high_95"),
+    *("difference_to_dqn", "difference_low_95", "difference_high_95", "p", "p_holm", "detectable_difference"),
+    *("gain", "gain_low_95", "gain_high_95", "thesis_gain", "area", "area_low_95", "area_high_95"),
 )
 
 
@@ -38,10 +38,17 @@ class Score:
 class Comparison:
     """An agent against DQN at one budget; NaN ends where one seed allows no interval."""
 
-    # difference of the interquartile means of the success shares, with its 95 % interval
+    # difference of the interquartile means of the success shares, with its 95 % interval and p-value
     difference: statistics.Estimate
+    p_adjusted: float  # of the difference, by Holm over all comparisons of the report; NaN with one seed
+    detectable: float  # the smallest difference that this cell would have shown with probability 80 %; NaN likewise
     gain: statistics.Estimate  # (P_aug - P_base) / P_base of the means over seeds, with its interval
     thesis_gain: float | None  # the thesis' gain at this budget, or None
+
+    @property
+    def shown(self) -> int:
+        """1 where the agent is ahead, -1 where it is behind, 0 where no difference is shown."""
+        return int(np.sign(self.difference.value)) if self.p_adjusted < 1.0 - statistics.LEVEL else 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +61,15 @@ class Timing:
     env_steps: float  # real training macro-actions of one run
     test_steps: int  # test macro-actions of all runs
     faults: int  # those whose physics disagreed with the rules
+
+
+@dataclass(frozen=True, kw_only=True)
+class Price:
+    """What one run had had until a budget, means over seeds."""
+
+    env_steps: float  # real training macro-actions
+    updates: float  # gradient updates of all networks; NaN where the agent counts none
+    train_cpu_s: float  # CPU seconds of training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +100,8 @@ class ReportData:
 
     ``reached`` holds for each seed the first budget from which on success never falls below the task's
     ``success_threshold``, or None.
-    ``prices`` holds, for each budget, real macro-actions and CPU seconds of training until then, means over seeds.
+    ``prices`` holds what each agent had had until each budget, and ``frames_before`` the frames that its encoder was
+    trained on, None where that is not known.
     ``areas`` holds the area under each learner's success curve from episode 0, where it is at the chance level, to each
     budget, divided by the budget: the mean success until then, with its interval over seeds.
     """
@@ -100,7 +117,8 @@ class ReportData:
     reached: dict[str, tuple[int | None, ...]]
     areas: dict[str, dict[int, statistics.Estimate]]
     timing: dict[str, Timing]
-    prices: dict[str, dict[int, tuple[float, float]]]
+    prices: dict[str, dict[int, Price]]
+    frames_before: dict[str, int | None]
     thesis: dict[str, dict[int, tuple[float, float]]]
     thesis_gains: dict[str, dict[int, float]]
     thesis_source: str
@@ -129,7 +147,7 @@ class ReportData:
 
 
 def collect(result: BenchResult) -> ReportData:
-    """Compute a report's numbers. The same result gives the same bits: the bootstrap's seed is the protocol's hash."""
+    """Compute a report's numbers."""
     spec = registry.task(result.protocol.task)
     facts, agents = spec.facts(), result.protocol.agents
     learners = [agent for agent in agents if registry.agent_entry(agent).learns]
@@ -149,6 +167,7 @@ def collect(result: BenchResult) -> ReportData:
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
+        frames_before={agent: _frames_before(result, agent) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
         thesis_gains={agent: gains for agent, gains in thesis_gains.items() if gains},
         thesis_source=reference.success_source(spec.reference) if spec.reference else "",
@@ -178,8 +197,9 @@ def summary_csv(data: ReportData) -> str:
             row: list[object] = [agent, budget, len(score.by_seed), score.value, score.low, score.high, score.over]
             row += list(score.thesis or ("", ""))
             versus = data.comparisons.get(agent, {}).get(budget)
-            row += [*versus.difference, *versus.gain, versus.thesis_gain] if versus else [""] * 7
-            rows.append(row + list(data.areas.get(agent, {}).get(budget, [""] * 3)))
+            columns = (*versus.difference, versus.p_adjusted, versus.detectable, *versus.gain[:3]) if versus else ()
+            row += [*columns, versus.thesis_gain] if versus else [""] * 10
+            rows.append(row + list(data.areas[agent][budget][:3] if agent in data.areas else [""] * 3))
     return csv_text(rows)
 
 
@@ -214,7 +234,7 @@ def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, floa
     scores = {}
     for index, budget in enumerate(result.protocol.budgets):
         shares = result.success_rates(agent)[:, index]  # [seeds]
-        (low, high), over = statistics.bootstrap_interval(shares, _rng(result, agent, budget)), "seeds"
+        (low, high), over = statistics.interval(shares, trials=result.protocol.evaluation_episodes), "seeds"
         if len(shares) == 1:
             checkpoint = result.of(agent)[0].checkpoints[index]
             (low, high), over = statistics.wilson(checkpoint.successes, checkpoint.test_episodes), "episodes"
@@ -228,18 +248,21 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
     agents = result.protocol.agents
     if BASE_AGENT not in agents:
         return {}
-    base = result.success_rates(BASE_AGENT)
-    comparisons: dict[str, dict[int, Comparison]] = {}
-    for agent in (each for each in agents if each != BASE_AGENT and registry.agent_entry(each).learns):
-        treated = result.success_rates(agent)
-        comparisons[agent] = {}
-        for index, budget in enumerate(result.protocol.budgets):
-            rng = _rng(result, agent, budget, "comparison")
-            comparisons[agent][budget] = Comparison(
-                difference=statistics.difference(treated[:, index], base[:, index], rng),
-                gain=statistics.gain(treated[:, index], base[:, index], rng),
-                thesis_gain=thesis[agent].get(budget),
-            )
+    treated = [each for each in agents if each != BASE_AGENT and registry.agent_entry(each).learns]
+    rates, budgets = {agent: result.success_rates(agent) for agent in (*treated, BASE_AGENT)}, result.protocol.budgets
+    trials, cells = result.protocol.evaluation_episodes, [(agent, i) for agent in treated for i in range(len(budgets))]
+    pairs = [(rates[agent][:, index], rates[BASE_AGENT][:, index]) for agent, index in cells]
+    found = [statistics.difference(*pair, trials=trials) for pair in pairs]
+    adjusted = statistics.holm([each.p for each in found]).tolist()
+    comparisons: dict[str, dict[int, Comparison]] = {agent: {} for agent in treated}
+    for (agent, index), pair, difference, p_adjusted in zip(cells, pairs, found, adjusted, strict=True):
+        comparisons[agent][budgets[index]] = Comparison(
+            difference=difference,
+            p_adjusted=p_adjusted,
+            detectable=statistics.detectable(*pair, cells=len(cells), trials=trials),
+            gain=statistics.gain(*pair, trials=trials),
+            thesis_gain=thesis[agent].get(budgets[index]),
+        )
     return comparisons
 
 
@@ -318,12 +341,10 @@ def _reached(result: BenchResult, agent: str, threshold: float) -> tuple[int | N
 def _areas(result: BenchResult, agent: str, chance_level: float) -> dict[int, statistics.Estimate]:
     budgets = result.protocol.budgets
     means = statistics.running_means(budgets, result.success_rates(agent), chance_level)  # [seeds, B]
+    trials = result.protocol.evaluation_episodes
     return {
-        budget: statistics.Estimate(
-            statistics.iqm(means[:, index]),
-            *statistics.bootstrap_interval(means[:, index], _rng(result, agent, budget, "area")),
-        )
-        for index, budget in enumerate(budgets)
+        budget: statistics.Estimate(statistics.iqm(column), *statistics.interval(column, trials=trials))
+        for budget, column in zip(budgets, means.T, strict=True)
     }
 
 
@@ -341,10 +362,25 @@ def _timing(runs: tuple[RunResult, ...], *, learns: bool) -> Timing:
     )
 
 
-def _prices(runs: tuple[RunResult, ...]) -> dict[int, tuple[float, float]]:
-    costs = np.array([[(row.env_steps, row.train_cpu_s) for row in run.checkpoints] for run in runs])  # [runs, B, 2]
-    budgets = [row.episodes for row in runs[0].checkpoints]
-    return {budget: (float(steps), float(cpu_s)) for budget, (steps, cpu_s) in zip(budgets, costs.mean(0), strict=True)}
+def _prices(runs: tuple[RunResult, ...]) -> dict[int, Price]:
+    rows = zip(*(run.checkpoints for run in runs), strict=True)
+    return {
+        seeds[0].episodes: Price(
+            env_steps=float(np.mean([row.env_steps for row in seeds])),
+            updates=float(np.mean([row.diagnostics.get("gradient_updates", float("nan")) for row in seeds])),
+            train_cpu_s=float(np.mean([row.train_cpu_s for row in seeds])),
+        )
+        for seeds in rows
+    }
+
+
+def _frames_before(result: BenchResult, agent: str) -> int | None:
+    """Frames that the encoder of an agent was trained on, by its card; 0 for an agent that has none."""
+    entry = registry.agent_entry(agent)
+    if not entry.needs_encoder:
+        return 0
+    card = encoders.card(result.protocol.encoder_of(entry.encoder_kind))
+    return None if card is None else int(card["recipe"]["frames"])
 
 
 def _learner_cpu_s(run: RunResult) -> float:
@@ -356,7 +392,3 @@ def _learner_cpu_s(run: RunResult) -> float:
             total = np.nansum([total, sum(parts) * (checkpoint.env_steps - before)])
         before = checkpoint.env_steps
     return float(total)
-
-
-def _rng(result: BenchResult, *names: str | int) -> np.random.Generator:
-    return SeedTree(int(result.protocol_hash, 16)).child("report", *names).generator()

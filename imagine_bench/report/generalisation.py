@@ -12,7 +12,8 @@ from imagine_bench import reference
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.generalisation import Generalisation, Predictions, generalisation, predict, transition_set
-from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
+from imagine_bench.report.analysis import MEANS, Analysis, Groups, Measured, analyse, markdown
+from imagine_bench.report.text import mean_text
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.trained import Trained
 
@@ -63,19 +64,19 @@ class GeneralisationAnalysis(Analysis[Found]):
 
     def table(self, runs: Sequence[Measured[Found]]) -> str:
         """Means over the seeds of each agent with 95 % intervals, as Markdown, the thesis' figure beside them."""
-        spec, groups = self.spec, Groups(runs, self.name)
+        spec, groups = self.spec, Groups(runs)
         thesis = {} if spec.reference is None else reference.load(spec.reference).get("generalisation", {})
         terminal = self.transitions.terminal
         unseen = int(terminal.sum())
         heads = [f"{title} ({len(seeds)} seed(s))" for title, seeds in zip(groups.titles, groups.values(), strict=True)]
         rows = []
         for name, (figure, words) in _ROWS.items():
-            cells = [groups.cell([attrgetter(figure)(found) for _, found in seeds], name) for seeds in groups.values()]
+            cells = [mean_text([attrgetter(figure)(found) for _, found in seeds]) for seeds in groups.values()]
             there = f"{thesis['correct']} (of {thesis['attempted']})" if name == "unseen" and thesis else "–"
             if any(cell != "–" for cell in (*cells, there)):
                 rows.append([words, *cells, there])
         lines = [
-            f"{unseen} transitions out of terminal macrostates, {len(terminal) - unseen} others; {groups.caution}",
+            f"{unseen} transitions out of terminal macrostates, {len(terminal) - unseen} others; {MEANS}",
             "",
             *markdown([spec.title, *heads, "thesis"], rows),
             "",
@@ -116,9 +117,9 @@ def _by_consequence(groups: Groups[Found]) -> list[str]:
     for title, seeds in zip(groups.titles, groups.values(), strict=True):
         for name, first in seeds[0][1].consequences.items():
             scores = [found.consequences[name] for _, found in seeds]
-            right = groups.cell([one.right for one in scores], f"{name} right")
-            end = groups.cell([one.end_right for one in scores], f"{name} end")
-            reward = groups.cell([one.reward_error for one in scores], f"{name} reward", "{:.2f}".format)
+            right = mean_text([one.right for one in scores])
+            end = mean_text([one.end_right for one in scores])
+            reward = mean_text([one.reward_error for one in scores], "{:.2f}".format)
             rows.append([title, name, first.count, right, end, reward])
     head = ("agent", "consequence", "transitions", "next macrostate right, %", "end right, %", "reward's mean error")
     return ["The others, by what the rules say comes of them:", "", *markdown(head, rows)]
@@ -130,9 +131,9 @@ def _by_visit_count(groups: Groups[Found]) -> list[str]:
     for title, seeds in zip(groups.titles, groups.values(), strict=True):
         for name in seeds[0][1].visit_counts:
             scores = [found.visit_counts[name] for _, found in seeds]
-            count = groups.cell([float(one.count) for one in scores], f"{name} count", "{:.0f}".format)
-            right = groups.cell([one.right for one in scores], f"{name} right")
-            likeliest = groups.cell([one.likeliest_right for one in scores], f"{name} likeliest")
+            count = mean_text([float(one.count) for one in scores], "{:.0f}".format)
+            right = mean_text([one.right for one in scores])
+            likeliest = mean_text([one.likeliest_right for one in scores])
             rows.append([title, name, count, right, likeliest])
     if not rows:
         return []

@@ -129,7 +129,7 @@ def aligned(rows: list[list[str]]) -> list[str]:
 def _interval_words(data: ReportData) -> str:
     if len(data.result.protocol.seeds) == 1:
         return "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
-    return "95 % interval over seeds (bootstrap), given the test episodes, which are the same for every agent"
+    return "95 % interval over seeds (Student's, of the trimmed mean)"
 
 
 def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:

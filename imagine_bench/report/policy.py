@@ -10,8 +10,8 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.policy import FRAMES, Terminations, action_shares, eval_states, optimal_length, terminations
-from imagine_bench.report.analysis import Analysis, Groups, Measured, analyse, markdown
-from imagine_bench.report.text import agent_words, percent
+from imagine_bench.report.analysis import MEANS, Analysis, Groups, Measured, analyse, markdown
+from imagine_bench.report.text import agent_words, mean_text, percent
 from imagine_bench.seeding import Purpose
 from imagine_bench.store.trained import Trained
 
@@ -47,17 +47,17 @@ class PolicyAnalysis(Analysis[Terminations]):
 
     def table(self, runs: Sequence[Measured[Terminations]]) -> str:
         """Means over the seeds of each agent with 95 % intervals, and the starts that are missed most, as Markdown."""
-        groups = Groups(runs, self.name)
+        groups = Groups(runs)
         head = ["agent", "real episodes", "seeds", *(f"{words}, %" for words in _SHARES.values())]
         rows = []
         for (agent, episodes), seeds in groups.items():
             means = {name: [float(getattr(each, name).mean()) for each in seeds] for name in (*_SHARES, "length")}
-            cells = [groups.cell(means[share], f"{agent} {share}") for share in _SHARES]
-            length = groups.cell(means["length"], f"{agent} length", "{:.2f}".format)
+            cells = [mean_text(means[share]) for share in _SHARES]
+            length = mean_text(means["length"], "{:.2f}".format)
             rows.append([agent_words(agent).title, f"{episodes:,}", len(seeds), *cells, length])
         lines = [
             f"All {len(self._optimal)} starts, followed by the rules; every visit of a macrostate shows one of "
-            f"{FRAMES} frames of it; {groups.caution}",
+            f"{FRAMES} frames of it; {MEANS}",
             "",
             *markdown([*head, f"macro-actions (optimal: {self._optimal.mean():.2f})"], rows),
             "",

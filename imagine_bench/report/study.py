@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from imagine_bench import statistics
 from imagine_bench.report.analysis import markdown
 from imagine_bench.report.plots import image
-from imagine_bench.report.text import estimate_text, few_words, percent
+from imagine_bench.report.text import estimate_text, percent
 from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.studies.study import Line, Study
 
@@ -43,7 +43,7 @@ def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
     head = (
         f"# {study.question}\n\n{study.execution}, {study.appearance}, tuning seeds "
         f"{', '.join(map(str, study.seeds))}, {study.evaluation_episodes} test episodes; interquartile means, "
-        f"differences in points with 95 % bootstrap intervals over seeds. {' '.join(few_words(len(study.seeds)))}\n\n"
+        "differences in points with 95 % intervals over seeds, each alone: of many, some exclude zero by chance.\n\n"
     )
     compared = [line for line in lines if line.difference]
     if compared:
@@ -78,7 +78,7 @@ def _summary(study: Study, lines: Sequence[Line]) -> str:
     ]
     for line in lines:
         for index, budget in enumerate(study.budgets):
-            estimate = line.difference[index] if line.difference else ("", "", "")
+            estimate = line.difference[index][:3] if line.difference else ("", "", "")
             variant, iqm = line.variant, statistics.iqm(line.success[:, index])
             rows.append([
                 variant.factor, variant.name, variant.agent, budget, f"{iqm:.6g}", variant.against or "", *estimate,
@@ -96,7 +96,7 @@ def _figure(study: Study, compared: Sequence[Line]) -> Figure:
         axes.axvline(0.0, color="#2b2b2f", linewidth=1.0)
         for row, line in enumerate(compared):
             assert line.difference is not None
-            value, low, high = (100.0 * number for number in line.difference[index])
+            value, low, high = (100.0 * number for number in line.difference[index][:3])
             color = _HELPS if low > 0 else _HURTS if high < 0 else _UNCLEAR
             axes.plot([low, high], [row, row], color=color)
             axes.plot([value], [row], marker="o", markersize=5, color=color)

@@ -13,7 +13,6 @@ from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate
 
-FEW_SEEDS = 5  # below this the bootstrap interval is hardly more than the range of the seeds, and the report says so
 _NAMED = 4  # missing runs that are named; the others are counted
 
 
@@ -54,14 +53,14 @@ def signed_percent(share: float) -> str:
     return DASH if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
 
 
-def mean_text(values: Sequence[float], rng: np.random.Generator, words: Callable[[float], str] = percent) -> str:
+def mean_text(values: Sequence[float], words: Callable[[float], str] = percent) -> str:
     """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
     if any(math.isnan(value) for value in values):
         return DASH
     mean = words(float(np.mean(values)))
     if len(values) == 1:
         return mean
-    low, high = statistics.bootstrap_interval(values, rng, statistic="mean")
+    low, high = statistics.interval(values, trim=0.0, share=words is percent)
     return f"{mean} [{words(low)}, {words(high)}]"
 
 
@@ -110,14 +109,19 @@ def answers(data: ReportData) -> list[str]:
         sentences.append(
             "Whether imagination helps cannot be said from this run: it needs dqn and an imagining agent side by side."
         )
-    return sentences + few_words(len(data.result.protocol.seeds))
+    return sentences
 
 
-def few_words(count: int, noun: str = "seeds") -> list[str]:
-    """A sentence of warning where a bootstrap interval rests on few."""
-    if not 1 < count < FEW_SEEDS:
-        return []
-    return [f"With only {count} {noun} an interval is hardly more than their range, and too narrow: read it as a hint."]
+def detectable_words(comparisons: Mapping[str, Mapping[int, Comparison]]) -> str:
+    """How small a difference a table of comparisons could have shown; empty with one seed."""
+    sizes = [each.detectable for by_budget in comparisons.values() for each in by_budget.values()]
+    if not sizes or any(math.isnan(size) for size in sizes):
+        return ""
+    least, most = percent(min(sizes)), percent(max(sizes))
+    return (
+        f"Ahead or behind: p < 0.05 after Holm's correction for all {len(sizes)} comparisons. With these seeds the "
+        f"smallest difference that would be shown with probability 80 % is {least} to {most} points, by cell."
+    )
 
 
 def _largest_area(data: ReportData) -> str:
@@ -151,25 +155,22 @@ def _verdict(data: ReportData, agent: str) -> str:
     if math.isnan(difference.low):
         return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
-    verdict = "which includes zero, so at this budget no difference is shown"
-    if difference.low > 0 or difference.high < 0:
-        verdict = f"so at this budget it is {'ahead' if difference.low > 0 else 'behind'}"
-    return f"{head} ({interval}), {verdict}. {_over_budgets(comparisons, len(data.result.protocol.seeds))}"
+    adjusted = comparisons[budget].p_adjusted
+    chance = "p < 0.001" if adjusted < 0.001 else f"p = {adjusted:.3f}"
+    verdict = {1: "it is ahead", -1: "it is behind", 0: "no difference is shown"}[comparisons[budget].shown]
+    return f"{head} ({interval}; {chance}, corrected): at this budget {verdict}. {_over_budgets(comparisons)}"
 
 
-def _over_budgets(comparisons: dict[int, Comparison], seeds: int) -> str:
+def _over_budgets(comparisons: dict[int, Comparison]) -> str:
     if len(comparisons) < 2:
         return ""
-    ahead = [budget for budget, comparison in comparisons.items() if comparison.difference.low > 0]
-    behind = [budget for budget, comparison in comparisons.items() if comparison.difference.high < 0]
-    clearly = "clearly " if seeds >= FEW_SEEDS else ""
-    parts = [
-        f"{clearly}{word} at {_listing([f'{budget:,}' for budget in budgets])}"
-        for budgets, word in ((ahead, "ahead"), (behind, "behind"))
-        if budgets
-    ]
+    shown = {
+        word: [f"{budget:,}" for budget, comparison in comparisons.items() if comparison.shown == sign]
+        for word, sign in (("ahead", 1), ("behind", -1))
+    }
+    parts = [f"{word} at {_listing(budgets)}" for word, budgets in shown.items() if budgets]
     if not parts:
-        return f"At none of the {len(comparisons)} budgets does the interval exclude zero."
+        return f"At none of the {len(comparisons)} budgets is a difference shown."
     most = max(comparisons, key=lambda budget: abs(comparisons[budget].difference.value))
     return (
         f"Over all budgets it is {' and '.join(parts)} real episodes (of {len(comparisons)} budgets); the largest "

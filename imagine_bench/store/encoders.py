@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from imagine_bench.errors import ArtefactError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
@@ -53,3 +54,11 @@ def kind(path: Path) -> str:
 def identity(path: Path) -> str:
     """What stands for an encoder in a protocol: its name and 12 digits of its digest, or ArtefactError."""
     return f"{path.stem}@{sha256(path)[:12]}"
+
+
+def card(used: str | None) -> dict[str, Any] | None:
+    """The card of a bundled encoder by its identity; None where none such is bundled. Raises ArtefactError: damaged."""
+    path = None if used is None else bundled().get(used.partition("@")[0])
+    if path is None or identity(path) != used or not path.with_suffix(".json").is_file():
+        return None
+    return read_json(path.with_suffix(".json"), "an encoder's card")

@@ -20,7 +20,7 @@ from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import TASKS
-from imagine_bench.seeding import TUNING_SEEDS, SeedTree, is_tuning_seed
+from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult
 
@@ -131,8 +131,6 @@ def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Enco
 def _differences(study: Study, variant: Variant, success: Mapping[str, NDArray[np.float64]]) -> tuple[Estimate, ...]:
     ours, theirs = success[variant.name], success[str(variant.against)]
     return tuple(
-        difference(
-            ours[:, index], theirs[:, index], SeedTree(0).child("study", study.name, variant.name, budget).generator()
-        )
+        difference(ours[:, index], theirs[:, index], trials=study.evaluation_episodes)
         for index, budget in enumerate(study.budgets)
     )

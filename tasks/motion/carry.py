@@ -29,7 +29,6 @@ _PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
 _LOST_M = 0.003
 """Fingers that close so much further than the object is wide have lost it."""
 _MAX_TILT_RAD = math.radians(12)
-_HALF_TURN_RAD = math.pi
 
 
 class CarryExecutor:
@@ -55,7 +54,7 @@ class CarryExecutor:
         spec, pose = OBJECTS[index], self._measure(data, index, np.array(standing_m(index)))
         if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, None, f"the {spec.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
-        yaw_rad = _nearest_to_zero(pose.yaw_rad) if spec.upright else 0.0
+        yaw_rad = pose.yaw_rad if spec.upright else 0.0
         try:
             reach = self._solve(pose.position_m, yaw_rad, self._slots[index])
         except UnreachableTargetError as error:
@@ -114,7 +113,7 @@ class CarryExecutor:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
         spec, pose = OBJECTS[index], self._measure(data, index, self._rest_tcp_m)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
-        turn_rad = 0.0 if yaw_rad is None or not spec.upright else _nearest_to_zero(yaw_rad - pose.yaw_rad)
+        turn_rad = 0.0 if yaw_rad is None or not spec.upright else yaw_rad - pose.yaw_rad
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         held_m = pose.position_m - self._rest_tcp_m
         turned_m = np.array([cos * held_m[0] - sin * held_m[1], sin * held_m[0] + cos * held_m[1], held_m[2]])
@@ -164,11 +163,6 @@ class CarryExecutor:
 
 def _up(height_m: float) -> Floats:
     return np.array([0.0, 0.0, height_m])
-
-
-def _nearest_to_zero(yaw_rad: float) -> float:
-    """The heading of the same two opposite sides within a quarter turn of 0: fingers grip both alike."""
-    return yaw_rad - round(yaw_rad / _HALF_TURN_RAD) * _HALF_TURN_RAD
 
 
 def _waypoints(reach: Reach, before_m: float, after_m: float) -> list[Waypoint]:

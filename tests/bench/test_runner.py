@@ -252,3 +252,22 @@ def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> N
 def test_every_registered_agent_has_a_target() -> None:
     for entry in registry.AGENTS.values():
         assert callable(registry.load(entry.make))
+
+
+def test_test_episodes_are_greedy_and_training_explores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    act = bench_fakes.TableAgent.act
+
+    def telling(agent: Any, observation: Any, *, explore: bool) -> int:
+        asked.append(explore)
+        return act(agent, observation, explore=explore)
+
+    monkeypatch.setattr(bench_fakes.TableAgent, "act", telling)
+    counts, env = EvaluationCounts(), gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    for _ in range(3):
+        play_test_episode(counts, env, bench_fakes.TableAgent(context()), privileged=False, purpose="evaluation")
+    env.close()
+    assert len(asked) == counts.env_steps > 0 and not any(asked)
+    asked.clear()
+    result = do(tmp_path / "run", open_loop_starts=0)
+    assert sum(asked) == result.training_length.sum(), "each training step explores, and no step of a test"

@@ -135,7 +135,9 @@ def test_chosen_variants_bring_what_they_are_compared_with() -> None:
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_settings_of_every_study_exist(name: str) -> None:
     for variant in STUDIES[name].variants:
-        registry.load(registry.agent_entry(variant.agent).settings).resolve("fast", variant.settings, "chapter_5")
+        settings = registry.load(registry.agent_entry(variant.agent).settings)
+        changed = settings.resolve("fast", variant.settings, "chapter_5")
+        assert (changed == settings.resolve("fast", {}, "chapter_5")) == (not variant.settings)
 
 
 def test_the_table_says_what_helps() -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import warnings
 from collections import Counter
 
 import gymnasium
@@ -47,16 +48,22 @@ def env(request):
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_s_checker_is_content(task, execution):
     env = make(task, execution=execution, render_mode="rgb_array", width=64, height=48)
-    check_env(env.unwrapped, skip_render_check=execution == "physics")
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped, skip_render_check=execution == "physics")
     env.close()
+    assert not complaints, [str(each.message) for each in complaints]
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_stable_baselines_checker_is_content(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     env = make(task, **KINEMATIC)
-    checker.check_env(env, warn=True)
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        checker.check_env(env, warn=True)
     env.close()
+    assert not complaints, [str(each.message) for each in complaints]
 
 
 # --- spaces, info, ends ------------------------------------------------------------------------------------------

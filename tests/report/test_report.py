@@ -24,7 +24,9 @@ from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
 from imagine_bench.report.data import _nan_mean, collect
 from imagine_bench.report.sections.imagination import encoder_views
+from imagine_bench.report.sections.success import gain
 from imagine_bench.report.text import percent, signed_percent
+from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult
 
 
@@ -225,7 +227,8 @@ def test_markdown_agrees_with_the_tables(result: BenchResult, folder: Path) -> N
         for index, seed in enumerate(result.protocol.seeds):
             assert seeds[title, str(seed)] == [percent(share) for share in result.success_rates(agent)[index]]
     header = next(row for row in table if row[0] == "solved (%) after")
-    scores = {row[0]: dict(zip(header, row, strict=True)) for row in table if len(row) == len(header)}
+    first = table.index(header)
+    scores = {row[0]: dict(zip(header, row, strict=True)) for row in table[first : first + 2 + len(titles)]}
     for row in rows(folder / "summary.csv"):
         cell = scores[titles[row["agent"]]][f"{int(row['episodes']):,}"]
         assert cell.startswith(percent(float(row["success_iqm"])))
@@ -309,9 +312,9 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "so at this budget it is ahead"),
-        ([50, 52, 54], "so at this budget it is behind"),
-        ([80, 100, 140], "which includes zero, so at this budget no difference is shown"),
+        ([150, 152, 154], "corrected): at this budget it is ahead."),
+        ([50, 52, 54], "corrected): at this budget it is behind."),
+        ([80, 100, 140], "corrected): at this budget no difference is shown."),
     ],
 )
 def test_the_answer_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
@@ -360,15 +363,21 @@ def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult)
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("count", "warned"), [(1, False), (2, True), (4, True), (5, False)])
-def test_few_seeds_are_called_few(count: int, warned: bool) -> None:
-    assert bool(words.few_words(count)) is warned
-
-
-@pytest.mark.parametrize("agents", [("dqn", "imagination"), ("imagination", "imagination_uncertainty"), ("dqn",)])
-def test_few_seeds_are_called_few_whoever_is_compared(agents: tuple[str, ...], tmp_path: Path) -> None:
-    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, budgets=(5, 10))
-    assert words.few_words(3)[0] in words.answers(collect(bench_result(tmp_path, protocol=protocol)))
+def test_a_difference_is_shown_only_after_holm_s_correction(result: BenchResult) -> None:
+    """The same difference counts less among more comparisons, and what could have been shown stands below the table."""
+    changed = shifted(shifted(result, "dqn", [90, 100, 110]), "imagination", [116, 126, 136])
+    data = collect(changed)
+    one, budgets = data.comparisons["imagination"][2000], len(data.budgets)
+    assert (
+        one.difference.p < 0.05 < one.p_adjusted <= budgets * len(data.comparisons) * one.difference.p
+        and one.shown == 0
+    )
+    assert "no difference is shown" in "".join(words.answers(data))
+    said = words.detectable_words(data.comparisons)
+    sizes = [each.detectable for by_budget in data.comparisons.values() for each in by_budget.values()]
+    assert f"{percent(min(sizes))} to {percent(max(sizes))} points" in said
+    assert f"all {len(sizes)} comparisons" in said
+    assert said in " ".join(table.caption for table in gain(data).tables)
 
 
 def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(result: BenchResult) -> None:
@@ -434,3 +443,52 @@ def test_no_two_registered_agents_share_a_color() -> None:
 def test_infinite_uncertainty_stays_and_unknown_is_left_out() -> None:
     table = np.array([[1.0, np.inf, np.nan, np.nan], [3.0, 2.0, 4.0, np.nan]])
     np.testing.assert_array_equal(_nan_mean(table), [2.0, np.inf, 4.0, np.nan])
+
+
+def _with(result: BenchResult, agent: str, shares: list[float], diagnostics: list[dict[str, float]]) -> BenchResult:
+    """The result, in which each seed of an agent always succeeds in a given share of tests and says something."""
+    values = iter(zip(shares, diagnostics, strict=True))
+    runs = []
+    for run in result.runs:
+        if run.agent == agent:
+            share, said = next(values)
+            rows = [
+                dataclasses.replace(row, successes=round(share * row.test_episodes), diagnostics=said)
+                for row in run.checkpoints
+            ]
+            run = dataclasses.replace(run, checkpoints=tuple(rows))  # noqa: PLW2901
+        runs.append(run)
+    return dataclasses.replace(result, runs=tuple(runs))
+
+
+def test_acceptance_is_the_mean_over_seeds(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1, 2))
+    said = [{"imagination/acceptance_rate": rate} for rate in (0.2, 0.9, 0.4)]
+    data = collect(_with(bench_result(tmp_path, protocol=protocol), "imagination_uncertainty", [0.5] * 3, said))
+    assert data.acceptance["imagination_uncertainty"] == pytest.approx(dict.fromkeys(protocol.budgets, 0.5))
+
+
+def test_the_area_begins_at_the_chance_level(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1))
+    data = collect(_with(bench_result(tmp_path, protocol=protocol), "dqn", [1.0, 1.0], [{}, {}]))
+    chance, first = data.facts.chance_level, protocol.budgets[0]
+    assert 0.0 < chance < 0.2
+    assert data.areas["dqn"][first].value == pytest.approx((chance + 1.0) / 2.0)
+    last = protocol.budgets[-1]
+    assert data.areas["dqn"][last].value == pytest.approx(1.0 - (1.0 - chance) / 2.0 * first / last)
+
+
+def test_an_interval_that_touches_zero_shows_no_difference(result: BenchResult) -> None:
+    def say(low: float, high: float) -> str:
+        data = collect(result)
+        rows = data.comparisons["imagination"]
+        row = dataclasses.replace(rows[data.decisive_budget], difference=Estimate(0.1, low, high))
+        changed = {**data.comparisons, "imagination": dict.fromkeys(rows, row)}
+        answers = words.answers(dataclasses.replace(data, comparisons=changed))
+        return next(answer for answer in answers if answer.startswith("“imagination” "))
+
+    for low, high in [(0.0, 0.2), (-0.2, 0.0), (0.0, 0.0)]:
+        said = say(low, high)
+        assert "no difference is shown" in said and "does the interval exclude zero" in said
+        assert "ahead" not in said and "behind" not in said
+    assert "ahead" in say(0.001, 0.2) and "behind" in say(-0.2, -0.001)

@@ -74,7 +74,7 @@ def test_the_widest_report_can_be_read(seeds: tuple[int, ...], tmp_path: Path, m
     folder = write_report(make(tmp_path, agents, budgets, seeds)).parent
     check_report(folder)
     widest = max(read_tables((folder / "index.html").read_text(encoding="utf-8")), key=lambda table: len(table[0]))
-    assert len(widest[0]) == 13 and narrowest_px(widest) > 800  # ten budgets, one name, two prices: not vacuous
+    assert len(widest[0]) == 12 and narrowest_px(widest) > 700  # ten budgets, a name and a seed: not vacuous
 
 
 def test_reports_of_few_runs_can_be_read(tmp_path: Path) -> None:

@@ -80,6 +80,8 @@ def test_a_tuple_among_the_settings_is_the_list_of_its_file(tmp_path: Path) -> N
     protocol = small(overrides=(("controller.hidden", (64, 64)),))
     for _ in range(2):
         BenchStore(bench_folder(tmp_path, protocol), protocol).open()
+    kept = json.loads((bench_folder(tmp_path, protocol) / "protocol.json").read_text())
+    assert kept == json.loads(json.dumps(protocol.as_dict())) and [64, 64] in kept["overrides"][0]
 
 
 def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:

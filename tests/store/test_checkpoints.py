@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,8 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.store import checkpoints as checkpointing
 from imagine_bench.store.checkpoints import Snapshot, load_newest, load_snapshot, save_snapshot
+from imagine_bench.store.counters import Counters, EvaluationCounts
+from imagine_bench.store.results import Checkpoint
 
 
 def snapshot(episode: int = 3) -> Snapshot:
@@ -113,3 +117,43 @@ def test_a_foreign_state_is_named(tmp_path: Path, content: str) -> None:
     with pytest.raises(ArtefactError, match=r"state\.json .*left untouched"):
         load_newest(tmp_path)
     assert (folder / "state.json").read_text() == content
+
+
+_watch: list[Callable[[str], None]] = []
+sys.addaudithook(lambda event, _: [call(event) for call in _watch[:1]] and None)
+
+
+def test_a_whole_checkpoint_is_there_at_every_moment_of_a_save(tmp_path: Path) -> None:
+    save_snapshot(tmp_path, snapshot(1))
+    seen: list[int] = []
+
+    def look(event: str) -> None:
+        if event.startswith(("os.", "shutil.", "open")):
+            call = _watch.pop()  # looking opens files too
+            newest = load_newest(tmp_path)
+            seen.append(0 if newest is None else newest.episode)
+            _watch.append(call)
+
+    _watch.append(look)
+    try:
+        save_snapshot(tmp_path, snapshot(2))
+    finally:
+        _watch.clear()
+    assert set(seen) == {1, 2} and seen == sorted(seen)
+
+
+def test_every_counter_comes_back(tmp_path: Path) -> None:
+    counters = Counters(before=3, train_cpu_s=1.5)
+    for success, length, queries in [(True, 3, 2), (False, 6, 0), (True, 1, 5)]:
+        counters.add_episode(success, length, queries)
+    counters.test = EvaluationCounts(episodes=4, successes=2, env_steps=9, return_sum=-1.5, faults=1, cpu_s=0.25)
+    row = {"episodes": 2, "env_steps": 9, "test_episodes": 5, "successes": 4, "mean_return": 0.5, "mean_length": 2.5}
+    counters.rows.append(Checkpoint(**row, faults=1, train_cpu_s=0.5, eval_cpu_s=0.25, diagnostics={"loss": 0.1}))
+    save_snapshot(tmp_path, counters.snapshot(AgentState(arrays={}, values={})))
+    newest = load_newest(tmp_path)
+    assert newest is not None and newest.episode == 3
+    again = Counters.of(newest)
+    assert again == counters
+    assert {name: part.tolist() for name, part in again.training().items()} == {
+        "success": [True, False, True], "length": [3, 6, 1], "queries": [2, 0, 5],
+    }  # fmt: skip

@@ -202,3 +202,15 @@ def test_kept_results_are_read_back_and_keep_their_hash(tmp_path: Path) -> None:
     facts["protocol_hash"] = "0123456789ab"
     (tmp_path / "kept" / "bench.json").write_text(json.dumps(facts))
     assert load_archive(tmp_path / "kept").protocol_hash == "0123456789ab"
+
+
+def test_a_table_cut_short_leaves_later_imagination_out(tmp_path: Path) -> None:
+    result = bench_result(tmp_path)
+    run = next(run for run in result.runs if run.agent == "imagination")
+    assert run.imagined, "there is something to leave out"
+    whole, budgets = result.protocol, result.protocol.budgets
+    assert cut(run, whole).imagined == run.imagined
+    short = cut(run, dataclasses.replace(whole, budgets=budgets[:-1]))
+    assert [row.episodes for row in short.checkpoints] == list(budgets[:-1])
+    assert short.imagined == () and short.sampled_rollouts == ()
+    assert len(short.training_success) == len(short.training_length) == budgets[-2]

@@ -88,7 +88,10 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatc
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
     camera = agent_camera(world.model)
-    pickle.loads(pickle.dumps(camera)).close()
+    twin = pickle.loads(pickle.dumps(camera))
+    with pytest.raises(pytest.fail.Exception, match="made a context"):
+        twin.frame(world.data)
+    twin.close()
     camera.close()
 
 

@@ -9,7 +9,7 @@ from imagine_bench import statistics
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
-from imagine_bench.report.text import agent_words, interval_text, lasting, percent, signed_percent
+from imagine_bench.report.text import agent_words, detectable_words, interval_text, lasting, percent, signed_percent
 
 
 def compared(data: ReportData) -> Section:
@@ -49,7 +49,7 @@ def success(data: ReportData, interval_words: str) -> Section:
         f"interquartile mean over {seeds} (independent trainings, the same {protocol.evaluation_episodes:,} test "
         f"starts for all); bands: {interval_words}.{thesis}",
     )  # fmt: skip
-    tables = (_scores(data, interval_words), *_thesis_only(data), _seeds(data))
+    tables = (_scores(data, interval_words), _prices(data), *_thesis_only(data), _seeds(data))
     return Section(title="Success against real experience", images=(figure,), tables=tables)
 
 
@@ -58,17 +58,33 @@ def _scores(data: ReportData, interval_words: str) -> Table:
         [
             agent_words(agent).title,
             *(_score(score, agent, budget, data.thesis.get(agent, {})) for budget, score in scores.items()),
-            *(f"{price:,.0f}" for price in data.prices[agent][data.budgets[-1]]),
         ]
         for agent, scores in data.scores.items()
     ]
     for name, share in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
-        rows.append([name, *[percent(share)] * len(data.budgets), DASH, DASH])
+        rows.append([name, *[percent(share)] * len(data.budgets)])
     return Table(
-        name="scores", header=[*_heads("solved (%) after", data), "real macro-actions", "training (CPU s)"], rows=rows,
-        caption=f"Columns: real training episodes; in brackets: {interval_words}. The last two columns are the price "
-        f"of the {data.budgets[-1]:,} episodes, means over seeds.",
-        why_dash="chance level and optimum are computed from the rules, not trained",
+        name="scores", header=_heads("solved (%) after", data), rows=rows,
+        caption=f"Columns: real training episodes; in brackets: {interval_words}.",
+    )  # fmt: skip
+
+
+def _prices(data: ReportData) -> Table:
+    """What each agent had had at the last budget."""
+    rows = []
+    for agent, by_budget in data.prices.items():
+        price, frames = by_budget[data.budgets[-1]], data.frames_before[agent]
+        counts = (price.env_steps, math.nan if frames is None else frames, price.updates)
+        cells = [DASH if math.isnan(count) else f"{count:,.0f}" for count in counts]
+        rows.append([agent_words(agent).title, *cells, seconds(price.train_cpu_s)])
+    return Table(
+        name="prices", rows=rows,
+        header=[
+            f"price of {data.budgets[-1]:,} episodes", "real macro-actions", "frames its encoder saw before",
+            "gradient updates", "training (CPU s)",
+        ],
+        caption="Means over seeds. Frames before training are drawn from all macrostates alike.",
+        why_dash="not counted by the agent, or an encoder that is not bundled",
     )  # fmt: skip
 
 
@@ -163,7 +179,7 @@ def gain(data: ReportData) -> Section:
     figure = plots.image(
         "gain", lambda: plots.gain_figure(data), svg=True, dpi=180,
         alt="Gain over DQN against real training episodes, with the thesis' gains.",
-        caption="Gain of the means over seeds; bands: 95 % interval over seeds (bootstrap). Diamonds: the thesis (its "
+        caption="Gain of the means over seeds; bands: 95 % interval over seeds (Fieller). Diamonds: the thesis (its "
         "means alone).",
     ) if near else None  # fmt: skip
     why_dash = "DQN solved nothing to compare with"
@@ -178,12 +194,17 @@ def gain(data: ReportData) -> Section:
         title="Gain over DQN",
         words=(
             "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / "
-            "DQN, the thesis' measure. An interval that includes zero shows no difference; one seed has none, nor has "
-            "a gain over a DQN that may have solved nothing.",
+            "DQN, the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved "
+            "nothing. Runs of one seed are not paired: what training makes of them does not agree.",
         ),
         images=[figure] if figure else [],
         tables=(
-            Table(name="differences", header=_heads("difference (points) after", data), rows=differences),
+            Table(
+                name="differences",
+                header=_heads("difference (points) after", data),
+                rows=differences,
+                caption=detectable_words(data.comparisons),
+            ),
             Table(name="gains", header=_heads("gain (%) after", data), rows=gains, why_dash=why_dash),
         ),
     )

@@ -309,3 +309,92 @@ def test_curiosity_outlearns_random_exploration() -> None:
 def test_wrong_settings_are_refused(override: dict[str, object], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         HYPERPARAMETERS.resolve("fast", override, "chapter_5")
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_optimism_values_the_unknown_at_the_best_reward(place: int) -> None:
+    class Untried(_Chain):
+        """Only the end brings a reward; what the others do is half unknown."""
+
+        def successors(self, codes: NDArray[np.int64]) -> SimpleNamespace:
+            found = super().successors(codes)
+            return SimpleNamespace(**{**vars(found), "unknown": np.full_like(found.unknown, 0.5)})
+
+    settings = dataclasses.replace(FactoredSettings().planning, depth=9, discount=0.9)
+    planner = Planner(Untried(5, settings.branches), settings)  # type: ignore[arg-type]
+    value = 10.0  # 0.5 * 10 known and 0.5 * 10 hoped for
+    for _ in range(4 - place):
+        value = 0.5 * 0.9 * value + 0.5 * 10.0
+    assert planner.values((place,), "optimistic") == pytest.approx([value])
+    assert planner.values((place,)) == pytest.approx([10.0 * 0.9 ** (4 - place)])
+
+
+def test_an_optimist_acts_by_what_the_unknown_may_bring() -> None:
+    """Each exploring action is among those of the largest optimistic value, and often no greedy one."""
+    learner, differs = agent(planning__exploration="optimism"), 0
+    live(learner, range(6), np.random.default_rng(0))
+    for code in starts():
+        seen = Observation(frame=frame(code))
+        hoped = learner.planner.values(code, "optimistic")
+        assert (hoped >= learner.q_values(seen) - 1e-6).all(), "hope is never less than what is expected"
+        best = set(np.flatnonzero(hoped >= hoped.max() - 1e-9).tolist())
+        assert {learner.act(seen, explore=True) for _ in range(10)} <= best
+        differs += learner.act(seen, explore=False) not in best
+    assert differs > 0
+
+
+def test_a_likely_transition_is_still_a_surprise_while_unknown() -> None:
+    def surprises(threshold: float) -> float:
+        learner = agent(planning__exploration_threshold=threshold)
+        for _ in range(50):
+            learner.observe(fake_codes.transition((0, 1, 0), 1), episode=0)
+        learner.diagnostics()
+        learner.observe(fake_codes.transition((0, 1, 0), 1), episode=0)
+        return learner.diagnostics()["model/unexpected"]
+
+    assert surprises(0.0) == 1.0, "nothing is ever wholly known"
+    assert surprises(0.5) == 0.0, "after fifty times it is expected"
+
+
+def test_what_another_cause_decided_weighs_as_the_settings_say() -> None:
+    def strength(masked: int, weight: float) -> np.ndarray:
+        learned = OutcomeModel((3, 2), 1, dataclasses.replace(OutcomeSettings(), masked_weight=weight))
+        for _ in range(300):
+            learned.add(CodeTransition((0, 0), 0, (0, 0), -1.0, False))
+        for _ in range(3):
+            learned.add(CodeTransition((0, 0), 0, (1, 1), 5.0, False))
+        for _ in range(masked):
+            learned.add(CodeTransition((0, 0), 0, (2, 1), 9.0, True))
+        learned.fit()
+        assert learned.causes is not None and learned.causes.outcomes[learned.causes.default] == (-1.0, False)
+        found: np.ndarray = learned.causes.strength[learned.outcomes.index((5.0, False))]
+        return found
+
+    assert strength(1, 0.0) == pytest.approx(strength(20, 0.0), abs=1e-12), "masked tests of no weight refute nothing"
+    assert not np.allclose(strength(1, 1.0), strength(20, 1.0), atol=1e-3)
+    assert not np.allclose(strength(20, 0.1), strength(20, 1.0), atol=1e-3)
+
+
+@pytest.mark.parametrize("decay", [0.2, 1.0])
+def test_each_further_parent_is_less_probable_beforehand(decay: float) -> None:
+    settings = dataclasses.replace(DynamicsSettings(), parent_decay=decay, persistence=0.4)
+    factor = Dynamics((3, 3, 2, 2), 2, settings).factors[0]
+    weight = factor.weights()
+    assert weight[:, 0] == pytest.approx([0.4, 0.4])
+    by_size = [
+        sum(weight[0, 1 + index] for index, table in enumerate(factor.tables) if len(table.parents) == size)
+        for size in (1, 2, 3)
+    ]
+    assert by_size[1] / by_size[0] == pytest.approx(decay)
+    assert by_size[2] / by_size[1] == pytest.approx(decay)
+
+
+def test_what_was_seen_is_drawn_as_seen_without_the_prior() -> None:
+    settings = dataclasses.replace(DynamicsSettings(), concentration=2.0)
+    model = FactoredModel((4,), 1, dataclasses.replace(FactoredSettings(), dynamics=settings))
+    for _ in range(40):
+        model.add(CodeTransition((0,), 0, (1,), -1.0, False))
+    expected = model.dynamics.predict(np.array([[0]]))[0].expected[0, 0]
+    assert expected[2:].sum() > 0.05, "the prior would show among 300 draws"
+    rng = np.random.default_rng(0)
+    assert {model.sample((0,), 0, rng)[0] for _ in range(300)} == {(1,)}

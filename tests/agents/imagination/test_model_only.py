@@ -17,6 +17,7 @@ from imagine_bench.agents.dqn import Controller, epsilon
 from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only
+from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.model_only import ModelOnlyAgent, ModelOnlyTraining
 from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import Settings
@@ -219,3 +220,21 @@ def test_a_filter_without_dropout_is_refused(monkeypatch: pytest.MonkeyPatch) ->
         with pytest.raises(InvalidValueError, match=r"model.members 1 .* Set model.dropout above 0"):
             maker(context(monkeypatch, {"model.dropout": 0.0}))
         assert maker(context(monkeypatch, {"model.dropout": 0.0, "model.members": 2})).imagination.filter.active
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_model_only_training_imagines_with_the_noise_of_the_model(temperature: float) -> None:
+    """A model whose every step has a standard deviation of 0.5; the temperature scales the variance."""
+
+    class Noisy(CountingModel):
+        def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+            certain = super().predict(z, action, weights)
+            return Mixture(certain.log_weights, certain.means, torch.full_like(certain.means, np.log(0.5)))
+
+    practice, one_episode = model_only_training(Noisy(), depth=200, temperature=temperature)
+    one_episode()
+    rows = practice.arrays()
+    steps = rows["memory/next_z"][:, 1] - rows["memory/z"][:, 1]
+    assert len(steps) == 200
+    assert steps.mean() == pytest.approx(1.0, abs=0.15)
+    assert steps.std() == pytest.approx(0.5 if temperature else 0.0, abs=0.08)

@@ -275,3 +275,29 @@ def test_a_moving_threshold_is_a_quantile_of_real_transitions(
     ]
     assert imagination.filter.threshold == threshold
     assert accepted == kept
+
+
+@pytest.mark.parametrize(
+    ("model", "limits"),
+    [
+        (CountingModel(), {"threshold": 0.0}),
+        (CountingModel(reward_uncertain_at=5), {"reward_threshold": 2.0}),
+        (CountingModel(torn_at=5), {"termination_threshold": float(np.float32(0.3))}),
+    ],
+)
+def test_what_is_as_uncertain_as_the_threshold_passes(model: CountingModel, limits: dict[str, float]) -> None:
+    imagination, controller = make(filtered=True, model=model, **limits)
+    assert imagination.rollouts(controller, torch.zeros(2), NOTHING_REAL, 0.5).accepted == 30
+
+
+def test_a_moved_threshold_comes_back() -> None:
+    def filtering() -> Imagination:
+        settings = Settings(imagination=ImaginationSettings(threshold=99.0, threshold_quantile=0.5))
+        return Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
+
+    moved, resumed = filtering(), filtering()
+    moved.filter.move_threshold(moved.model, remembering(4), moved.draw_weights(moved.generators["dropout"]).dynamics,
+                                moved.generators["replay"])  # fmt: skip
+    assert moved.filter.threshold < 99.0
+    resumed.load(moved.arrays(), 0)
+    assert resumed.filter.threshold == moved.filter.threshold

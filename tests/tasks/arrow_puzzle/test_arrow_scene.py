@@ -295,3 +295,16 @@ def test_samples_of_looks_do_not_add_up():
         frames.append(own.frame(world.data))
         own.close()
     assert np.array_equal(*frames)
+
+
+@pytest.mark.parametrize(("level", "most_deg"), [("clean", 0.0), ("mild", 4.0), ("strong", 8.0)])
+def test_the_hand_turns_as_far_as_its_level_says(level, most_deg):
+    varied, generator, yaw_deg = ArrowWorld(appearance(level)), rng(), []
+    varied.place((0, 0, 0, 1), generator)
+    for _ in range(60):
+        varied.vary(generator)
+        w, x, y, z = varied.data.mocap_quat[0]
+        assert (x, y) == (0.0, 0.0)
+        yaw_deg.append(2 * math.degrees(math.atan2(z, w)))
+    assert np.abs(yaw_deg).max() <= most_deg + 1e-9
+    assert min(yaw_deg) <= -0.8 * most_deg and max(yaw_deg) >= 0.8 * most_deg

@@ -170,6 +170,16 @@ def test_two_thousand_turns_do_what_the_rules_say(turner):
     check_turns(*run_turns(turner, number=2000, per_start=100, seed=1))
 
 
+def test_a_finger_does_not_push_a_cube_that_stands_close(turner):
+    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    place(model, data, (0, 0, 0), [(0, -0.01), (0, 0.01), (0, 0.01)])
+    before = poses(model, data)
+    assert turner.turn(data, cube=0, clockwise=False).fault is None
+    after = poses(model, data)
+    assert np.abs(after[1:, :3] - before[1:, :3]).max() < 2e-4
+    assert math.degrees(after[0, 3]) == pytest.approx(90.0, abs=1.0)
+
+
 @pytest.mark.parametrize("clockwise", [True, False])
 def test_very_skew_cubes_are_squared(turner, clockwise):
     """Even 25 degrees off, where the wrist would leave its range if it took the usual faces."""
@@ -291,9 +301,10 @@ def test_the_grip_is_friction():
     ("quat", "position", "message"),
     [
         ((math.cos(0.4), math.sin(0.4), 0, 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 46 degrees"),
+        ((math.cos(0.1), 0, math.sin(0.1), 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 11 degrees"),
         ((1, 0, 0, 0), (1.4, 0, CUBE_Z_M), "cube 1 is out of reach: The gripper cannot reach"),
     ],
-    ids=["tipped", "far"],
+    ids=["tipped", "leaning", "far"],
 )
 def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)

@@ -169,3 +169,17 @@ def test_inertia_is_symmetric_positive_and_holds_the_armature(arm):
     np.testing.assert_allclose(inertia, inertia.T, atol=1e-12)
     assert np.linalg.eigvalsh(inertia).min() > 0
     assert (np.diag(inertia) >= arm.model.dof_armature).all()
+
+
+def test_the_error_of_a_reach_is_the_larger_of_both_ends(arm, ik):
+    worse_above = 0
+    for x_m, y_m in [(0.5, 0.0), (0.55, 0.1), (0.6, -0.1), (0.62, 0.09), (0.65, 0.05), (0.7, 0.0)]:
+        place_m, lift_m = np.array([x_m, y_m, -0.05]), 0.1
+        reach = ik.reach(place_m, yaw_rad=0.0, lift_m=lift_m)
+        at_m, above_m = (
+            math.dist(arm.tcp_in_base(qpos)[0], place_m + np.array([0.0, 0.0, height_m]))
+            for qpos, height_m in ((reach.at_qpos_rad, 0.0), (reach.above_qpos_rad, lift_m))
+        )
+        assert reach.error_m == pytest.approx(max(at_m, above_m), abs=1e-9)
+        worse_above += above_m > at_m + 1e-7
+    assert worse_above > 0

@@ -130,6 +130,15 @@ def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, p
     assert reading.macrostate == (0, 0, 0, 0)
 
 
+@pytest.mark.parametrize("index", [1, 2])
+def test_what_leans_too_far_is_not_picked(world, index):
+    world.place((0, 0, 0, 0), rng())
+    half_rad = math.radians(14) / 2
+    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, math.sin(half_rad), 0]
+    result = world.executor.pick(world.data, index=index)
+    assert result.fault == f"the {OBJECTS[index].name} is tipped by 14 degrees" and result.sim_time_s == 0.0
+
+
 # --- acting ------------------------------------------------------------------------------------------------------
 
 

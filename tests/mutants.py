@@ -1,0 +1,206 @@
+"""Plants small bugs, one at a time, and counts those that a test notices: ``make mutants``.
+
+cosmic-ray says what can be changed in the files below. Of all the places a sample is drawn, as many a room, and at
+each place one of its changes. Each is made in a copy of the checkout, where the tests of its file run until one fails.
+What was tried is kept as it comes in ``build/mutants.jsonl``: the same command goes on there, and tries again what
+no test noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+
+ROOT = Path(__file__).resolve().parents[1]
+_RULES = ("tests/tasks/arrow_puzzle/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
+_FACTORED = ("tests/agents/factored",)
+_CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
+ROOMS: dict[str, dict[str, Sequence[str]]] = {
+    "rules": {
+        "tasks/arrow_puzzle/rules.py": _RULES[:1],
+        "tasks/pick_place/rules.py": _RULES[1:],
+        "imagine_bench/rules.py": _RULES,
+    },
+    "filter": {
+        "agents/imagination/filter.py": (
+            "tests/agents/imagination/test_rollouts.py", "tests/agents/imagination/test_model_only.py",
+        ),
+    },
+    "uncertainties": {
+        "agents/imagination/uncertainty.py": ("tests/agents/imagination/test_uncertainty.py",),
+        "agents/imagination/mixture.py": (
+            "tests/agents/imagination/test_mixture.py", "tests/agents/imagination/test_uncertainty.py",
+        ),
+    },
+    "statistics": {"imagine_bench/statistics.py": ("tests/test_statistics.py",)},
+    "resume": {
+        "imagine_bench/store/checkpoints.py": _CHECKPOINTS,
+        "imagine_bench/store/counters.py": _CHECKPOINTS,
+        "imagine_bench/bench/run_state.py": _CHECKPOINTS[::-1],
+    },
+    "report": {"imagine_bench/report/data.py": ("tests/report/test_report.py", "tests/report/test_report_futures.py")},
+    "own agent": {
+        f"agents/factored/{name}.py": _FACTORED
+        for name in ("agent", "dynamics", "exploration", "factors", "model", "outcomes", "perception", "planner")
+    },
+}  # fmt: skip
+"""Of each room the files, and the tests of each file, those that find most first."""
+_SLOWEST = 5.0
+"""A change that makes its tests take so many times as long as without it is noticed."""
+
+
+def bare(code: str) -> str | None:
+    """A program without annotations, which nobody executes; None if it is no program."""
+    try:
+        tree = ast.parse(code)
+    except SyntaxError:
+        return None
+    for node in ast.walk(tree):
+        if isinstance(node, ast.AnnAssign):
+            node.annotation = ast.Constant(None)
+        elif isinstance(node, ast.arg):
+            node.annotation = None
+        elif isinstance(node, ast.FunctionDef):
+            node.returns = None
+    return ast.dump(tree)
+
+
+def places(file: str) -> dict[tuple[Any, Any], list[tuple[str, int]]]:
+    """Where a file can be changed, and what each place can be changed by: operators and their occurrences."""
+    found: dict[tuple[Any, Any], list[tuple[str, int]]] = {}
+    nodes = list(ast_nodes(get_ast((ROOT / file).read_text())))
+    for name in operator_names():
+        kind = get_operator(name)
+        if not kind.arguments():
+            positions = (where for node in nodes for where in kind().mutation_positions(node))
+            for occurrence, (start, end) in enumerate(positions):
+                found.setdefault((start, end), []).append((name, occurrence))
+    return found
+
+
+def sample(count: int, seed: int) -> Iterator[dict[str, Any]]:
+    """So many changes, rooms by turns."""
+    rng, drawn = random.Random(seed), []
+    for room, files in ROOMS.items():
+        where = [(file, place, ways) for file in files for place, ways in sorted(places(file).items())]
+        rng.shuffle(where)
+        drawn.append([(room, rng.choice(ways), file, place[0][0]) for file, place, ways in where])
+    left = count
+    for turn in range(max(map(len, drawn))):
+        for found in drawn:
+            if left and turn < len(found):
+                room, (name, occurrence), file, line = found[turn]
+                before = (ROOT / file).read_text()
+                after = mutate_code(before, get_operator(name)(), occurrence)
+                if after is not None and bare(after) not in (None, bare(before)):
+                    left -= 1
+                    yield {"room": room, "file": file, "line": line, "operator": name.split("/")[1], "code": after}
+
+
+def copy_checkout(where: Path) -> None:
+    """The tracked and new files of the checkout, its packages where Python finds them before the installed ones."""
+    shutil.rmtree(where, ignore_errors=True)
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    for name in subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split("\0"):
+        if name and (ROOT / name).is_file():
+            (where / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, where / name)
+    for name in ("agents", "tasks", "assets"):
+        (where / "imagine_bench" / name).symlink_to(f"../{name}")
+
+
+def fails(where: Path, tests: Sequence[str], log: Path, limit_s: float) -> tuple[str, float]:
+    """``passed``, ``failed`` or ``timeout`` of some tests in a process of its own, and the seconds they took."""
+    start_s, child = time.monotonic(), os.fork()
+    if child == 0:
+        os.setsid()
+        os.chdir(where)
+        os.environ["PYTHONPATH"], sys.dont_write_bytecode = str(where), limit_s < float("inf")
+        sys.path.insert(0, str(where))
+        out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(out, 1)
+        os.dup2(out, 2)
+        here = [name for name in tests if (where / name).exists()]
+        os._exit(int(importlib.import_module("pytest").main(["-x", "-p", "no:cacheprovider", *here])))
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        took_s = time.monotonic() - start_s
+        if done:
+            return "passed" if status == 0 else "failed", took_s
+        if took_s > limit_s:
+            os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return "timeout", took_s
+        time.sleep(0.05)
+
+
+def main() -> int:
+    """Try the sample, or go on with it; 1 if too few fall."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=300, help="changes to try")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sample")
+    parser.add_argument("--least", type=float, default=0.92, help="share that must be noticed")
+    args = parser.parse_args()
+    for name in ("torch", "numpy", "scipy.stats", "gymnasium", "pytest"):  # once, not in every process
+        importlib.import_module(name)
+    build = ROOT / "build"
+    where, log = build / "mutants", build / "mutants.jsonl"
+    copy_checkout(where)
+    limits: dict[Sequence[str], float] = {}
+    known = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    tried: list[dict[str, Any]] = []
+    for mutant in sample(args.count, args.seed):
+        code, path = mutant.pop("code"), where / mutant["file"]
+        before = path.read_text()
+        mutant["change"] = change(before, code)
+        earlier = [row for row in known if mutant.items() <= row.items() and row["result"] != "passed"]
+        if not earlier:
+            tests = tuple(ROOMS[mutant["room"]][mutant["file"]])
+            if tests not in limits:
+                result, took_s = fails(where, tests, build / "mutants.log", float("inf"))
+                if result != "passed":
+                    sys.exit(f"{' '.join(tests)} fail without any change; see {build / 'mutants.log'}.")
+                limits[tests] = 20.0 + _SLOWEST * took_s
+            path.write_text(code)
+            mutant["result"], took_s = fails(where, tests, build / "mutants.log", limits[tests])
+            shutil.copy2(ROOT / mutant["file"], path)
+            mutant["seconds"] = round(took_s, 1)
+            with log.open("a") as file:
+                file.write(json.dumps(mutant) + "\n")
+        tried.append(earlier[0] if earlier else mutant)
+        if tried[-1]["result"] == "passed":
+            print(f"survives: {mutant['file']}:{mutant['line']} {mutant['change']}", flush=True)
+    for room in ROOMS:
+        rows = [row["result"] for row in tried if row["room"] == room]
+        print(f"{room}: {sum(result != 'passed' for result in rows)} of {len(rows)} noticed")
+    noticed = sum(row["result"] != "passed" for row in tried)
+    share = noticed / max(1, len(tried))
+    print(f"{noticed} of {len(tried)} small bugs are noticed, {share:.1%}; wanted are {args.least:.0%}")
+    return int(noticed < args.least * len(tried))
+
+
+def change(before: str, after: str) -> str:
+    """The first line that differs, as it was and as it is."""
+    pairs = zip(before.splitlines(), after.splitlines(), strict=False)
+    old, new = next((old.strip(), new.strip()) for old, new in pairs if old != new)
+    return f"{old} -> {new}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
