@@ -19,6 +19,7 @@ takes_film := TASK APPEARANCE ARGS
 takes_speed := ARGS
 takes_test := PYTEST ARGS
 takes_test-slow := $(takes_test)
+takes_storm := ARGS
 takes_mutants := ARGS
 takes_docs := ARGS
 takes_lock := ARGS
@@ -38,7 +39,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan generalise policy study view report encoder film doctor test test-slow mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan generalise policy study view report encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -88,6 +89,9 @@ test: ready  ## Run the tests, but for those that take minutes each; ARGS goes t
 
 test-slow: ready  ## Run the tests that take minutes each
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST) $(ARGS)
+
+storm: ready  ## Try every death, damage and hostile input on small runs; prints its counts
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 0 tests/storm $(ARGS)
 
 mutants: ready  ## Plant 300 small bugs one at a time and count those that a test notices (about an hour)
 	@PATH="$$PATH:$(BIN)" uv pip install -q --python $(BIN)/python 'cosmic-ray>=8.7,<9'

@@ -8,12 +8,13 @@ from imagine_bench.errors import InvalidValueError
 
 from .settings import (
     COUNT,
-    FINITE,
     LAYERS,
     NOT_NEGATIVE,
     POSITIVE,
     PROBABILITY,
     RATE,
+    ROWS,
+    UPDATES,
     ConfigGroup,
     Hyperparameters,
     Override,
@@ -30,7 +31,7 @@ class GreedySettings:
     #: Exploration probability in the limit; ``epsilon_max`` that at step 0.
     epsilon_min: float = setting(0.001, PROBABILITY)
     epsilon_max: float = setting(0.8, PROBABILITY)
-    epsilon_decay: float = setting(0.03, FINITE)  #: decay rate lambda, a real step
+    epsilon_decay: float = setting(0.03, NOT_NEGATIVE)  #: decay rate lambda, a real step
 
     def __post_init__(self) -> None:
         if self.epsilon_min > self.epsilon_max:
@@ -47,7 +48,7 @@ class ControllerSettings(GreedySettings):
     hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
     learning_rate: float = setting(1e-3, POSITIVE)
     batch_size: int = setting(64, COUNT)  #: transitions an update, real or imagined
-    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: updates on real transitions a real step, N_R
+    updates_per_step: int = setting(1, UPDATES)  #: updates on real transitions a real step, N_R
     #: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no target network
     #: (thesis).
     target_rate: float = setting(1.0, RATE)
@@ -57,7 +58,7 @@ class ControllerSettings(GreedySettings):
 class ReplaySettings:
     """How many real transitions are kept; the oldest go first (thesis 5.2.2)."""
 
-    real: int = setting(50_000, COUNT)
+    real: int = setting(50_000, ROWS)
 
 
 @dataclass(frozen=True, kw_only=True)

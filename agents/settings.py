@@ -6,14 +6,14 @@ An agent declares a frozen dataclass whose fields are :func:`setting` s, or sect
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
 
+_HUGE = 10**300  # integers beyond it are no floats, and in no range
 CONFIG_GROUPS = ("chapter_3", "chapter_5")
 """What a task may name: the chapter of the thesis whose settings it is measured with."""
 SETS = ("minimal", "fast", "published")
@@ -39,15 +39,21 @@ def between(low: float, high: float, why: str = "") -> Range:
 PROBABILITY = between(0.0, 1.0)
 INSIDE = Range(lambda value: 0.0 < value < 1.0, "must lie between 0 and 1")
 RATE = Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
-POSITIVE = Range(lambda value: value > 0.0, "must be above 0")
-NOT_NEGATIVE = Range(lambda value: value >= 0.0, "must be at least 0")
-FINITE = Range(lambda value: 0.0 <= value < math.inf, "must be at least 0 and finite")
-COUNT = Range(lambda value: value >= 1, "must be at least 1")
+POSITIVE = Range(lambda value: 0.0 < value <= 1e6, "must be above 0 and at most 1e+06")
+NOT_NEGATIVE = between(0.0, 1e6)
+UPDATES = between(0, 1000)
+"""Updates a step; the thesis makes 16 at most."""
+COUNT = between(1, 10_000)
+ROWS = between(1, 5_000_000)
+"""Kept transitions, macro-actions or epochs: more fit no memory, or no day."""
 DROPOUT = Range(
     lambda value: value == 0.0 or 1 / 256 <= value <= 255 / 256,
     "must be 0 or lie in [1/256, 255/256]: dropout masks count in 256ths",
 )
-SIZES = Range(lambda sizes: all(size >= 1 for size in sizes), "must be numbers of units, each at least 1")
+SIZES = Range(
+    lambda sizes: len(sizes) <= 16 and all(1 <= size <= 8192 for size in sizes),
+    "must be numbers of units, each at least 1 and at most 8192, of at most 16 layers",
+)
 LAYERS = Range(lambda sizes: len(sizes) > 0 and SIZES.holds(sizes), f"{SIZES.words}, of one layer or more")
 SWITCH = Range(lambda value: True, "may be true or false")
 
@@ -140,7 +146,7 @@ def checked(settings: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(allowed, tuple):
             require_known(f"value of setting {name}:", typed, allowed)
         elif typed is not None and not allowed.holds(typed):
-            raise InvalidValueError(f"Setting {name} is {typed}; it {allowed.words}.")
+            raise InvalidValueError(f"Setting {name} is {brief(typed)}; it {allowed.words}.")
     return found
 
 
@@ -162,11 +168,11 @@ def _typed(name: str, hint: Any, value: Any) -> Any:
         if option is type(None) and value is None:
             return None
         if option is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
+            return float(min(max(value, -_HUGE), _HUGE)) if isinstance(value, int) else value
         if get_origin(option) is tuple and isinstance(value, list | tuple):
             if all(type(item) is int for item in value):
                 return tuple(value)
         elif isinstance(option, type) and type(value) is option:
             return value
     wanted = " or ".join(getattr(option, "__name__", str(option)) for option in options)
-    raise InvalidValueError(f"Setting {name!r} was given {value!r}; it takes {wanted}.")
+    raise InvalidValueError(f"Setting {name!r} was given {brief(value)}; it takes {wanted}.")

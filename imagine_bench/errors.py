@@ -3,8 +3,26 @@
 from __future__ import annotations
 
 import difflib
+import re
+import reprlib
 from collections.abc import Iterable
 from typing import Any
+
+_LONGEST = 200
+_SHORT = reprlib.Repr()
+_SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = _LONGEST, _LONGEST, 60
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxarray = 10
+
+
+def brief(value: object) -> str:
+    """``repr(value)``, whatever the value is, at most a few hundred characters of it."""
+    return _SHORT.repr(value)
+
+
+def plain(text: object) -> str:
+    """A text for a terminal: its control characters as escapes, the middle of words that no reader needs left out."""
+    shown = "".join(mark if mark.isprintable() or mark == "\n" else repr(mark)[1:-1] for mark in str(text))
+    return re.sub(r"\S{1000,}", lambda word: f"{word[0][:80]}... ({len(word[0]):,} characters)", shown)
 
 
 class ImagineBenchError(Exception):
@@ -24,9 +42,10 @@ class UnknownNameError(ImagineBenchError, ValueError):
 
     def __init__(self, kind: str, given: object, known: Iterable[object]) -> None:
         names = [str(name) for name in known]
-        closest = difflib.get_close_matches(str(given), names, n=1, cutoff=0.4)
+        word = str(given) if isinstance(given, str | int | float | None) else brief(given)
+        closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
         hint = f" Did you mean {closest[0]!r}?" if closest else ""
-        super().__init__(f"No {kind} {str(given)!r}.{hint} Known: {', '.join(names) or 'none'}.")
+        super().__init__(f"No {kind} {brief(word)}.{hint} Known: {', '.join(names) or 'none'}.")
         self.kind, self.given, self.known = kind, given, tuple(names)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -68,6 +87,6 @@ def require_known(kind: str, given: str, known: Iterable[str]) -> str:
         UnknownNameError: It is not; the message lists all of ``known`` and the nearest one.
     """
     names = tuple(known)
-    if given not in names:
+    if not isinstance(given, str) or given not in names:
         raise UnknownNameError(kind, given, names)
     return given

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -11,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 
 from .motion.executor import MacroResult
@@ -162,7 +163,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         return None if self.render_mode is None else self._render_camera.frame(self.world.data)
 
     def close(self) -> None:
-        """Free the OpenGL contexts; may be called again. Only the thread that drew can: in another they stay."""
+        """Free the OpenGL contexts; may be called again."""
         for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
             renderer.close()
 
@@ -246,7 +247,9 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
         if not isinstance(options, Mapping):
-            raise InvalidValueError(f"Reset options {options!r} are no mapping; give {{'macrostate': ...}} or nothing.")
+            raise InvalidValueError(
+                f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
+            )
         for key in options:
             if key != "macrostate":
                 raise UnknownNameError("reset option", key, ("macrostate",))
@@ -254,12 +257,13 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             return self._starts[int(self.np_random.integers(len(self._starts)))]
         given = options["macrostate"]
         try:
-            start = tuple(int(value) for value in given)
-            known = start in self._known and all(a == b for a, b in zip(start, given, strict=True))
-        except (TypeError, ValueError, OverflowError):
+            values = list(itertools.islice(given, len(self._starts[0]) + 1))  # what never ends is none
+            start = tuple(int(value) for value in values)
+            known = start in self._known and all(bool(a == b) for a, b in zip(start, values, strict=True))
+        except Exception:  # what is no number can fail in any way
             known = False
         if not known:
-            raise InvalidValueError(f"No macrostate {given!r}; give {self._allowed()}, such as {self._starts[0]}.")
+            raise InvalidValueError(f"No macrostate {brief(given)}; give {self._allowed()}, such as {self._starts[0]}.")
         return start
 
     def _allowed(self) -> str:
@@ -272,10 +276,12 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         try:
             chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1
-        except (TypeError, ValueError, OverflowError):
+        except Exception:  # as of a macrostate
             chosen = -1
         if not 0 <= chosen < n_actions:
-            raise InvalidValueError(f"Action {action!r} does not exist; give an integer from 0 to {n_actions - 1}.")
+            raise InvalidValueError(
+                f"Action {brief(action)} does not exist; give an integer from 0 to {n_actions - 1}."
+            )
         return chosen
 
     def _intended(self, start: tuple[int, ...], action: int) -> Outcome:
@@ -303,7 +309,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 def _image_size(width: int, height: int) -> tuple[int, int]:
     for name, value in (("width", width), ("height", height)):
         if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
-            raise InvalidValueError(f"Image {name} {value!r} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
+            raise InvalidValueError(f"Image {name} {brief(value)} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
     return int(width), int(height)
 
 

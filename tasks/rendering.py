@@ -2,6 +2,8 @@
 
 - A context is made at the first image, in the process that draws it; one inherited through a fork is dropped.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
+- Any thread may draw, one at a time. A context is current in the thread that made it until a second thread draws; that
+  one makes another, and from then on it is released after each frame, which costs a tenth of the frame.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
 """
 
@@ -16,6 +18,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import SetupError, UnknownNameError
+from imagine_bench.errors import SetupError, require_known
 
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -98,11 +101,20 @@ def _is_current(context: Any) -> bool:
     return addresses[0] is not None and addresses[0] == addresses[1]
 
 
+def _release() -> None:
+    """Let no context of EGL be current in this thread, so that another thread may use it."""
+    from mujoco.egl import EGL_DISPLAY  # noqa: PLC0415  (after the platform is chosen)
+    from OpenGL import EGL  # noqa: PLC0415
+
+    EGL.eglMakeCurrent(EGL_DISPLAY, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+
+
 class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
-        self.pid, self.thread = os.getpid(), threading.get_ident()
+        self.pid = os.getpid()
+        self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
         self.gl: Any = _new_gl_context(view.width, view.height)
         try:
             with _quality(model, view):
@@ -113,20 +125,26 @@ class _Canvas:
 
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
-        if self.thread != threading.get_ident():
-            raise SetupError(
-                "This environment drew its first frame in another thread, whose OpenGL context no other may use. Make "
-                "and use each environment in one thread."
-            )
         if not _is_current(self.gl):
             self.gl.make_current()
+
+    @property
+    def usable(self) -> bool:
+        """Whether this thread of this process may make it current."""
+        return self.pid == os.getpid() and self.thread in (None, threading.get_ident())
+
+    def release(self) -> None:
+        """Leave it to any thread; EGL alone can."""
+        if type(self.gl).__module__.endswith("egl"):
+            _release()
+            self.thread = None
 
     def close(self) -> None:
         """Free everything; nothing if that was done before or belongs to a parent process or another thread."""
         gl, mjr, self.gl, self.mjr = self.gl, self.mjr, None, None
         if gl is None:
             return
-        if (self.pid, self.thread) != (os.getpid(), threading.get_ident()):
+        if not self.usable:
             _inherited.append((gl, gl._context, mjr))
             gl._context = None  # its destructor would free it from here, or after the display was closed
             return
@@ -177,9 +195,8 @@ class Renderer:
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self._canvas: _Canvas | None = None
-        cameras = [model.camera(index).name for index in range(model.ncam)]
-        if view.camera not in cameras:
-            raise UnknownNameError("camera", view.camera, cameras)
+        self._shared, self._lock, self._pid = False, threading.RLock(), os.getpid()
+        require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
         self.view, self._model = view, model
         self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
         self._bottom_up = np.empty((view.height, view.width, 3), dtype=np.uint8)
@@ -199,17 +216,27 @@ class Renderer:
         Raises:
             SetupError: The machine has no OpenGL.
         """
-        canvas = self._ready_canvas()
-        canvas.make_current()
-        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
-        mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
-        mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
-        return self._bottom_up[::-1].copy()
+        with self._one_at_a_time():
+            canvas = self._ready_canvas()
+            canvas.make_current()
+            mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+            mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
+            mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
+            if self._shared:
+                canvas.release()
+            return self._bottom_up[::-1].copy()
+
+    def _one_at_a_time(self) -> AbstractContextManager[Any]:
+        """The lock of this process: a thread of the parent's that held it when this was forked lives there alone."""
+        if self._pid != os.getpid():
+            self._lock, self._pid = threading.RLock(), os.getpid()
+        return self._lock
 
     def _ready_canvas(self) -> _Canvas:
         canvas = self._canvas
-        if canvas is not None and canvas.pid == os.getpid():
+        if canvas is not None and canvas.usable:
             return canvas
+        self._shared = self._shared or (canvas is not None and canvas.pid == os.getpid())
         self.close()
         self._canvas = canvas = _Canvas(self._model, self.view)
         # A renderer that is merely forgotten must free its context with it current, too.
@@ -221,11 +248,12 @@ class Renderer:
 
     def close(self) -> None:
         """Free the OpenGL context, if this process has one. Safe to call again; a later frame makes a new one."""
-        canvas, self._canvas = self._canvas, None
-        _open.discard(self)
-        if canvas is not None:
-            self._finalizer.detach()
-            canvas.close()
+        with self._one_at_a_time():
+            canvas, self._canvas = self._canvas, None
+            _open.discard(self)
+            if canvas is not None:
+                self._finalizer.detach()
+                canvas.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._model, self.view)

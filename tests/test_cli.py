@@ -217,3 +217,49 @@ def test_who_stops_reading_gets_no_traceback() -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["report", "x" * 5000], "give at most 1,000 characters"),
+        (["report", "\x1b[31mred"], r"The word '\x1b[31mred' cannot be meant"),
+        (["report", "\udcff"], "outside Unicode"),
+        (["report", "x" * 900], "File name too long"),
+        (["bench", "--task", "arrow_puzzle", "--set", "memory.real=" + "[" * 900], "it takes int"),
+    ],
+)
+def test_a_word_nobody_means_is_one_line(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "\x1b" not in said
+    assert sentence in said or "name is too long" in said
+
+
+def test_the_home_folder_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    for words in (["--out", "~/x"], ["--out=~/x"]):
+        assert main(["report", *words]) == 2
+        assert main(["film", "--task", "none", *words]) == 2
+    assert main(["bench", "--task", "toy_regression", "--preset", "smoke", "--agents", "none", "--out", "~/x"]) == 2
+    assert not (tmp_path / "~").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+@pytest.mark.parametrize(
+    ("redirection", "sentence"),
+    [(">/dev/full", "standard output cannot be read or written: the disk is full"), (">&-", "output is closed")],
+)
+def test_output_that_cannot_be_written_is_one_line(redirection: str, sentence: str) -> None:
+    line = f"{sys.executable} -m imagine_bench list {redirection}"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and sentence in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_a_removed_folder_and_a_strange_backend_are_no_tracebacks(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    line = f"cd {gone} && rmdir {gone} && MPLBACKEND=nonsense {sys.executable} -m imagine_bench doctor"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert "The current folder was removed" in done.stdout and done.stderr == "" and done.returncode == 1

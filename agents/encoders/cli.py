@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -34,7 +35,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
     path = out / f"{name}.safetensors"
-    refuse_existing(path, path.with_suffix(".json"), path.with_suffix(".png"))
+    refuse_existing(path)
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}") as bar:
         show = partial(_show, bar)
         encoder = train_encoder(spec, recipe=recipe, appearance=appearance, seed=seed, progress=show)
@@ -42,8 +43,9 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
     frames, macrostates = draw_frames(spec, appearance, COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())
     sheet = sample_sheet(encoder, spec, frames, macrostates, noise)
-    encoder.save(path)
-    sheet.save(path.with_suffix(".png"))
+    picture = io.BytesIO()
+    sheet.save(picture, format="png")
+    encoder.save(path, picture.getvalue())
     bundled = bundled_encoder(name)
     other = bundled.is_file() and bundled.resolve() != path.resolve()
     return f"Wrote {path}.\n{compare(encoder.card, Encoder.load(bundled).card if other else None)}"

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.preprocessing import PREPROCESSING, join_strips, preprocess
 
@@ -127,14 +127,15 @@ class Encoder:
         """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
         return self.probe.read(latents.to(self.device))
 
-    def save(self, path: Path) -> None:
-        """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``), each whole or not at all.
+    def save(self, path: Path, picture: bytes = b"") -> None:
+        """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``), the artefact last.
+
+        What a killed process leaves is written anew; a whole artefact never.
 
         Raises:
             ArtefactError: Either file exists already; it is left untouched.
         """
-        card_path = path.with_suffix(".json")
-        refuse_existing(path, card_path)
+        refuse_existing(path)
         tensors = {
             f"{name}.{key}": value.half().contiguous().cpu()
             for name, module in (("vae", self.network), ("probe", self.probe))
@@ -142,10 +143,19 @@ class Encoder:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         artefact = save(tensors, metadata={"card": self.card.to_json()})
-        for target, content in ((card_path, f"{self.card.to_json()}\n".encode()), (path, artefact)):
-            unfinished = target.with_name(f".{target.name}.unfinished")
-            unfinished.write_bytes(content)
+        beside = {path.with_suffix(".json"): f"{self.card.to_json()}\n".encode()}
+        if picture:
+            beside[path.with_suffix(".png")] = picture
+        begun = _begun(path)
+        begun.touch()
+        for target, content in {**beside, path: artefact}.items():
+            unfinished = target.with_name(f".{target.name}.partial")
+            with unfinished.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
             os.replace(unfinished, target)
+        begun.unlink()
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> Encoder:
@@ -166,8 +176,8 @@ class Encoder:
             probe = empty_probe(network.latent_size, card.cardinalities)
             _fill(network, tensors, "vae.")
             _fill(probe, tensors, "probe.")
-        except (OSError, SafetensorError, RuntimeError, TypeError, ValueError, ImagineBenchError) as error:
-            reason = str(error).splitlines()[0].rstrip(".")
+        except Exception as error:  # a file that is no encoder can be wrong in any way
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
         return cls(network, probe, card, device)
 
@@ -177,11 +187,17 @@ def bundled_encoder(name: str) -> Path:
     return Path(str(resources.files("imagine_bench.assets"))) / "encoders" / f"{name}.safetensors"
 
 
-def refuse_existing(*paths: Path) -> None:
-    """Raise ArtefactError where one of ``paths`` exists, before anything is overwritten."""
-    for path in paths:
-        if path.exists():
-            raise ArtefactError(f"{path} exists already and is never overwritten; choose another folder or remove it.")
+def refuse_existing(path: Path) -> None:
+    """Raise ArtefactError where an artefact, its card or its picture exists, unless a killed :meth:`save` left them."""
+    beside = () if _begun(path).exists() else (path.with_suffix(".json"), path.with_suffix(".png"))
+    for each in (path, *beside):
+        if each.exists():
+            raise ArtefactError(f"{each} exists already and is never overwritten; choose another folder or remove it.")
+
+
+def _begun(path: Path) -> Path:
+    """Lies beside an artefact from the beginning of its saving to the end."""
+    return path.with_name(f".{path.name}.begun")
 
 
 def image_shape(preprocessing: str) -> tuple[int, int, int]:

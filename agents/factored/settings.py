@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..settings import COUNT, INSIDE, NOT_NEGATIVE, POSITIVE, PROBABILITY, RATE, SWITCH, Hyperparameters, setting
+from ..settings import COUNT, INSIDE, POSITIVE, PROBABILITY, RATE, SWITCH, Hyperparameters, between, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,7 +13,7 @@ class DynamicsSettings:
 
     #: Whether each factor has a model of its own; otherwise the whole code is one factor (an ablation).
     factored: bool = setting(True, SWITCH)
-    parents: int = setting(3, COUNT)  #: most factors that one factor's next value may depend on, itself included
+    parents: int = setting(3, between(1, 10))  #: most factors that a factor's next value may depend on, itself included
     persistence: float = setting(0.5, INSIDE)  #: prior probability that an action leaves a factor alone
     parent_decay: float = setting(0.2, RATE)  #: multiplies the prior for each further parent
     #: Pseudo-count of each value in a Dirichlet prior (Heckerman et al. 1995).
@@ -26,7 +26,7 @@ class OutcomeSettings:
     """What is rewarded and what ends an episode; see :mod:`.outcomes`."""
 
     #: Most values in a conjunction that may be a cause; the whole code may always be one.
-    order: int = setting(3, NOT_NEGATIVE)
+    order: int = setting(3, between(0, 10))
     prior: float = setting(0.1, INSIDE)  #: prior probability that one value, or a pair, is a cause
     order_decay: float = setting(0.3, RATE)  #: multiplies it for each value beyond two
     pseudo_tests: float = setting(0.2, POSITIVE)  #: how many tests of one conjunction the prior is worth
@@ -46,7 +46,7 @@ class PlanningSettings:
     discount: float = setting(0.95, PROBABILITY)  #: of rewards, a macro-action
     branches: int = setting(8, COUNT)  #: most next codes of one action
     least_probability: float = setting(0.02, PROBABILITY)  #: less likely ones are not followed, but for the likeliest
-    states: int = setting(3000, COUNT)  #: most codes that one plan visits
+    states: int = setting(3000, between(1, 1_000_000))  #: most codes that one plan visits
     #: ``"curiosity"`` goes where most is unknown, ``"optimism"`` values the unknown at the best reward seen,
     #: ``"random"`` acts greedily but for random actions (the last two are ablations).
     exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))

@@ -22,14 +22,18 @@ from ..settings import (
     POSITIVE,
     PRECISIONS,
     PROBABILITY,
+    ROWS,
     SIZES,
     SWITCH,
+    UPDATES,
     ConfigGroup,
     Hyperparameters,
     Override,
     between,
     setting,
 )
+
+FEW = between(1, 1000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +44,10 @@ class WorldModelSettings:
     """
 
     dynamics_hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
-    components: int = setting(5, COUNT)  #: gaussians in the mixture of the dynamics network, K
+    components: int = setting(5, FEW)  #: gaussians in the mixture of the dynamics network, K
     #: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble (Lakshminarayanan et
     #: al. 2017); the thesis has one.
-    members: int = setting(1, COUNT)
+    members: int = setting(1, FEW)
     reward_hidden: tuple[int, ...] = setting((512, 512, 512), SIZES)
     termination_hidden: tuple[int, ...] = setting((256, 256), SIZES)
     #: Of one network for reward and termination, instead of the two (thesis 3.2.2).
@@ -57,7 +61,9 @@ class WorldModelSettings:
     learning_rate: float = setting(1e-3, POSITIVE)
     #: Largest norm of the incoming weights of a unit; None limits nothing.
     max_norm: float | None = setting(3.0, POSITIVE)
-    updates_per_step: int = setting(16, COUNT)  #: model updates a real step, N_E, of ``batch_size`` transitions each
+    updates_per_step: int = setting(
+        16, between(1, 1000)
+    )  #: model updates a real step, N_E, of ``batch_size`` transitions each
     batch_size: int = setting(512, COUNT)
     #: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1. Where an
     #: encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the few frames
@@ -87,18 +93,18 @@ class WorldModelSettings:
 class ImaginationSettings:
     """Imagined rollouts and their filter (thesis 5.2.2, algorithm 1); none ends before it starts."""
 
-    start_episode: int = setting(1000, NOT_NEGATIVE)  #: first training episode that imagines, I_start
+    start_episode: int = setting(1000, between(0, 10_000_000))  #: first training episode that imagines, I_start
     #: First training episode that imagines no more; its updates are made on real transitions instead, of which there
     #: are enough by then. None: imagination never ends (thesis).
-    end_episode: int | None = setting(None, NOT_NEGATIVE)
+    end_episode: int | None = setting(None, between(0, 10_000_000))
     #: Where rollouts start: ``"current"``, the state the robot just left (thesis), or ``"replayed"``, states sampled
     #: from the real memory.
     start_states: str = setting("current", ("current", "replayed"))
     #: Imagined episodes of a controller that is trained in the model alone (thesis 3.2.2).
-    model_only_episodes: int = setting(1000, COUNT)
+    model_only_episodes: int = setting(1000, ROWS)
     breadth: int = setting(3, COUNT)  #: rollouts a real step, I_B
     depth: int = setting(10, COUNT)  #: longest rollout in macro-actions, I_D
-    updates_per_step: int = setting(1, NOT_NEGATIVE)  #: controller updates on imagined transitions a real step, N_I
+    updates_per_step: int = setting(1, UPDATES)  #: controller updates on imagined transitions a real step, N_I
     #: Scale of the component's standard deviation when z' is sampled: 1 the thesis, 0 its mean.
     temperature: float = setting(1.0, NOT_NEGATIVE)
     #: Whose ``p(z' | z, a)`` is imagined: ``"average"``, that of the T weight samples (thesis 4.4, of chapter 4's
@@ -108,7 +114,7 @@ class ImaginationSettings:
     #: Smallest exploration probability inside rollouts; the real one counts where it is larger.
     exploration: float = setting(0.0, PROBABILITY)
     #: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
-    weight_samples: int = setting(50, COUNT)
+    weight_samples: int = setting(50, between(1, 1000))
     #: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation 4.25) and one
     #: threshold; see docs/explanation/deviations.md for why that is read as max.
     reduction: str = setting("max", ("sum", "mean", "max"))
@@ -136,7 +142,7 @@ class ImaginationSettings:
 class MemorySettings(ReplaySettings):
     """How many real and imagined transitions are kept; the oldest go first (thesis 5.2.2)."""
 
-    imagined: int = setting(3_000, COUNT)
+    imagined: int = setting(3_000, ROWS)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ _DROPOUT = Range(
     lambda value: value == 0.0 or 1 / 256 <= value <= 0.95,
     "must be 0 or lie in [1/256, 0.95]: dropout masks count in 256ths",
 )
-_BATCH_SIZE = Range(lambda value: value >= 8, "must be at least 8: layers are standardised over a batch")
+_BATCH_SIZE = between(8, 1_000_000, "layers are standardised over a batch")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class RegressorSettings(MDNSettings):
         InvalidValueError: All weight samples would be the same.
     """
 
-    epochs: int = setting(3000, COUNT)
+    epochs: int = setting(3000, kinds.ROWS)
     final_rate: float = setting(1.0, PROBABILITY)
     batch_size: int | None = setting(None, _BATCH_SIZE)
     members: int = setting(1, between(1, 1_000))

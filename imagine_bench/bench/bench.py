@@ -18,6 +18,7 @@ from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
 from imagine_bench.protocols.task_types import Encoders, Result, require_options, task_type
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench
+from imagine_bench.store.files import sweep
 
 _SAVE_EVERY_S = 10.0
 
@@ -50,6 +51,7 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
     store = BenchStore(bench_folder(root, wanted), wanted)
     store.open()
     with store.lock():
+        sweep(store.folder)
         missing = len(store.missing())
         if missing:
             if task_type(store.protocol.task).draws:

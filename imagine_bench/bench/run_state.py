@@ -19,8 +19,9 @@ from imagine_bench.interfaces import Agent
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.checkpoints import load_newest, save_snapshot
+from imagine_bench.store.checkpoints import load_newest, save_snapshot, sweep_partial
 from imagine_bench.store.counters import Counters
+from imagine_bench.store.files import reading, sweep, writing
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""
@@ -54,13 +55,17 @@ class Run:
             require_able(self.agent, spec.agent, spec.protocol)
         self.counters = Counters()
         self._on_progress = on_progress
+        with writing(folder):
+            sweep(folder)
+            sweep_partial(folder / "checkpoints")
         run_folder.check_config(folder, self._config())
         if self.entry.external_training_loop:
             run_folder.forget(folder)  # an earlier attempt cannot be gone on with
         snapshot = load_newest(folder / "checkpoints")
         if snapshot is not None:
-            self.agent.restore(snapshot.agent)
-            self.counters = Counters.of(snapshot)
+            with reading(folder / "checkpoints", f"a checkpoint of {spec.agent!r}"):
+                self.agent.restore(snapshot.agent)
+                self.counters = Counters.of(snapshot)
             if self.counters.rows:  # a kill between a test's checkpoint and its table would leave the table behind
                 run_folder.write_metrics(folder, self.counters.rows)
         self._saved_s = self._reported_s = time.monotonic()

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
+import unicodedata
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -13,10 +17,12 @@ from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
 from imagine_bench.cli.benches import Bench, List, Report, Study, parse_settings
 from imagine_bench.cli.tools import Coverage, Doctor, Encoder, Film, Margins, Speed, View
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, brief, plain
+from imagine_bench.store.files import reason
 
 __all__ = ["INTERRUPTED", "main", "parse_settings"]
 
+_LONGEST_WORD = 1000
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
@@ -42,7 +48,13 @@ def main(words: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
     given = sys.argv[1:] if words is None else list(words)
     command: Any = None
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a window system's backend would fail only at the end
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")
     try:
+        if sys.stdout is None:
+            raise SetupError("Standard output is closed; open it, or send it to a file or /dev/null.")
+        given = [_readable(word) for word in given]
         if given == ["--version"]:
             print(f"imagine-bench {__version__}")
             return 0
@@ -57,13 +69,42 @@ def main(words: Sequence[str] | None = None) -> int:
         command()
         sys.stdout.flush()
     except ImagineBenchError as error:
-        print(f"imagine-bench: {error}", file=sys.stderr)
-        return error.exit_code
+        return _say(error, error.exit_code)
     except BrokenPipeError:  # the reader has seen enough, as `| head` does; nothing more can be said to it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
+    except OSError as error:
+        where = error.filename or "standard output"
+        return _say(f"{where} cannot be read or written: {reason(error)}.")
+    except (MemoryError, RecursionError, UnicodeError) as error:
+        return _say(f"{type(error).__name__}: {error}")
     except KeyboardInterrupt:
         resumes = isinstance(command, Bench | Study)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
-        print(f"imagine-bench: interrupted; the same command {then}.", file=sys.stderr)
-        return INTERRUPTED
+        return _say(f"interrupted; the same command {then}.", INTERRUPTED)
     return 0
+
+
+def _readable(word: str) -> str:
+    """A word of a command with ``~`` as the home folder, or InvalidValueError where no terminal could show it."""
+    if len(word) > _LONGEST_WORD or any(unicodedata.category(mark) in ("Cc", "Cs") for mark in word):
+        raise InvalidValueError(
+            f"The word {brief(word)} cannot be meant: give at most {_LONGEST_WORD:,} characters, none of them a "
+            "control character or outside Unicode."
+        )
+    return re.sub(r"^(--[a-z-]+=)?~(?=/|$)", lambda found: f"{found[1] or ''}{Path.home()}", word)
+
+
+def _say(error: object, exit_code: int = 2) -> int:
+    """Say what went wrong, and let nothing that is still to be written fail after that."""
+    with suppress(OSError):
+        print(f"imagine-bench: {plain(error)}", file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError, AttributeError):
+        _discard_output()
+    return exit_code
+
+
+def _discard_output() -> None:
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -188,7 +188,7 @@ def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
 def _value(text: str) -> Any:
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
-from imagine_bench.protocols.data import ProtocolData, require_ascending, require_different, require_seeds
+from imagine_bench.protocols.data import MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
@@ -66,8 +66,9 @@ class Protocol(ProtocolData):
         require_seeds(self.seeds)
         require_different("agents", self.agents)
         for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise InvalidValueError(f"{name} is {getattr(self, name)}; give at least {least}.")
+            if not least <= (value := getattr(self, name)) <= MOST:
+                allowed = f"at least {least}" if value < least else f"at most {MOST:,}"
+                raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
         require_same_world(self.task, self.after)
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(

@@ -10,8 +10,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Self
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
+
+MOST = 10_000_000
+"""Episodes, budgets and the like; a real robot lives to see a thousandth of it."""
 
 
 def digest(values: Any) -> str:
@@ -68,22 +71,23 @@ class ProtocolData(ABC):
 def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
     """Raise InvalidValueError unless values are different integers, ascending, of at least ``at_least``."""
     ascending = all(a < b for a, b in itertools.pairwise(values))
-    if not values or not ascending or values[0] < at_least:
+    if not values or not ascending or values[0] < at_least or values[-1] > MOST:
+        most = f" and at most {MOST:,}" if values and values[-1] > MOST else ""
         raise InvalidValueError(
-            f"{name} {values} must be one or more different integers of at least {at_least}, ascending."
+            f"{name} {brief(values)} must be one or more different integers of at least {at_least}{most}, ascending."
         )
 
 
 def require_different(name: str, values: tuple[str, ...]) -> None:
     """Raise InvalidValueError for names that are none or given twice."""
     if not values or len(set(values)) != len(values):
-        raise InvalidValueError(f"{name} {values} must be at least one name, none of them twice.")
+        raise InvalidValueError(f"{name} {brief(values)} must be at least one name, none of them twice.")
 
 
 def require_seeds(seeds: tuple[int, ...]) -> None:
     """Raise InvalidValueError for seeds that are none, equal or out of range, and for tuning among reported ones."""
     if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
-        raise InvalidValueError(f"seeds {seeds} must be one or more different integers from 0 to {SEEDS - 1}.")
+        raise InvalidValueError(f"seeds {brief(seeds)} must be one or more different integers from 0 to {SEEDS - 1}.")
     if len({is_tuning_seed(seed) for seed in seeds}) > 1:
         raise InvalidValueError(
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "

@@ -21,9 +21,9 @@ from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
+from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
 from imagine_bench.store.codec import Arrays, grouped
-from imagine_bench.store.files import lock, make_folder
+from imagine_bench.store.files import lock, make_folder, reading, sweep, writing
 
 _SLICES = 100
 """Steps of progress in which a variant's training is reported."""
@@ -57,6 +57,9 @@ class _Run:
         self.evaluations: dict[str, Arrays] = {}
         self.train_cpu_s = 0.0
         self.snapshot = load_newest(folder / "checkpoints")
+        with writing(folder):
+            sweep(folder)
+            sweep_partial(folder / "checkpoints")
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
             found = grouped(self.snapshot.arrays)  # files give arrays back in any order
@@ -86,7 +89,8 @@ class _Run:
         self._check_config(regressor)
         snapshot, self.snapshot, self.train_cpu_s = self.snapshot, None, 0.0
         if snapshot is not None and snapshot.values["variant"] == variant:
-            regressor.restore(snapshot.agent)
+            with reading(self.folder / "checkpoints", f"a checkpoint of {self.spec.agent!r}"):
+                regressor.restore(snapshot.agent)
             self.train_cpu_s = snapshot.values["train_cpu_s"]
         return regressor
 

@@ -14,7 +14,7 @@ from imagine_bench.report.data import ReportData, collect, futures_csv, open_loo
 from imagine_bench.report.sections import Page, Section, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
-from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.files import make_folder, sweep, write_bytes
 from imagine_bench.store.results import BenchResult
 
 
@@ -69,10 +69,10 @@ def write_page(folder: Path, page: Page) -> Path:
         loader=jinja2.PackageLoader("imagine_bench.report"), autoescape=lambda name: str(name).endswith(".html.j2"),
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    environment.filters["md"] = markdown_text
+    environment.filters |= {"md": markdown_text, "code": markdown_code}
     for name, template in (("report.md", "page.md.j2"), ("index.html", "page.html.j2")):
         files[name] = environment.get_template(template).render(page=page).encode()
-    make_folder(folder)
+    sweep(make_folder(folder), older_than_s=3600.0)  # another may write the same report
     for name, content in files.items():
         write_bytes(folder / name, content)
     return folder / "index.html"
@@ -80,7 +80,14 @@ def write_page(folder: Path, page: Page) -> Path:
 
 def markdown_text(value: object) -> str:
     """A text as Markdown shows it unchanged: in a line, its special characters escaped."""
-    return re.sub(r"([\\`*_<>|]|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
+    return re.sub(r"([\\`*_<>|&~]|^#|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
+
+
+def markdown_code(value: object) -> str:
+    """A text as code in a line of Markdown, unchanged, whatever backticks it has."""
+    text = " ".join(str(value).split())
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if len(fence) > 1 else f"{fence}{text}{fence}"
 
 
 def summary_table(result: BenchResult) -> str:

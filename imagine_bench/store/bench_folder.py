@@ -6,6 +6,7 @@ overwritten by another protocol, for its hash is in the name.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
@@ -15,14 +16,24 @@ from typing import Any
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Result, task_type
 from imagine_bench.store import run_folder
-from imagine_bench.store.files import lock, make_folder, read_json, reading, write_json
+from imagine_bench.store.files import (
+    lock,
+    make_folder,
+    read_json,
+    read_sealed,
+    reading,
+    sealed,
+    write_json,
+)
 
 KEPT = "bench.json"
 """Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
 _PROTOCOL, _ENVIRONMENT, _SESSIONS = "protocol.json", "environment.json", "sessions.json"
+_NAME = re.compile("-([0-9a-f]{12})$")
+"""The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
 _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
 
@@ -52,6 +63,13 @@ class BenchStore:
         """The folder of one run."""
         return self.folder / agent / f"seed_{seed}"
 
+    def require_own(self, folders: Collection[Path]) -> None:
+        """Raise ArtefactError for a run's folder among ``folders`` that says it is of another protocol."""
+        for agent in self.protocol.agents:
+            for seed in self.protocol.seeds:
+                if (folder := self.run_folder(agent, seed)) in folders:
+                    run_folder.require_run_of(folder, self.protocol, agent, seed)
+
     def missing(self, until: int | None = None) -> list[tuple[str, int]]:
         """Agents and seeds that are not finished, or have not come to the budget ``until``, seed by seed."""
         wanted = [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
@@ -74,20 +92,20 @@ class BenchStore:
         })  # fmt: skip
         self.save_time()
         if not begun:
-            write_json(path, environment)  # last, so that a bench with an environment has sessions too
+            write_json(path, sealed(environment))  # last, so that a bench with an environment has sessions too
         return changed
 
     def changed(self, environment: dict[str, Any]) -> list[str]:
         """Names of facts that decide the bits and are not as in the first session; none before there was one."""
         path = self.folder / _ENVIRONMENT
-        first = read_json(path, "a bench's environment") if path.exists() else environment
+        first = read_sealed(path, "a bench's environment") if path.exists() else environment
         then, now = _facts(first), _facts(environment)
         return [name for name in _IDENTITY if then.get(name) != now.get(name)]
 
     def save_time(self) -> None:
         """Note how long this session has lasted, so that a kill loses little of the count."""
         self._sessions[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
-        write_json(self.folder / _SESSIONS, self._sessions)
+        write_json(self.folder / _SESSIONS, sealed({"sessions": self._sessions}))
 
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:
@@ -100,7 +118,9 @@ def load_bench(folder: Path) -> Result:
     protocol = read_protocol(folder)
     kind, store = task_type(protocol.task), BenchStore(folder, protocol)
     folders = [store.run_folder(agent, seed) for agent in protocol.agents for seed in protocol.seeds]
-    runs = tuple(kind.load_run(run) for run in folders if run_folder.is_done(run))
+    done = [run for run in folders if run_folder.is_done(run)]
+    store.require_own(done)
+    runs = tuple(kind.load_run(run) for run in done)
     return kind.result(protocol=protocol, runs=runs, **bench_facts(folder))
 
 
@@ -111,7 +131,7 @@ def bench_facts(folder: Path) -> dict[str, Any]:
         with reading(folder / KEPT, "a kept bench"):
             facts, sessions = kept["environment"], _with_times(kept["sessions"])
     else:
-        facts, sessions = read_json(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
+        facts, sessions = read_sealed(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
     environment = {**facts, "sessions": sessions}
     return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
 
@@ -154,9 +174,9 @@ def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_sessions(folder: Path) -> list[dict[str, Any]]:
     path, what = folder / _SESSIONS, "a bench's sessions"
-    sessions = read_json(path, what, holds=list)
+    sessions = read_sealed(path, what)
     with reading(path, what):
-        return _with_times(sessions)
+        return _with_times(sessions["sessions"])
 
 
 def _with_times(sessions: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -168,6 +188,11 @@ def read_protocol(folder: Path) -> ProtocolData:
     kept = (folder / KEPT).exists()
     path, what = folder / (KEPT if kept else _PROTOCOL), "a bench's protocol"
     data = read_json(path, what)
+    name = _NAME.search(folder.resolve().name)
+    if name is not None and not kept and digest(data) != name[1]:
+        raise ArtefactError(
+            f"{path} is damaged: {name[1]} in its folder's name stands for another protocol. It was left untouched."
+        )
     with reading(path, what):
         data = data["protocol"] if kept else data
         return task_type(data["task"]).protocol.from_dict(data)

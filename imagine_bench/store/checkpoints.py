@@ -1,13 +1,14 @@
 """Snapshots that a ``kill -9`` at any moment cannot damage: one folder each, complete once it has its name.
 
 A folder ``checkpoint_000007_episode_120`` (the seventh of its run) holds ``agent.safetensors``, ``runner.safetensors``
-and ``state.json``, which has the digests of the other two. The newest is kept; the one before it goes when the newer is
-complete.
+and ``state.json``, which has its own digest and those of the other two. A folder of another name is none. The newest is
+kept; the one before it goes when the newer is complete.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,10 +22,19 @@ from safetensors.numpy import load, save
 
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.store.files import make_folder, read_json, sha256, sync_folder, write_bytes, write_json, writing
+from imagine_bench.store.files import (
+    make_folder,
+    read_sealed,
+    reading,
+    sealed,
+    sync_folder,
+    write_bytes,
+    write_json,
+    writing,
+)
 
-FORMAT = "imagine_bench checkpoint 1"
-_NAME, _PARTIAL = "checkpoint_", ".partial_"
+FORMAT = "imagine_bench checkpoint 2"
+_NAME, _PARTIAL = re.compile(r"checkpoint_([0-9]{6,})_episode_([0-9]+)"), ".partial_"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,23 +54,27 @@ def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
     """
     make_folder(folder)
     earlier = _checkpoints(folder)
-    number = int(earlier[-1].name.split("_")[1]) + 1 if earlier else 1
-    final = folder / f"{_NAME}{number:06d}_episode_{snapshot.episode}"
+    number = _number(earlier[-1]) + 1 if earlier else 1
+    final = folder / f"checkpoint_{number:06d}_episode_{snapshot.episode}"
     partial = folder / f"{_PARTIAL}{final.name}"
     with writing(final):
-        for leftover in folder.glob(f"{_PARTIAL}*"):  # of a process that was killed while it wrote or removed
-            shutil.rmtree(leftover)
+        sweep_partial(folder)
         partial.mkdir()
-        write_bytes(partial / "agent.safetensors", _packed(snapshot.agent.arrays))
-        write_bytes(partial / "runner.safetensors", _packed(snapshot.arrays))
+        parts = {"agent.safetensors": snapshot.agent.arrays, "runner.safetensors": snapshot.arrays}
+        digests = {}
+        for name, arrays in parts.items():
+            content = _packed(arrays)
+            write_bytes(partial / name, content)
+            digests[name] = hashlib.sha256(content).hexdigest()
         state = {
             "format": FORMAT,
+            "name": final.name,
             "episode": snapshot.episode,
-            "sha256": {name: sha256(partial / name) for name in ("agent.safetensors", "runner.safetensors")},
+            "sha256": digests,
             "agent": snapshot.agent.values,
             "runner": snapshot.values,
         }
-        write_json(partial / "state.json", state)
+        write_json(partial / "state.json", sealed(state))
         partial.replace(final)
         sync_folder(folder)
         for old in earlier:
@@ -87,10 +101,12 @@ def has_checkpoint(folder: Path) -> bool:
 def load_snapshot(checkpoint: Path) -> Snapshot:
     """Read one checkpoint folder. Raises ArtefactError: it is damaged or not a checkpoint."""
     path = checkpoint / "state.json"
-    state = read_json(path, "a checkpoint's state")
+    state = read_sealed(path, f"the state of an {FORMAT!r}")
     if state.get("format") != FORMAT:
         raise ArtefactError(f"{path} was not written as {FORMAT!r}. It was left untouched.")
-    try:
+    if state.get("name") != checkpoint.name:
+        raise ArtefactError(f"{path} is of {state.get('name')}, a checkpoint of another name. It was left untouched.")
+    with reading(path, f"the state of an {FORMAT!r}"):
         agent = _unpacked(checkpoint / "agent.safetensors", state["sha256"])
         runner = _unpacked(checkpoint / "runner.safetensors", state["sha256"])
         return Snapshot(
@@ -99,12 +115,25 @@ def load_snapshot(checkpoint: Path) -> Snapshot:
             arrays=runner,
             values=state["runner"],
         )
-    except (KeyError, TypeError) as error:
-        raise ArtefactError(f"{path} lacks {error}. It was left untouched.") from error
+
+
+def sweep_partial(folder: Path) -> None:
+    """Remove what a process left below ``folder`` that was killed while it wrote or removed a checkpoint."""
+    for leftover in folder.glob(f"{_PARTIAL}*"):
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
 
 
 def _checkpoints(folder: Path) -> list[Path]:
-    return sorted(folder.glob(f"{_NAME}*")) if folder.is_dir() else []
+    """Complete checkpoints, the newest last; a folder that somebody copied or renamed has another name."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    return sorted((path for path in found if _NAME.fullmatch(path.name) and path.is_dir()), key=_number)
+
+
+def _number(checkpoint: Path) -> int:
+    return int(checkpoint.name.split("_")[1])
 
 
 def _remove(checkpoint: Path) -> None:

@@ -10,6 +10,8 @@ import json
 import math
 import os
 import socket
+import stat
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,8 +20,10 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from imagine_bench.errors import ArtefactError, BusyError, ImagineBenchError, SetupError
+from imagine_bench.errors import ArtefactError, BusyError, SetupError, brief
 
+_LONGEST = 1000
+"""Characters of a library's own complaint that are handed on."""
 _REASONS = {
     errno.EACCES: "you may not write there; choose another folder or change its permissions",
     errno.EPERM: "you may not write there; choose another folder or change its permissions",
@@ -28,6 +32,8 @@ _REASONS = {
     errno.EDQUOT: "your disk quota is used up; free some space and run the same command again",
     errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
     errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
+    errno.ENAMETOOLONG: "that name is too long for the file system; choose a shorter one",
+    errno.ELOOP: "a part of that path is a link; remove it or choose another folder",
     errno.ENOLCK: "that file system cannot lock files; choose a local folder",
     errno.ENOTSUP: "that file system cannot lock files; choose a local folder",
 }
@@ -39,8 +45,12 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = _REASONS.get(error.errno or 0, error.strerror or str(error))
-        raise SetupError(f"Cannot write {path}: {reason}.") from error
+        raise SetupError(f"Cannot write {path}: {reason(error)}.") from error
+
+
+def reason(error: OSError) -> str:
+    """Why the system refused, in words."""
+    return _REASONS.get(error.errno or 0, error.strerror or str(error))
 
 
 def make_folder(folder: Path) -> Path:
@@ -67,19 +77,29 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def sweep(folder: Path, *, older_than_s: float = 0.0) -> None:
+    """Remove what killed writers left half-written in ``folder``, whose lock is held or where nothing is so old."""
+    for leftover in folder.glob(".*.partial"):
+        with suppress(OSError):  # another sweeps too, or may not
+            if time.time() - leftover.stat().st_mtime >= older_than_s:
+                leftover.unlink()
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file at once, by a temporary neighbour, or raise SetupError and leave an earlier one untouched."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
         try:
-            with temporary.open("wb") as stream:
+            temporary.unlink(missing_ok=True)
+            with temporary.open("xb") as stream:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
             temporary.replace(path)
             sync_folder(path.parent)
         finally:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):
+                temporary.unlink()
 
 
 def with_null(value: Any) -> Any:
@@ -117,6 +137,24 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
         return found
 
 
+def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with the digest of all of them, under ``seal``."""
+    return {**values, "seal": _seal(values)}
+
+
+def read_sealed(path: Path, what: str) -> dict[str, Any]:
+    """What :func:`sealed` values a JSON file holds. Raises ArtefactError as :func:`read_json`, or where one changed."""
+    values = read_json(path, what)
+    seal = values.pop("seal", None)
+    if seal != _seal(values):
+        raise ArtefactError(f"{path} is damaged: it is not as it was written. It was left untouched.")
+    return values
+
+
+def _seal(values: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
     """Turn whatever is wrong with the file ``path``, which should be ``what``, into one ArtefactError."""
@@ -124,9 +162,14 @@ def reading(path: Path, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise ArtefactError(f"There is no {path}, {what}.") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, ImagineBenchError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise ArtefactError(f"{path} is not {what}: {reason}. It was left untouched.") from error
+    except Exception as error:  # what is not as it was written can be wrong in any way
+        why: object = error.strerror if isinstance(error, OSError) and error.strerror else error
+        if isinstance(error, KeyError):
+            why = f"{error} is missing"
+        elif isinstance(error, RecursionError):
+            why = "it is nested too deep"
+        text = str(why).strip().rstrip(".") or type(error).__name__
+        raise ArtefactError(f"{path} is not {what}: {text[:_LONGEST]}. It was left untouched.") from error
 
 
 def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | None:
@@ -167,10 +210,13 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
     """
     held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")
     with writing(path):
+        for each in (path, holder):
+            if os.path.lexists(each) and not stat.S_ISREG(each.lstat().st_mode):
+                raise SetupError(f"{each} is not a file of ours but a link or the like; remove it.")
         try:
             held.acquire()
         except Timeout:
-            who = holder.read_text() if holder.is_file() else "another process"
+            who = brief(holder.read_text(errors="replace"))[1:-1] if holder.is_file() else "another process"
             raise BusyError(f"{busy} is in use by {who}; wait for it, stop it, or choose another folder.") from None
     try:
         with suppress(OSError):  # a courtesy to the next who finds it held, which a full disk cannot take

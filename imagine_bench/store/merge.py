@@ -37,6 +37,7 @@ def load_so_far(folder: Path) -> BenchResult:
     whole = read_control(folder)
     store = BenchStore(folder, whole)
     reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
+    store.require_own([store.run_folder(*pair) for pair, budget in reached.items() if budget])
     part = largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
     if part.missing:
         return part
@@ -76,7 +77,12 @@ def largest_part(
 def _reached(store: BenchStore, agent: str, seed: int) -> int:
     """The last budget of which a run has results; they lie in its newest checkpoint until it is done."""
     folder = store.run_folder(agent, seed)
-    return run_folder.reached(folder) if run_folder.is_done(folder) or has_checkpoint(folder / "checkpoints") else 0
+    if run_folder.is_done(folder):
+        return run_folder.reached(folder)
+    if not has_checkpoint(folder / "checkpoints"):
+        return 0
+    rows = run_folder.load_unfinished(folder).checkpoints  # not the table beside it, which has no digest yet
+    return rows[-1].episodes if rows else 0
 
 
 def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:

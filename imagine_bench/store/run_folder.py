@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench.errors import ArtefactError
+from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
 from imagine_bench.store.counters import Counters
-from imagine_bench.store.files import first_difference, read_json, reading, sha256, write_bytes, write_json
+from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, ComparedRollout, RunResult
 
-FORMAT = "imagine_bench run 1"
+FORMAT = "imagine_bench run 2"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
 _MEASURED, _IMAGINED, _TRAINING = "measured.npz", "imagined.npz", "training.npz"
 _DIAGNOSTIC = "diagnostics/"
@@ -55,15 +56,37 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
     """
     path, now = folder / _CONFIG, json.loads(json.dumps({"format": FORMAT, **config}))
     if not path.exists():
-        write_json(path, now)
+        write_json(path, sealed(now))
         return
-    difference = first_difference(read_json(path, "a run's configuration"), now)
+    difference = first_difference(_config(folder), now)
     if difference is not None:
         name, was, would_be = difference
         raise ArtefactError(
             f"{folder} was begun with {name} {was!r}, and this version would use {would_be!r} on this machine; it was "
             "left untouched. Finish it with the version and on the kind of machine that began it, or choose another "
             "folder with --out."
+        )
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    config = read_sealed(folder / _CONFIG, "a run's configuration")
+    if config.get("format") != FORMAT:
+        raise ArtefactError(f"{folder / _CONFIG} was not written as {FORMAT!r}. It was left untouched.")
+    return config
+
+
+def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) -> None:
+    """Raise ArtefactError unless the run in ``folder`` is this agent's and seed's of this very protocol."""
+    config = _config(folder)
+    difference = first_difference(
+        {name: config.get(name) for name in ("agent", "seed", "protocol_hash", "protocol")},
+        {"agent": agent, "seed": seed, "protocol_hash": digest(config.get("protocol")), "protocol": protocol.as_dict()},
+    )
+    if difference is not None:
+        name, was, would_be = difference
+        raise ArtefactError(
+            f"{folder / _CONFIG} has {name} {was!r} where its bench has {would_be!r}. It was left untouched; put back "
+            "what was written."
         )
 
 
@@ -99,22 +122,29 @@ def finish(
 
 
 def mark_done(folder: Path, names: Sequence[str]) -> None:
-    """Mark a run as done: from now on these files of it never change. Raises SetupError: the mark cannot be written."""
-    write_json(folder / _DONE, {"format": FORMAT, "sha256": {name: sha256(folder / name) for name in names}})
+    """Mark a run as done: from now on these files of it, and its recording, never change.
+
+    Raises SetupError: the mark cannot be written.
+    """
+    names = [*names, _RECORDING] if recording_path(folder).is_file() else names
+    digests = {name: sha256(folder / name) for name in names}
+    write_json(folder / _DONE, sealed({"format": FORMAT, "sha256": digests}))
 
 
 def require_done(folder: Path) -> dict[str, Any]:
     """The configuration of a finished run. Raises ArtefactError: it is unfinished, damaged or of another format."""
-    done = read_json(folder / _DONE, "the mark of a finished run")
+    done = read_sealed(folder / _DONE, "the mark of a finished run")
     if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
-    for name, digest in done["sha256"].items():
-        if sha256(folder / name) != digest:
+    for name, written in done["sha256"].items():
+        if name == _RECORDING and not recording_path(folder).exists():
+            continue  # recordings are large, and nothing else needs them
+        if sha256(folder / name) != written:
             raise ArtefactError(
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    return read_json(folder / _CONFIG, "a run's configuration")
+    return _config(folder)
 
 
 def load_run(folder: Path) -> RunResult:
@@ -141,7 +171,7 @@ def load_unfinished(folder: Path) -> RunResult:
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:  # it had one a moment ago
         raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
-    config = read_json(folder / _CONFIG, "a run's configuration")
+    config = _config(folder)
     with reading(folder / "checkpoints", "a run's checkpoint"):
         counters = Counters.of(snapshot)
     training = counters.training()

@@ -19,7 +19,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.archive import is_archive
 from imagine_bench.store.bench_folder import BenchStore, read_control
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.files import read_json, reading
+from imagine_bench.store.files import read_sealed, reading
 from imagine_bench.store.results import BenchResult, RunResult
 
 
@@ -55,7 +55,7 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
         UnknownNameError: No such encoder.
     """
     path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
-    config = read_json(path, what)
+    config = read_sealed(path, what)
     with reading(path, what):
         task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
         settings = _flat(config["settings"])
@@ -69,7 +69,8 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
     settings.update((name, value) for name, value in overrides if name in settings)
     as_it_ran = dataclasses.replace(protocol, overrides=tuple(sorted(settings.items())))  # whatever presets say by now
     agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
-    agent.restore(_with_settings(snapshot.agent, overrides))
+    with reading(folder / "checkpoints", f"a checkpoint of {name!r}"):
+        agent.restore(_with_settings(snapshot.agent, overrides))
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
         while agent.train_in_model():
             pass

@@ -50,9 +50,13 @@ def examine() -> Examination:
     complaints = unmet_requirements()
     gl, frame, gl_complaint = _drawing()
     complaints += [gl_complaint] if gl_complaint else []
-    free_gib = shutil.disk_usage(Path.cwd()).free / 2**30
-    if free_gib < _NEEDED_DISK_GIB:
-        complaints.append(f"Only {free_gib:.1f} GiB are free in {Path.cwd()}; a bench needs about 1 GiB.")
+    free_gib = 0.0
+    try:
+        free_gib = shutil.disk_usage(Path.cwd()).free / 2**30
+        if free_gib < _NEEDED_DISK_GIB:
+            complaints.append(f"Only {free_gib:.1f} GiB are free in {Path.cwd()}; a bench needs about 1 GiB.")
+    except FileNotFoundError:
+        complaints.append("The current folder was removed; change to one that exists.")
     facts = {
         "command": sys.executable,
         "commit": commit() or "not in a checkout",

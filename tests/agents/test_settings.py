@@ -224,17 +224,17 @@ def test_an_unknown_set_lists_what_exists() -> None:
         ("model.dropout", 0.001, r"model.dropout is 0.001; it must be 0 or lie in \[1/256, 255/256\]"),
         ("controller.hidden", (8, 0), r"controller.hidden is \(8, 0\); it must be numbers of units, each at least 1"),
         ("controller.epsilon_min", -0.1, r"controller.epsilon_min is -0.1; it must lie in \[0, 1\]"),
-        ("controller.epsilon_decay", float("inf"), "controller.epsilon_decay is inf; it must be at least 0 and finite"),
+        ("controller.epsilon_decay", float("inf"), r"controller.epsilon_decay is inf; it must lie in \[0, 1e\+06\]"),
         ("controller.epsilon_min", 0.9, r"epsilon_min 0.9 is above controller.epsilon_max 0.8: exploration would rise"),
         ("imagination.start_episode", 1000, r"end_episode 1000 is not above imagination.start_episode 1000: nothing"),
         ("model.dropout", 1.0, r"model.dropout is 1.0; it must be 0 or lie in \[1/256, 255/256\]"),
         ("model.gradient_clip", 0.0, "model.gradient_clip is 0.0; it must be above 0"),
         ("model.components", 2.5, "'model.components' was given 2.5; it takes int"),
         ("imagination.reduction", "median", "No value of setting imagination.reduction: 'median'"),
-        ("imagination.depth", 0, "imagination.depth is 0; it must be at least 1"),
-        ("imagination.temperature", float("nan"), "imagination.temperature is nan; it must be at least 0"),
+        ("imagination.depth", 0, r"imagination.depth is 0; it must lie in \[1, 10000\]"),
+        ("imagination.temperature", float("nan"), r"imagination.temperature is nan; it must lie in \[0, 1e\+06\]"),
         ("imagination.termination_threshold", 0.9, r"is 0.9; it must lie in \[0, 0.5\]: it bounds the less likely"),
-        ("memory.real", -5, "memory.real is -5; it must be at least 1"),
+        ("memory.real", -5, r"memory.real is -5; it must lie in \[1, 5e\+06\]"),
     ],
 )
 def test_wrong_values_are_named_with_what_is_allowed(name: str, value: Any, message: str) -> None:
@@ -251,3 +251,16 @@ def test_more_updates_are_those_of_imagination(group: str, name: str) -> None:
     )
     as_many = imagining.controller.updates_per_step + imagining.imagination.updates_per_step
     assert more == replaced(plain, {"controller.updates_per_step": as_many})
+
+
+@pytest.mark.parametrize("agent", ALL)
+def test_every_number_has_a_largest_value(agent: str) -> None:
+    """Absurd ones, which no machine could hold or finish, are refused before anything starts."""
+    group = next(iter(ALL[agent].groups))
+    for name, value in flatten(ALL[agent].groups[group].published).items():
+        if isinstance(value, bool | str):
+            continue
+        for absurd in (10**10, 10**400, float("inf")):
+            wrong = [absurd] if isinstance(value, tuple) else absurd
+            with pytest.raises(InvalidValueError, match=name):
+                ALL[agent].resolve("fast", {name: wrong}, group)

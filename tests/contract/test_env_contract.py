@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pickle
 import subprocess
 import sys
@@ -287,11 +288,40 @@ def kinematic():
 
 @pytest.mark.parametrize(
     "given",
-    [(0, 1, 2), (0, 1, 2, 3), (0, 1, 4, 0), (-1, 1, 2, 0), (0.5, 1, 2, 0), (float("inf"), 1, 2, 0), "0120", 7, None],
+    [
+        (0, 1, 2),
+        (0, 1, 2, 3),
+        (0, 1, 4, 0),
+        (-1, 1, 2, 0),
+        (0.5, 1, 2, 0),
+        (float("inf"), 1, 2, 0),
+        "0120",
+        7,
+        None,
+        np.ma.masked,
+        (np.ma.masked,) * 4,
+        np.array([["x"]]),
+        (0,) * 10**6,
+    ],
 )
 def test_a_wrong_macrostate_is_refused(kinematic, given):
     with pytest.raises(InvalidValueError, match=r"No macrostate .*; give 4 integers from 0 to at most \(3, 3, 3, 2\)"):
         kinematic.reset(options={"macrostate": given})
+
+
+def test_what_never_ends_is_no_macrostate(kinematic):
+    for endless in (itertools.repeat(0), itertools.count()):
+        with pytest.raises(InvalidValueError, match="No macrostate") as caught:
+            kinematic.reset(options={"macrostate": endless})
+        assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("name", ["camera", "execution", "appearance", "render_mode"])
+@pytest.mark.parametrize("given", [np.array(["human", "wrist"]), np.ma.masked, ["clean"], b"clean"])
+def test_an_option_that_is_no_word_is_named(name, given):
+    make_env = gymnasium.envs.registration.load_env_creator(gymnasium.spec("imagine_bench/ArrowPuzzle-v0").entry_point)
+    with pytest.raises(UnknownNameError):
+        make_env(**{"execution": "kinematic", name: given})
 
 
 def test_an_unknown_reset_option_is_refused(kinematic):

@@ -37,7 +37,7 @@ from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.policy import PolicyAnalysis
 from imagine_bench.rules import fewest_actions, greedy
 from imagine_bench.store import encoders
-from imagine_bench.store.files import lock
+from imagine_bench.store.files import lock, sealed
 from imagine_bench.store.results import BenchResult
 from imagine_bench.store.trained import learners, load_trained
 
@@ -290,10 +290,10 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
     wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "factored"), **names)
     config = {"protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
     for agent, complaint in (("dqn", "has no checkpoint"), ("factored", "has no checkpoint")):
-        (tmp_path / "config.json").write_text(json.dumps({**config, "agent": agent}))
+        (tmp_path / "config.json").write_text(json.dumps(sealed({**config, "agent": agent})))
         with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
             load_trained(tmp_path, encoder=str(own))
-    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "config.json").write_text(json.dumps(sealed(config)))
     with pytest.raises(ArtefactError, match=r"own@\w+, which is not bundled; give its file with --encoder"):
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"own@\w+, and .*arrow_puzzle-mild.* give the right file"):

@@ -14,7 +14,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, text, write_report
 from imagine_bench.report.data import ReportData, collect
-from imagine_bench.report.page import markdown_text
+from imagine_bench.report.page import markdown_code, markdown_text
 from imagine_bench.report.sections import DASH, Cell, Table
 from imagine_bench.store.results import BenchResult
 
@@ -135,3 +135,5 @@ def test_names_are_escaped_in_markdown(tmp_path: Path, monkeypatch: pytest.Monke
     assert "my_agent |" not in markdown and "<b>" not in markdown
     check_report(folder)
     assert markdown_text("[a](b) `c` d_e") == r"[a]\(b) \`c\` d\_e"
+    assert markdown_text("# a & <b>") == r"\# a \& \<b\>"
+    assert markdown_code("a`b``c\nd") == "``` a`b``c d ```" and markdown_code("a") == "`a`"

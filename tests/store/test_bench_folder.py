@@ -89,7 +89,9 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     path = store.folder / "protocol.json"
     other = small(budgets=(1, 2)).as_dict()
     path.write_text(json.dumps(other))
-    with pytest.raises(ArtefactError, match=r"protocol\.json is of another protocol .* left untouched"):
+    with pytest.raises(
+        ArtefactError, match=r"protocol\.json is damaged: .* stands for another protocol.* left untouched"
+    ):
         store.open()
     path.write_text('{"task": "arrow_puzzle", "color": "red"}')
     with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol: .*color"):
@@ -101,7 +103,7 @@ def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     opened(tmp_path).begin_session(_ENVIRONMENT)
     changed = opened(tmp_path).begin_session({**_ENVIRONMENT, "versions": {"torch": "2"}, "command": "other"})
     assert changed == ["versions"]
-    sessions = json.loads((opened(tmp_path).folder / "sessions.json").read_text())
+    sessions = json.loads((opened(tmp_path).folder / "sessions.json").read_text())["sessions"]
     assert [session["changed"] for session in sessions] == [{}, {"versions": {"torch": "2"}}]
     elsewhere = {**_ENVIRONMENT, "machine": {"cpu": "another", "cores": 2}}
     assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -383,6 +384,28 @@ def test_saving_that_fails_half_way_leaves_no_artefact(
     monkeypatch.undo()
     tiny.save(tmp_path / "e.safetensors")
     assert Encoder.load(tmp_path / "e.safetensors").card == tiny.card
+
+
+@pytest.mark.parametrize("at", [0, 1, 2])
+def test_saving_that_was_killed_is_done_again(
+    tiny: Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    real, calls, path = os.replace, [], tmp_path / "e.safetensors"
+
+    def killed(*paths: Path) -> None:
+        calls.append(paths)
+        if len(calls) == at + 1:
+            raise KeyboardInterrupt
+        real(*paths)
+
+    monkeypatch.setattr("os.replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        tiny.save(path, b"picture")
+    monkeypatch.undo()
+    tiny.save(path, b"picture")
+    assert {each.name for each in tmp_path.iterdir()} == {"e.json", "e.png", "e.safetensors"}
+    with pytest.raises(ArtefactError, match="exists already"):
+        tiny.save(path, b"picture")
 
 
 def test_view_joins_strips_and_keeps_colors() -> None:

@@ -1,0 +1,137 @@
+"""What was changed behind our back is refused in one sentence that names the file; what others left is no hindrance."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_runs import Inline, do, same_but_for_time, small
+
+from imagine_bench.bench.bench import bench
+from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.files import lock, read_json, write_bytes
+from imagine_bench.store.run_folder import load_unfinished
+
+
+def unfinished(folder: Path) -> Path:
+    """A run that lacks its end, and its only checkpoint."""
+    do(folder)
+    (folder / "DONE").unlink()
+    (checkpoint,) = (folder / "checkpoints").iterdir()
+    return checkpoint
+
+
+def change(path: Path, **values: Any) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+@pytest.mark.parametrize("values", [{"episode": 8}, {"episode": 10**30}, {"agent": {}}, {"runner": {}}, {"seal": "0"}])
+def test_a_changed_state_of_a_checkpoint_is_refused(tmp_path: Path, values: dict[str, Any]) -> None:
+    change(unfinished(tmp_path) / "state.json", **values)
+    with pytest.raises(ArtefactError, match=r"state\.json is damaged"):
+        do(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["config.json", "state.json"])
+@pytest.mark.parametrize("content", ["[" * 10**5, "[]", "{}", "1" * 5000, "\x00", "null"])
+def test_whatever_json_holds_is_one_sentence(tmp_path: Path, name: str, content: str) -> None:
+    path = unfinished(tmp_path) / name if name == "state.json" else tmp_path / name
+    do(tmp_path)
+    (tmp_path / "DONE").unlink()
+    path.write_text(content)
+    with pytest.raises(ArtefactError, match=name) as caught:
+        do(tmp_path)
+    assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["checkpoint_old", "checkpoint_000099_episode_9 (copy)", "checkpoint_x_episode_1"])
+def test_folders_of_other_names_are_no_checkpoints(tmp_path: Path, name: str) -> None:
+    checkpoint = unfinished(tmp_path)
+    shutil.copytree(checkpoint, checkpoint.with_name(name))
+    whole = do(tmp_path)
+    assert whole.checkpoints[-1].episodes == 9 and checkpoint.with_name(name).is_dir()
+
+
+def test_a_renamed_checkpoint_is_named(tmp_path: Path) -> None:
+    checkpoint = unfinished(tmp_path)
+    shutil.copytree(checkpoint, checkpoint.with_name("checkpoint_000099_episode_9"))
+    with pytest.raises(ArtefactError, match=r"checkpoint_000099_episode_9.* of checkpoint_0"):
+        load_newest(tmp_path / "checkpoints")
+
+
+def test_what_killed_writers_left_is_swept(tmp_path: Path) -> None:
+    checkpoint = unfinished(tmp_path)
+    litter = [tmp_path / ".metrics.csv.999.partial", checkpoint.parent / ".partial_checkpoint_000009_episode_1"]
+    litter[0].write_text("half")
+    litter[1].mkdir()
+    do(tmp_path)
+    assert not any(path.exists() for path in litter)
+
+
+@pytest.mark.parametrize("name", [".lock", ".lock.holder"])
+def test_a_lock_follows_no_link(tmp_path: Path, name: str) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    (tmp_path / name).symlink_to(precious)
+    with pytest.raises(SetupError, match="is not a file of ours"), lock(tmp_path / ".lock", "It"):
+        pass
+    assert precious.read_text() == "precious"
+
+
+def test_a_file_half_written_by_a_link_is_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.getpid", lambda: 7)
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    (tmp_path / ".a.json.7.partial").symlink_to(precious)
+    write_bytes(tmp_path / "a.json", b"1")
+    assert precious.read_text() == "precious" and (tmp_path / "a.json").read_bytes() == b"1"
+
+
+def test_a_long_name_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SetupError, match="name is too long"):
+        write_bytes(tmp_path / ("x" * 300), b"")
+
+
+def test_a_recording_that_changed_is_noticed_one_that_was_removed_is_not(tmp_path: Path) -> None:
+    before = do(tmp_path, recorded_episodes=1)
+    assert before.recording is not None
+    with before.recording.open("r+b") as stream:
+        stream.seek(100)
+        stream.write(b"?????")
+    with pytest.raises(ArtefactError, match=r"recording\.rrd is not as the run left it"):
+        do(tmp_path, recorded_episodes=1)
+    before.recording.unlink()
+    assert same_but_for_time(before, do(tmp_path, recorded_episodes=1))
+
+
+def test_a_protocol_stands_for_its_folder_and_its_runs(tmp_path: Path) -> None:
+    folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    path = folder / "protocol.json"
+    values = read_json(path, "a protocol")
+    assert values.pop("execution") == "kinematic"
+    path.write_text(json.dumps(values))
+    with pytest.raises(ArtefactError, match=r"protocol\.json is damaged.*stands for another protocol"):
+        load_bench(folder)
+    elsewhere = folder.rename(tmp_path / "moved")  # no hash in its name: the runs know
+    with pytest.raises(ArtefactError, match=r"config\.json has protocol.execution 'kinematic'.* has 'physics'"):
+        load_bench(elsewhere)
+
+
+@pytest.mark.parametrize("name", ["environment.json", "sessions.json"])
+def test_changed_facts_of_a_bench_are_refused(tmp_path: Path, name: str) -> None:
+    folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    change(folder / name, commit="other")
+    with pytest.raises(ArtefactError, match=rf"{name} is damaged"):
+        load_bench(folder)
+
+
+def test_changed_settings_of_an_unfinished_run_are_refused(tmp_path: Path) -> None:
+    unfinished(tmp_path)
+    change(tmp_path / "config.json", settings={"rate": 0.1})
+    with pytest.raises(ArtefactError, match=r"config\.json is damaged"):
+        load_unfinished(tmp_path)
