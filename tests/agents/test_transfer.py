@@ -166,6 +166,7 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     assert after <= before
 
 
+@pytest.mark.slow
 def test_labels_save_episodes() -> None:
     def curve(queries: int) -> float:
         total = 0.0

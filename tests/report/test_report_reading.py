@@ -64,7 +64,7 @@ def test_without_any_difference_it_is_about_the_last_budget(tmp_path: Path) -> N
     assert text.answers(data)[0].startswith("After 200 real episodes DQN")
 
 
-@pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
+@pytest.mark.parametrize("seeds", [pytest.param((0,), marks=pytest.mark.slow), (0, 1, 2)])
 def test_the_widest_report_can_be_read(seeds: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     others = ("sb3_dqn", "sb3_qrdqn", "sb3_dqn_latents", "imagination_only_uncertainty", "factored")
     for agent in others:

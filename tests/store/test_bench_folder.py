@@ -94,7 +94,7 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
     ):
         store.open()
     path.write_text('{"task": "arrow_puzzle", "color": "red"}')
-    with pytest.raises(ArtefactError, match=r"protocol\.json is not a bench's protocol: .*color"):
+    with pytest.raises(ArtefactError, match=r"protocol\.json is damaged: .* stands for another protocol"):
         load_bench(store.folder)
     assert "color" in path.read_text()
 

@@ -12,6 +12,7 @@ from imagine_bench.errors import SetupError
 from imagine_bench.tools.film import HEIGHT_PX, WIDTH_PX, film
 
 
+@pytest.mark.slow
 def test_a_film_reaches_the_goal_and_is_never_overwritten(tmp_path: Path) -> None:
     out = film("arrow_puzzle", tmp_path / "new" / "turn.gif", seed=0)
     with Image.open(out) as gif:

@@ -300,7 +300,7 @@ def test_curiosity_outlearns_random_exploration() -> None:
     [
         ({"planning.exploration": "bold"}, UnknownNameError, "No value of setting planning.exploration: 'bold'"),
         ({"planning.depht": 3}, UnknownNameError, "Did you mean 'planning.depth'"),
-        ({"planning.depth": 0}, InvalidValueError, "planning.depth is 0; it must be at least 1"),
+        ({"planning.depth": 0}, InvalidValueError, "planning.depth is 0; it must lie in"),
         ({"dynamics.persistence": 1.0}, InvalidValueError, "must lie between 0 and 1"),
         ({"planning.discount": 1.5}, InvalidValueError, r"must lie in \[0, 1\]"),
         ({"planning.depth": 2.5}, InvalidValueError, "takes int"),

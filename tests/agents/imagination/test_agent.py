@@ -249,7 +249,7 @@ def test_nothing_to_imagine_is_an_error(
 
 
 def test_diagnostics_are_means_since_the_last_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = imagination_agents.make_uncertainty(context(monkeypatch, {"imagination.threshold": 1e9}))
+    agent = imagination_agents.make_uncertainty(context(monkeypatch, {"imagination.threshold": 1e6}))
     live(agent, range(4), np.random.default_rng(0))
     read = agent.diagnostics()
     names = {f"loss/{name}" for name in ("dynamics", "reward", "termination", "bellman")}
