@@ -95,7 +95,7 @@ storm: ready  ## Try every death, damage and hostile input on small runs; prints
 
 mutants: ready  ## Plant 300 small bugs one at a time and count those that a test notices (about an hour)
 	@PATH="$$PATH:$(BIN)" uv pip install -q --python $(BIN)/python 'cosmic-ray>=8.7,<9'
-	@OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python tests/tools/mutants.py $(ARGS)
 
 lint: ready  ## Check style, format and types
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy

@@ -27,7 +27,7 @@ from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 _RULES = ("tests/tasks/arrow_puzzle/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
 _FACTORED = ("tests/agents/factored",)
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
