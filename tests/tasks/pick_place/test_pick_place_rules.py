@@ -18,7 +18,8 @@ from imagine_bench.tasks.pick_place.rules import (
 from imagine_bench.tasks.pick_place.spec import HORIZON
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.rules import facts, optimal_values, tabulate
+from imagine_bench.interfaces import Outcome, State
+from imagine_bench.rules import advance, facts, optimal_values, tabulate
 
 RULES = PickPlaceRules()
 PLAY = [state for state in RULES.states if not RULES.is_terminal(state)]
@@ -133,3 +134,23 @@ def test_the_held_object_is_named():
 def test_unknown_actions_are_refused(action):
     with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 3"):
         RULES.outcomes((0, 0, 0, 0), action)
+
+
+def test_a_belief_advances_by_hand() -> None:
+    """What has ended stays and adds up; the rest is shared out by chance, and its reward expected."""
+
+    class Coin:
+        def optimal_action(self, state: State) -> int:
+            return 7
+
+        def outcomes(self, state: State, action: int) -> tuple[Outcome, ...]:
+            assert (state, action) == ((0,), 7)
+            win = Outcome(macrostate=(1,), probability=0.25, reward=2.0, terminated=True, success=True)
+            lose = Outcome(macrostate=(2,), probability=0.75, reward=-1.0, terminated=False, success=False)
+            return win, lose
+
+    belief = {((0,), False): 0.5, ((1,), True): 0.3, ((0,), True): 0.2}
+    for action in (None, 7):
+        after, reward = advance(Coin(), belief, action)  # type: ignore[arg-type]
+        assert after == pytest.approx({((1,), True): 0.425, ((2,), False): 0.375, ((0,), True): 0.2})
+        assert reward == pytest.approx(0.125 * 2.0 - 0.375)
