@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
-from doc_tables import PAGES, RESULTS, ROOT, rewritten, tables, unmarked
+from doc_tables import PAGES, RESULTS, ROOT, iqm, rewritten, tables, unmarked
+from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
 from imagine_bench.store.archive import load_archive
@@ -62,3 +64,12 @@ def test_every_kept_folder_is_cited() -> None:
     folders = {path.parent.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("results.csv")}
     folders = {folder for folder in folders if not folder.endswith("/report")}
     assert not [folder for folder in sorted(folders) if folder not in words]
+
+
+def test_the_figures_of_pages_draw_what_was_kept() -> None:
+    draw = runpy.run_path(str(ROOT / "docs" / "img" / "draw.py"), run_name="draw")
+    axes = Figure().add_subplot()
+    draw["curve"](axes, "arrow_puzzle-2000-episodes", "dqn")
+    (line,) = axes.lines
+    shown = [f"{value:.1f}" for value in line.get_ydata()]
+    assert shown == [iqm(str(budget), "arrow_puzzle-2000-episodes/dqn").split()[0] for budget in line.get_xdata()]

@@ -32,12 +32,12 @@ LEARNING = {
 
 
 def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
-    """Success of every seed, in %, by budget."""
+    """Success of every seed, as a share, by budget."""
     found: dict[int, list[float]] = {}
     with (RESULTS / folder / "results.csv").open() as file:
         for row in csv.DictReader(file):
             if row["agent"] == agent:
-                share = 100 * int(row["successes"]) / int(row["test_episodes"])
+                share = int(row["successes"]) / int(row["test_episodes"])
                 found.setdefault(int(row["episodes"]), []).append(share)
     return {budget: np.array(values) for budget, values in sorted(found.items())}
 
@@ -46,8 +46,9 @@ def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> 
     """Interquartile mean over seeds with its 95 % interval."""
     table = rates(folder, agent)
     budgets = list(table)
-    means = [statistics.iqm(values) for values in table.values()]
-    ends = [statistics.bootstrap_interval(values, np.random.default_rng(0)) for values in table.values()]
+    tests = json.loads((RESULTS / folder / "bench.json").read_text())["protocol"]["evaluation_episodes"]
+    means = [100 * statistics.iqm(values) for values in table.values()]
+    ends = [[100 * end for end in statistics.interval(values, trials=tests)] for values in table.values()]
     axes.plot(budgets, means, "o-", color=COLORS[agent], label=label or agent, markersize=4, linewidth=2)
     axes.fill_between(budgets, *zip(*ends, strict=True), color=COLORS[agent], alpha=0.15, linewidth=0)
 

@@ -1,4 +1,4 @@
-"""``imagine-bench coverage``: do intervals and tests keep their promise, on scores such as occur here?
+"""``imagine-bench coverage``: do intervals hold and tests claim as often as they say, on scores such as occur here?
 
 Every agent and budget with five kept seeds or more gives a population: its scores, smoothed on the logit scale. Benches
 are drawn from these, with and without one seed in ten that is stuck at chance, and judged by
@@ -32,7 +32,7 @@ _CELLS = (3, 2)  # budgets of a table, and agents beside the base
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """Whether promises are kept, at one number of seeds and one share of stuck ones."""
+    """Measured rates of intervals and tests, at one number of seeds and one share of stuck ones."""
 
     seeds: int
     stuck: float

@@ -16,7 +16,7 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 DRAWS = 150
 
 
-def test_promises_are_kept_on_kept_scores() -> None:
+def test_intervals_hold_on_kept_scores() -> None:
     found = list(measure(populations(RESULTS)[:40], DRAWS, np.random.default_rng(0)))
     assert [(kept.stuck, kept.seeds) for kept in found] == [(stuck, seeds) for stuck in STUCK for seeds in SEEDS]
     assert np.mean([kept.coverage for kept in found]) > 0.93, "of 1,200 intervals"
