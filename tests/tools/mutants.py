@@ -89,6 +89,10 @@ def bare(code: str) -> str | None:
             node.returns = None
         elif isinstance(node, ast.Call):
             node.keywords = [each for each in node.keywords if each.arg not in _GUARDS]
+        elif isinstance(node, ast.arguments):  # that one is given by name
+            node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]
+            node.defaults += [each for each in node.kw_defaults if each is not None]
+            node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
     return ast.dump(tree)
 
 
