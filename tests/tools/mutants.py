@@ -33,7 +33,10 @@ from cosmic_ray.plugins import get_operator, operator_names
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("mutants_that_may_live.json")
 _RULES = ("tests/tasks/arrow_puzzle/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
-_FACTORED = ("tests/agents/factored", "tests/agents/test_transfer.py")
+_FACTORED = (
+    "tests/agents/factored/test_factored_formulas.py", "tests/agents/factored/test_factored.py",
+    "tests/agents/test_transfer.py",
+)  # fmt: skip
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
 ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "rules": {

@@ -10,7 +10,7 @@ import pytest
 from imagine_bench.agents.factored.dynamics import FactorPrediction
 from imagine_bench.agents.factored.factors import Code, CodeTransition
 from imagine_bench.agents.factored.model import FactoredModel
-from imagine_bench.agents.factored.outcomes import Conjunctions
+from imagine_bench.agents.factored.outcomes import Conjunctions, OutcomeModel
 from imagine_bench.agents.factored.settings import (
     DynamicsSettings,
     FactoredSettings,
@@ -147,3 +147,78 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         assert probability == pytest.approx(moved * chance[causes.outcomes.index((each.reward, each.terminated))])
         known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
         assert unknown == pytest.approx(1.0 - known * (1.0 - untested))
+
+
+class ByLoops:
+    """Expectation maximisation over three outcomes; of conjunctions that were met alone."""
+
+    def __init__(self, learned: OutcomeModel, rows: list[CodeTransition]) -> None:
+        self.settings, self.prior = learned.settings, learned.conjunctions.prior
+        active = [learned.conjunctions.active(*(np.array([part]) for part in row[:3]))[0].tolist() for row in rows]
+        self.rows = list(
+            zip(active, [learned.outcomes.index((row.reward, row.terminated)) for row in rows], strict=True)
+        )
+        self.met = sorted({number for active, _ in self.rows for number in active})
+        self.group = {number: int(learned.conjunctions.group[number]) for number in self.met}
+        self.tried = Counter(self.group.values())
+
+    def silent(self, strength: dict[int, float], active: list[int]) -> float:
+        return float((1.0 - self.settings.leak) * np.prod([1.0 - strength[number] for number in active]))
+
+    def decided(self, strength: dict[int, float], outcome: int) -> dict[int, float]:
+        share = dict.fromkeys(self.met, 0.0)
+        for active, what in self.rows:
+            for number in active if what == outcome else ():
+                share[number] += min(strength[number] / (1.0 - self.silent(strength, active)), 1.0)
+        return share
+
+    def strengths(self, outcome: int, default: int) -> tuple[dict[int, float], list[float]]:
+        """Of each conjunction, and how likely those of each group are causes."""
+        pseudo, few, own = self.settings.pseudo_tests, self.settings.pseudo_conjunctions, list(self.prior / 2)
+        strength = {number: own[self.group[number]] for number in self.met}
+        weight = dict.fromkeys(self.met, 0.0)
+        for active, what in self.rows:
+            for number in active:
+                weight[number] += 1.0 if what in (outcome, default) else self.settings.masked_weight
+        for _ in range(self.settings.sweeps):
+            share = self.decided(strength, outcome)
+            strength = {n: (pseudo * own[self.group[n]] + share[n]) / (pseudo + weight[n]) for n in self.met}
+            found = [sum(strength[n] for n in self.met if self.group[n] == group) for group in range(len(own))]
+            own = [(few * self.prior[g] / 2 + found[g]) / (few + self.tried[g]) for g in range(len(own))]
+        return strength, own
+
+    def explain(self, default: int) -> tuple[dict[int, dict[int, float]], list[float], list[float], float]:
+        """Strengths by outcome, tests, rates, and the posterior's logarithm."""
+        few, strengths, posterior = self.settings.pseudo_conjunctions, {}, 0.0
+        rate = [0.5 * few * p / (few + self.tried[group]) for group, p in enumerate(self.prior)]
+        tests = [float(sum(n in active and what == default for active, what in self.rows)) for n in self.met]
+        for outcome in {0, 1, 2} - {default}:
+            strength, own = self.strengths(outcome, default)
+            strengths[outcome], rate = strength, [a + b for a, b in zip(rate, own, strict=True)]
+            tests = [a + b for a, b in zip(tests, self.decided(strength, outcome).values(), strict=True)]
+            before = {number: own[self.group[number]] for number in self.met}
+            posterior += sum(max(strength[n] - before[n], 0.0) * np.log(before[n]) for n in self.met)
+        for active, what in self.rows:
+            silent = {outcome: self.silent(strength, active) for outcome, strength in strengths.items()}
+            chance = {outcome: 1.0 - none for outcome, none in silent.items()}
+            chance[default] = float(np.prod(list(silent.values())))
+            posterior += np.log(chance[what] / sum(chance.values()))
+        return strengths, tests, rate, posterior
+
+
+def test_causes_are_found_by_expectation_maximisation() -> None:
+    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1, sweeps=6, masked_weight=0.3))
+    rows = [row._replace(reward=2.0) if row.following == (0, 1) else row for row in lived()]
+    for row in rows:
+        learned.add(row)
+    learned.fit()
+    assert learned.causes is not None and len(learned.outcomes) == 3
+    slow = ByLoops(learned, rows)
+    posteriors = [slow.explain(default)[3] for default in range(3)]
+    assert learned.causes.default == int(np.argmax(posteriors)), "whichever explains it best"
+    strengths, tests, rate, posterior = slow.explain(learned.causes.default)
+    for outcome, strength in strengths.items():
+        assert learned.causes.strength[outcome, slow.met] == pytest.approx(list(strength.values()))
+    assert learned.causes.tests[slow.met] == pytest.approx(tests)
+    assert learned.causes.cause_rate == pytest.approx(rate)
+    assert learned.causes.log_posterior == pytest.approx(posterior)
