@@ -70,7 +70,7 @@ def test_single_samples_and_components_have_no_spread() -> None:
 
 @pytest.mark.parametrize(("name", "expected"), [("sum", 6.0), ("mean", 2.0), ("max", 3.0)])
 def test_reductions_by_name(name: str, expected: float) -> None:
-    assert reduction(name)(torch.tensor([[1.0, 2.0, 3.0]])).tolist() == [expected]
+    assert reduction(name)(torch.tensor([[[1.0, 2.0, 3.0]] * 2])).tolist() == [[expected] * 2]
 
 
 def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
