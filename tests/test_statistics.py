@@ -139,7 +139,12 @@ def test_a_detectable_difference_is_found_four_times_in_five() -> None:
         a, b = draw.normal(size=(2, 12))
         found += statistics.difference(a + sizes, b).p < 0.05
     assert 0.7 < found / 400 < 0.93
-    assert statistics.detectable(a, b, cells=9) > 1.2 * statistics.detectable(a, b, cells=1)
+    test = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=0.25)
+    error = statistics.difference(FIVE, OTHERS).value / test.statistic
+    for cells in (1, 9):
+        expected = error * (stats.t.isf(0.05 / cells / 2, test.df) + stats.t.ppf(0.8, test.df))
+        assert statistics.detectable(FIVE, OTHERS, cells=cells) == pytest.approx(expected)
+    assert statistics.detectable([1.0, 1.0], [0.0, 0.0], cells=1) == 0.0
 
 
 def test_gain_is_the_thesis_table() -> None:

@@ -266,11 +266,12 @@ def test_progress_counts_all_that_was_played() -> None:
     told: list[Progress] = []
     counters = Counters(before=3, episode=110, success=[True] * 10 + [False] * 60 + [True] * 40)
     counters.rows = ["a row"] * 2  # type: ignore[list-item]
-    run: Any = SimpleNamespace(counters=counters, entry=SimpleNamespace(learns=True), protocol=small())
+    run: Any = object.__new__(run_state.Run)
+    run.counters, run.entry, run.protocol = counters, SimpleNamespace(learns=True), small()
     run.spec, run._reported_s, run._on_progress = RunSpec(protocol=small(), agent="table", seed=0), 0.0, told.append
 
     def tell(*, at_once: bool = True) -> tuple[int, float | None]:
-        run_state.Run.tell(run, "training", at_once=at_once)
+        run.tell("training", at_once=at_once)
         return told[-1].done, told[-1].success
 
     assert tell(at_once=False) == (123, 0.4) and told[0].episode == 110
@@ -281,6 +282,16 @@ def test_progress_counts_all_that_was_played() -> None:
     assert tell() == (127, 0.25)
     counters.test, counters.success, run.entry.learns = None, [], False
     assert tell() == (118, None), "one that does not learn is tested once"
+
+
+def test_a_run_is_saved_as_often_as_it_is_asked_to_be() -> None:
+    run: Any = object.__new__(run_state.Run)
+    saved: list[str] = []
+    run.tell, run.save, run.spec = str, lambda: saved.append("now"), SimpleNamespace(checkpoint_every_s=20.0)
+    for since_s, count in ((0.0, 0), (15.0, 0), (20.5, 1)):
+        run._saved_s = time.monotonic() - since_s
+        run.made_progress("training")
+        assert len(saved) == count
 
 
 def test_every_registered_agent_has_a_target() -> None:

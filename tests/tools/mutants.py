@@ -3,7 +3,8 @@
 cosmic-ray says what can be changed in the files below. Of all the places a sample is drawn, as many a room, and at
 each place one of its changes. Each is made in a copy of the checkout, where the tests of its file run until one fails.
 What was tried is kept as it comes in ``build/mutants.jsonl``: the same command goes on there, and tries again what
-no test noticed.
+no test noticed. All of them then lie in ``build/mutants.json``, with the reason why one that survives may, as far as
+``mutants_that_may_live.json`` gives one.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[2]
+REASONS = Path(__file__).with_name("mutants_that_may_live.json")
 _RULES = ("tests/tasks/arrow_puzzle/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
 _FACTORED = ("tests/agents/factored", "tests/agents/test_transfer.py")
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
@@ -87,6 +89,10 @@ def bare(code: str) -> str | None:
             node.returns = None
         elif isinstance(node, ast.Call):
             node.keywords = [each for each in node.keywords if each.arg not in _GUARDS]
+        elif isinstance(node, ast.arguments):  # that one is given by name
+            node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]
+            node.defaults += [each for each in node.kw_defaults if each is not None]
+            node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
     return ast.dump(tree)
 
 
@@ -184,12 +190,13 @@ def main() -> int:
     copy_checkout(where)
     limits: dict[Sequence[str], float] = {}
     known = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-    tried: list[dict[str, Any]] = []
+    tried, reasons = list[dict[str, Any]](), json.loads(REASONS.read_text())
     for mutant in sample(args.count, args.seed):
         code, path = mutant.pop("code"), where / mutant["file"]
         before = path.read_text()
         mutant["change"] = change(before, code)
-        earlier = [row for row in known if mutant.items() <= row.items() and row["result"] != "passed"]
+        what = (mutant["file"], mutant["change"])
+        earlier = [row for row in known if (row["file"], row["change"]) == what and row["result"] != "passed"]
         if not earlier:
             tests = tuple(ROOMS[mutant["room"]][mutant["file"]])
             if tests not in limits:
@@ -203,15 +210,21 @@ def main() -> int:
             mutant["seconds"] = round(took_s, 1)
             with log.open("a") as file:
                 file.write(json.dumps(mutant) + "\n")
-        tried.append(earlier[0] if earlier else mutant)
+        tried.append({**earlier[0], "line": mutant["line"]} if earlier else mutant)
         if tried[-1]["result"] == "passed":
-            print(f"survives: {mutant['file']}:{mutant['line']} {mutant['change']}", flush=True)
+            tried[-1]["why"] = why = reasons.get(mutant["file"], {}).get(mutant["change"], "")
+            print(f"survives: {mutant['file']}:{mutant['line']} {mutant['change']}\n    {why or 'WHY?'}", flush=True)
     for room in ROOMS:
         rows = [row["result"] for row in tried if row["room"] == room]
         print(f"{room}: {sum(result != 'passed' for result in rows)} of {len(rows)} noticed")
     noticed = sum(row["result"] != "passed" for row in tried)
-    share = noticed / max(1, len(tried))
+    share, why = noticed / max(1, len(tried)), sum(bool(row.get("why")) for row in tried)
     print(f"{noticed} of {len(tried)} small bugs are noticed, {share:.1%}; wanted are {args.least:.0%}")
+    print(f"{why} of the other {len(tried) - noticed} may live, by {REASONS.name}")
+    found = {"seed": args.seed, "count": len(tried), "noticed": noticed, "mutants": tried}
+    machine = importlib.import_module("imagine_bench.machine")  # not earlier, or every process had it unchanged
+    environment = {**machine.describe_environment(), "command": "make mutants"}
+    (build / "mutants.json").write_text(json.dumps({**found, "environment": environment}, indent=1) + "\n")
     return int(noticed < args.least * len(tried))
 
 
