@@ -17,11 +17,13 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame
 
 from .agent import ImaginingAgent
-from .rollouts import TERMINAL, Imagination, Imagined
+from .rollouts import LATENT_LIMIT, TERMINAL, Imagination, Imagined
 from .uncertainty import decompose
 
 Latents = NDArray[np.float32]
 Switches = NDArray[np.bool_]
+VERDICT = ("accepted", "epistemic", "aleatoric", "modal")
+"""What an info says of a transition."""
 
 
 class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
@@ -60,7 +62,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self.imagination, self.starts = imagination, starts
         self.num_envs, self.horizon = num_envs, horizon
         self._generator = torch.Generator(imagination.generators["rollouts"].device)
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (model.latent_size,), np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-LATENT_LIMIT, LATENT_LIMIT, (model.latent_size,))
         self.single_action_space = gymnasium.spaces.Discrete(model.n_actions)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
@@ -105,8 +107,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
     def _info(self, step: Imagined, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
         parts = decompose(step.samples)
         values = {"accepted": accepted} | {
-            name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy()
-            for name in ("epistemic", "aleatoric", "modal")
+            name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]
         }
         info: dict[str, Any] = {}
         for index, over in enumerate(ended):
@@ -122,6 +123,33 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
 
     def _draw_starts(self, count: int) -> Latents:
         return self.starts[self.np_random.integers(len(self.starts), size=count)]
+
+
+class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
+    """One imagined episode after another, for learners that know no vectors: a world of one episode at a time."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, world: ImaginedVectorEnv) -> None:
+        if world.num_envs != 1:
+            raise InvalidValueError(f"This world has {world.num_envs} episodes side by side; give one of num_envs 1.")
+        self.world = world
+        self.observation_space, self.action_space = world.single_observation_space, world.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Latents, dict[str, Any]]:
+        """Begin an episode: latents (Z,)."""
+        super().reset(seed=seed)
+        seen, info = self.world.reset(seed=seed)
+        return seen[0], info
+
+    def step(self, action: np.int64) -> tuple[Latents, float, bool, bool, dict[str, Any]]:
+        """Imagine one transition; errors as of :meth:`ImaginedVectorEnv.step`."""
+        seen, (reward,), (terminated,), (truncated,), info = self.world.step(np.array([action]))
+        reached = info["final_obs"][0] if terminated or truncated else seen[0]
+        own = {name: info[name][0].item() for name in VERDICT}
+        return reached, float(reward), bool(terminated), bool(truncated), own
 
 
 def imagined_env(
