@@ -15,8 +15,8 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxarray = 10
 
 
 def brief(value: object) -> str:
-    """``repr(value)``, whatever the value is, at most a few hundred characters of it."""
-    return _SHORT.repr(value)
+    """``repr(value)`` on one line, whatever the value is, at most a few hundred characters of it."""
+    return " ".join(_SHORT.repr(value).split())
 
 
 def plain(text: object) -> str:

@@ -37,7 +37,7 @@ class AgentEntry:
     #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
     #: group)``.
     settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
-    privileged: bool = False  #: Whether it is shown the macrostate and the rules (references only)
+    privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
     #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
     external_training_loop: bool = False
     title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
@@ -63,7 +63,8 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }  # fmt: skip
 
-_COUNT_TABLE_SETTINGS = "imagine_bench.agents.count_table.settings:HYPERPARAMETERS"
+_TRUE_STATE = "the true macrostate, which no other learner is shown (privileged)"
+_COUNT_TABLE_SETTINGS = "imagine_bench.agents.tabular.settings:HYPERPARAMETERS"
 _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
 AGENTS: dict[str, AgentEntry] = {
@@ -141,15 +142,28 @@ AGENTS: dict[str, AgentEntry] = {
         description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
     ),
     "count_table": AgentEntry(
-        make="imagine_bench.agents.count_table.agent:make", encoder_kind="codes", settings=_COUNT_TABLE_SETTINGS,
+        make="imagine_bench.agents.tabular.count_table:make", encoder_kind="codes", settings=_COUNT_TABLE_SETTINGS,
         description="A control: counts what followed each action in each code of a frame, and plans by value "
         "iteration; explores by chance as DQN does.",
     ),
     "count_table_directed": AgentEntry(
-        make="imagine_bench.agents.count_table.agent:make_directed", encoder_kind="codes",
+        make="imagine_bench.agents.tabular.count_table:make_directed", encoder_kind="codes",
         settings=_COUNT_TABLE_SETTINGS, title="count table, directed",
         description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
     ),
+    **{
+        f"{name}{twin}": AgentEntry(
+            make=f"imagine_bench.agents.tabular.dyna_q:make_{name}{twin}", encoder_kind="codes",
+            settings=f"imagine_bench.agents.tabular.settings:{name.upper()}", needs_encoder=not twin,
+            privileged=bool(twin), title=f"{title} (true state)" if twin else title,
+            description=f"{description}; its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
+        )
+        for name, title, description in (
+            ("q_learning", "Q-learning", "Learns values in a table from real transitions"),
+            ("dyna_q", "Dyna-Q", "Q-learning, also from transitions that its model recalls: imagination's ancestor"),
+        )
+        for twin in ("", "_macrostate")
+    },
 }  # fmt: skip
 
 AGENT_GROUP = "imagine_bench.agents"

@@ -222,8 +222,7 @@ def _contrast(a: Floats, b: Floats, trials: int | None, trim: float) -> tuple[fl
 
 def _welch(first: _Location, second: _Location) -> float:
     parts = first.error**4 / first.freedom + second.error**4 / second.freedom
-    both = first.freedom + second.freedom
-    return (first.error**2 + second.error**2) ** 2 / parts if parts > 0.0 else float(both)
+    return (first.error**2 + second.error**2) ** 2 / parts if parts > 0.0 else 1.0  # of no error, any number
 
 
 def _finite(scores: ArrayLike) -> Floats:

@@ -2,8 +2,8 @@
 
 - A context is made at the first image, in the process that draws it; one inherited through a fork is dropped.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
-- Any thread may draw, one at a time. A context is current in the thread that made it until a second thread draws; that
-  one makes another, and from then on it is released after each frame, which costs a tenth of the frame.
+- Any thread may draw, one at a time. A context stays current in the thread that made it. Another thread makes a
+  context of its own; where the work changes threads again, contexts are released after each frame, which takes 17 us.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
 """
 
@@ -195,7 +195,7 @@ class Renderer:
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self._canvas: _Canvas | None = None
-        self._shared, self._lock, self._pid = False, threading.RLock(), os.getpid()
+        self._takeovers, self._lock, self._pid = 0, threading.RLock(), os.getpid()
         require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
         self.view, self._model = view, model
         self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
@@ -222,7 +222,7 @@ class Renderer:
             mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
             mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
             mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
-            if self._shared:
+            if self._takeovers > 1:
                 canvas.release()
             return self._bottom_up[::-1].copy()
 
@@ -236,7 +236,7 @@ class Renderer:
         canvas = self._canvas
         if canvas is not None and canvas.usable:
             return canvas
-        self._shared = self._shared or (canvas is not None and canvas.pid == os.getpid())
+        self._takeovers += canvas is not None and canvas.pid == os.getpid()
         self.close()
         self._canvas = canvas = _Canvas(self._model, self.view)
         # A renderer that is merely forgotten must free its context with it current, too.

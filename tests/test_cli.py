@@ -48,7 +48,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
             ["--preset", "quik"],
             "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
         ),
-        (["--agents", "dnq"], "No agent 'dnq'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
+        (["--agents", "dqnn"], "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
         (["--appearance", "strng"], "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong."),
         (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
         (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),

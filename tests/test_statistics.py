@@ -34,9 +34,9 @@ def test_wilson_refuses_impossible_counts() -> None:
 
 
 def test_running_means_by_hand() -> None:
-    # 0.1 at episode 0, 0.3 at 10, 0.5 at 30: areas 2 and 2 + 8.
-    means = statistics.running_means((10, 30), [[0.3, 0.5], [0.1, 0.1]], 0.1)
-    assert means == pytest.approx(np.array([[0.2, 10.0 / 30.0], [0.1, 0.1]]), abs=1e-12)
+    # 0.1 at episode 0, 0.35 at 10, 0.5 at 30: areas 2.25 and 2.25 + 8.5.
+    means = statistics.running_means((10, 30), [[0.35, 0.5], [0.1, 0.1]], 0.1)
+    assert means == pytest.approx(np.array([[0.225, 10.75 / 30.0], [0.1, 0.1]]), abs=1e-12)
 
 
 def test_who_learns_earlier_has_the_larger_running_mean() -> None:
@@ -91,6 +91,7 @@ def test_one_run_gives_no_interval() -> None:
     assert math.isnan(statistics.gain([0.3], [0.2]).low)
     assert all(math.isnan(part) for part in statistics.difference([0.3], [0.2])[1:])
     assert math.isnan(statistics.detectable([0.3], [0.2], cells=1))
+    assert math.isfinite(statistics.gain([0.3, 0.31], [0.2, 0.21]).low), "two do"
 
 
 def test_a_difference_of_means_is_welch_s() -> None:
@@ -138,11 +139,18 @@ def test_a_detectable_difference_is_found_four_times_in_five() -> None:
         a, b = draw.normal(size=(2, 12))
         found += statistics.difference(a + sizes, b).p < 0.05
     assert 0.7 < found / 400 < 0.93
-    assert statistics.detectable(a, b, cells=9) > 1.2 * statistics.detectable(a, b, cells=1)
+    test = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=0.25)
+    error = statistics.difference(FIVE, OTHERS).value / test.statistic
+    for cells in (1, 9):
+        expected = error * (stats.t.isf(0.05 / cells / 2, test.df) + stats.t.ppf(0.8, test.df))
+        assert statistics.detectable(FIVE, OTHERS, cells=cells) == pytest.approx(expected)
+    assert statistics.detectable([1.0, 1.0], [0.0, 0.0], cells=1) == 0.0
 
 
 def test_gain_is_the_thesis_table() -> None:
     assert statistics.gain([62.17], [42.18]).value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes
+    gain, ratio = statistics.gain(FIVE, [0.4, 0.45, 0.5]), statistics.ratio(FIVE, [0.4, 0.45, 0.5])
+    assert gain[:3] == pytest.approx([end - 1.0 for end in ratio[:3]])
 
 
 @pytest.mark.parametrize("paired", [False, True])
@@ -182,3 +190,4 @@ def test_a_success_that_is_lost_again_does_not_last() -> None:
     assert statistics.first_lasting(budgets, [0.9, 0.2, 0.1, 0.95], 0.9) == 80
     assert statistics.first_lasting(budgets, [0.2, 0.9, 0.1, 0.1], 0.9) is None
     assert statistics.first_lasting(budgets, [0.2, 0.9, 0.95, 0.9], 0.9) == 20
+    assert statistics.first_lasting(budgets, [0.9] * 4, 0.9) == 10

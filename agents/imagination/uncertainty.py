@@ -36,7 +36,7 @@ def decompose(samples: Mixture) -> Uncertainty:
     return Uncertainty(means.var(dim=0, correction=0), aleatoric.mean(dim=0), modal.mean(dim=0))
 
 
-def component_variance(samples: Mixture, members: int = 1) -> Tensor:
+def component_variance(samples: Mixture, members: int) -> Tensor:
     """How uncertain each component of the averaged mixture is by itself: its noise, and what weights do to its mean.
 
     The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of

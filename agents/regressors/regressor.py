@@ -43,6 +43,8 @@ from .stationarity import jensen_shannon
 
 _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
+_DRAWN = 16
+"""Values of equation 4.8 drawn for each row."""
 _Arrays = TypeVar("_Arrays", Prediction, Mixtures)
 
 
@@ -104,9 +106,9 @@ class MixtureRegressor:
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict, with uncertainties; see :class:`imagine_bench.regression.interfaces.Regressor`."""
         self._require_inputs(inputs)
-        generator = self._generator(int(rng.integers(2**62)))
+        own, other = (self._generator(int(rng.integers(2**62))) for _ in range(2))
         networks = [
-            _joined([self._predict_rows(e, rows, generator) for rows in self._tensor(inputs[e]).split(_ROWS)])
+            _joined([self._predict_rows(e, rows, own, other) for rows in self._tensor(inputs[e]).split(_ROWS)])
             for e in range(self.networks)
         ]
         return _joined(networks, np.stack)
@@ -157,8 +159,9 @@ class MixtureRegressor:
         samples = self._model.mixture(sample_outputs(part, x, masks))
         return rescaled(samples, self._shift[network], self._scale[network])
 
-    def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator) -> Prediction:
+    def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator, other: torch.Generator) -> Prediction:
         samples = self._weight_samples(network, x)
+        pooled = mdn.average(samples, len(samples.means))
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
@@ -173,6 +176,7 @@ class MixtureRegressor:
             modal=_array(parts.modal),
             stationarity=_array(jensen_shannon(samples, self.settings.divergence_draws, generator)),
             predictive=_mixtures(predictive),
+            drawn=_array(torch.stack([mdn.sample(pooled, 1.0, other) for _ in range(_DRAWN)], dim=1)),
         )
 
     def _require_inputs(self, inputs: Floats) -> None:

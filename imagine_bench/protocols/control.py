@@ -56,6 +56,7 @@ class Protocol(ProtocolData):
     queries: int = 0  #: Most oracle queries of a learner in a training episode
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         task_entry(self.task)
         for agent in self.agents:
             agent_entry(agent)

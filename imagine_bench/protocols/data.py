@@ -8,7 +8,9 @@ import itertools
 import json
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, get_type_hints
+
+from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
@@ -39,6 +41,18 @@ class ProtocolData(ABC):
     settings_digest: str = ""
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
 
+    def __post_init__(self) -> None:
+        """Lists become tuples. Raises InvalidValueError: a value of another type than its field's."""
+        for name, hint in get_type_hints(type(self)).items():
+            if isinstance(value := getattr(self, name), list):
+                value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
+                object.__setattr__(self, name, value)
+            try:
+                check_type(value, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
+            except TypeCheckError:
+                wanted = next(field.type for field in dataclasses.fields(self) if field.name == name)
+                raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
+
     def as_dict(self) -> dict[str, Any]:
         """A JSON-serialisable copy."""
         return json.loads(json.dumps(dataclasses.asdict(self)))
@@ -46,9 +60,7 @@ class ProtocolData(ABC):
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """The inverse of :meth:`as_dict`."""
-        tuples: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in data.items()}
-        tuples["overrides"] = tuple((name, value) for name, value in tuples.get("overrides", ()))
-        return cls(**tuples)
+        return cls(**data)
 
     @property
     def hash(self) -> str:

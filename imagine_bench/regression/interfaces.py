@@ -54,6 +54,8 @@ class Prediction:
     sampled_variance: Floats
     nll: Floats  #: negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
     predictive: Mixtures  #: the mixture that predictions are sampled from. Leading axes (E, N).
+    #: values drawn as in equation 4.8, each from the mixture of one weight sample. Shape (E, N, S, D).
+    drawn: Floats
 
 
 SCORES: dict[str, Callable[[Prediction], Floats]] = {

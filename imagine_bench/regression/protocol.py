@@ -33,6 +33,7 @@ class RegressionProtocol(ProtocolData):
     recorded: bool = True  #: whether runs leave a recording
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         spec = registry.regression(self.task)
         if not self.variants:
             object.__setattr__(self, "variants", spec.variants)

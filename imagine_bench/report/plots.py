@@ -24,7 +24,7 @@ _INK = "#2b2b2f"  # in the SVG this becomes the page's own text color
 _COLORS = (
     "#8c8c8c", "#b8860b", "#0072b2", "#d55e00", "#009e73", "#882255",
     "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
-    "#44aa99", "#aa4499", "#117733",
+    "#44aa99", "#aa4499", "#117733", "#cc6677", "#7f5539", "#9aa600",
 )  # fmt: skip
 Value = TypeVar("Value")
 STYLE: dict[Any, Any] = {

@@ -52,6 +52,7 @@ class Study:
     appearance: str  #: Appearance level
     execution: str  #: ``"physics"`` or ``"kinematic"``
     variants: tuple[Variant, ...]  #: What is compared
+    preset: str = "quick"  #: Preset whose settings the variants change
 
     def __post_init__(self) -> None:
         names = [variant.name for variant in self.variants]
@@ -121,7 +122,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
     return plan(
-        task, "quick", agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,
+        task, study.preset, agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,
         evaluation_episodes=study.evaluation_episodes, execution=study.execution,
         appearance=variant.appearance or study.appearance, overrides=tuple(sorted(variant.settings.items())),
         open_loop_starts=0, recorded_episodes=0,

@@ -7,7 +7,6 @@ human's palm, four with the hands withdrawn, which is how the human answers what
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 from imagine_bench.errors import InvalidValueError
@@ -36,7 +35,6 @@ def _with(objects: tuple[int, ...], index: int, value: int) -> tuple[int, ...]:
     return (*objects[:index], value, *objects[index + 1 :])
 
 
-@dataclass(frozen=True)
 class PickPlaceRules:
     """The macrostate machine: action i picks object i, or places it if it is held; action 3 hands over.
 

@@ -97,7 +97,7 @@ def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
             UnknownNameError,
             "No preset 'fast'.* Known: smoke, quick, thesis, full, ",
         ),
-        ({"agents": ("dnq",)}, UnknownNameError, r"No agent 'dnq'. Did you mean 'dqn'\?"),
+        ({"agents": ("dqnn",)}, UnknownNameError, r"No agent 'dqnn'. Did you mean 'dqn'\?"),
         ({"agents": ("dqn", "dqn")}, InvalidValueError, "none of them twice"),
         ({"appearance": "milld"}, UnknownNameError, r"No appearance 'milld'. Did you mean 'mild'\?"),
         ({"execution": "real"}, UnknownNameError, "Known: physics, kinematic"),

@@ -104,6 +104,9 @@ def test_variances_and_nll_are_those_of_pooled_weight_samples(agent: str) -> Non
     np.testing.assert_allclose(said.mean, mean[..., 0, :], rtol=1e-5)
     assert 10.0 < np.sqrt(variance).mean() < 250.0 and abs(mean.mean() - 300.0) < 100.0
     np.testing.assert_allclose(said.nll, log_score(pooled, said.prediction), atol=1e-3)
+    drawn = (said.drawn - mean) / np.sqrt(variance)[..., None, :]  # [E, N, S, D]
+    assert drawn.shape == (2, 20, 16, 1) and abs(drawn.mean()) < 0.2 and abs(drawn.var() - 1.0) < 0.25
+    assert len(np.unique(drawn)) == drawn.size
 
 
 def tiny_context(agent: str, scale: float, shift: float) -> RegressorContext:
@@ -127,7 +130,7 @@ class Knowing:
         return Prediction(
             prediction=prediction, mean=prediction, epistemic=wrong, aleatoric=constant, modal=-wrong,
             stationarity=constant[..., 0], sampled_variance=constant[..., 0], nll=-wrong[..., 0],
-            predictive=self.pooled(inputs),
+            predictive=self.pooled(inputs), drawn=prediction[:, :, None],
         )  # fmt: skip
 
     def pooled(self, inputs: np.ndarray) -> Mixtures:

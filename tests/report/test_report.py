@@ -22,7 +22,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import plots, summary_table, write_report
 from imagine_bench.report import text as words
-from imagine_bench.report.data import _nan_mean, collect
+from imagine_bench.report.data import collect
 from imagine_bench.report.sections.imagination import encoder_views
 from imagine_bench.report.sections.success import gain
 from imagine_bench.report.text import percent, signed_percent
@@ -338,21 +338,6 @@ def test_summary_table_for_the_terminal(result: BenchResult) -> None:
     assert not any(line != line.rstrip() for line in lines)
 
 
-def test_learning_cost_counts_every_step(result: BenchResult) -> None:
-    timing = collect(result).timing["imagination"]
-    assert timing.env_steps == 3 * 6000
-    assert timing.learner_cpu_s == pytest.approx(0.022 * 3 * 6000)
-    assert math.isnan(collect(result).timing["random"].learner_cpu_s)
-
-
-def test_an_agent_that_does_not_learn_is_counted_once(result: BenchResult) -> None:
-    timing, runs = collect(result).timing, result.of("random")
-    assert timing["random"].faults == sum(run.checkpoints[0].faults for run in runs)
-    assert timing["random"].eval_cpu_s == pytest.approx(np.mean([run.checkpoints[0].eval_cpu_s for run in runs]))
-    every = [row for run in result.of("dqn") for row in run.checkpoints]
-    assert timing["dqn"].faults == sum(row.faults for row in every)
-
-
 def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult) -> None:
     both = dataclasses.replace(
         result.protocol, agents=("random", "dqn", "factored"), encoder="a@0123456789ab", codes="b@0123456789ab"
@@ -438,44 +423,6 @@ def test_no_two_registered_agents_share_a_color() -> None:
     colors = [plots.color(agent) for agent in own]
     assert len(own) > 8 and len(set(colors)) == len(colors)
     assert plots.color("an agent that nobody registered").startswith("#")
-
-
-def test_infinite_uncertainty_stays_and_unknown_is_left_out() -> None:
-    table = np.array([[1.0, np.inf, np.nan, np.nan], [3.0, 2.0, 4.0, np.nan]])
-    np.testing.assert_array_equal(_nan_mean(table), [2.0, np.inf, 4.0, np.nan])
-
-
-def _with(result: BenchResult, agent: str, shares: list[float], diagnostics: list[dict[str, float]]) -> BenchResult:
-    """The result, in which each seed of an agent always succeeds in a given share of tests and says something."""
-    values = iter(zip(shares, diagnostics, strict=True))
-    runs = []
-    for run in result.runs:
-        if run.agent == agent:
-            share, said = next(values)
-            rows = [
-                dataclasses.replace(row, successes=round(share * row.test_episodes), diagnostics=said)
-                for row in run.checkpoints
-            ]
-            run = dataclasses.replace(run, checkpoints=tuple(rows))  # noqa: PLW2901
-        runs.append(run)
-    return dataclasses.replace(result, runs=tuple(runs))
-
-
-def test_acceptance_is_the_mean_over_seeds(tmp_path: Path) -> None:
-    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1, 2))
-    said = [{"imagination/acceptance_rate": rate} for rate in (0.2, 0.9, 0.4)]
-    data = collect(_with(bench_result(tmp_path, protocol=protocol), "imagination_uncertainty", [0.5] * 3, said))
-    assert data.acceptance["imagination_uncertainty"] == pytest.approx(dict.fromkeys(protocol.budgets, 0.5))
-
-
-def test_the_area_begins_at_the_chance_level(tmp_path: Path) -> None:
-    protocol = Protocol(task="arrow_puzzle", preset="quick", seeds=(0, 1))
-    data = collect(_with(bench_result(tmp_path, protocol=protocol), "dqn", [1.0, 1.0], [{}, {}]))
-    chance, first = data.facts.chance_level, protocol.budgets[0]
-    assert 0.0 < chance < 0.2
-    assert data.areas["dqn"][first].value == pytest.approx((chance + 1.0) / 2.0)
-    last = protocol.budgets[-1]
-    assert data.areas["dqn"][last].value == pytest.approx(1.0 - (1.0 - chance) / 2.0 * first / last)
 
 
 def test_a_p_value_of_just_5_percent_shows_no_difference(result: BenchResult) -> None:

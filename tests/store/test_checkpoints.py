@@ -54,6 +54,9 @@ def test_the_newest_is_kept_alone(tmp_path: Path) -> None:
     newest = load_newest(tmp_path)
     assert newest is not None and newest.episode == 2
     assert load_newest(tmp_path / "nothing") is None
+    save_snapshot(tmp_path / "other", snapshot(1)).rename(tmp_path / "checkpoint_000001_episode_1")
+    newest = load_newest(tmp_path)
+    assert newest is not None and newest.episode == 2, "an older one that a kill left behind"
 
 
 def test_a_checkpoint_replaced_while_it_is_read_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -271,16 +271,23 @@ def test_scenes_of_several_threads_end_in_silence():
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
 
 
-def test_any_thread_draws_one_at_a_time(world):
+def test_any_thread_draws_one_at_a_time(world, monkeypatch):
+    made = []
+    make = rendering._new_gl_context
+    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make(*size))
     camera = agent_camera(world.model)
     before = camera.frame(world.data)
     with ThreadPoolExecutor(1) as first, ThreadPoolExecutor(1) as second:
+        for _ in range(3):  # a collector's thread keeps its own
+            assert np.array_equal(first.submit(camera.frame, world.data).result(), before)
+        assert len(made) == 2 and camera._canvas.thread is not None
         for _ in range(3):
             for pool in (first, second):
                 assert np.array_equal(pool.submit(camera.frame, world.data).result(), before)
             assert np.array_equal(camera.frame(world.data), before)
         at_once = [pool.submit(camera.frame, world.data) for _ in range(10) for pool in (first, second)]
         assert all(np.array_equal(job.result(), before) for job in at_once)
+        assert len(made) == 3 and camera._canvas.thread is None
         second.submit(camera.close).result()
     assert np.array_equal(camera.frame(world.data), before)
     camera.close()

@@ -72,6 +72,14 @@ def test_sigma_stays_above_its_floor_and_keeps_a_gradient() -> None:
     assert (outputs.grad[:, -K * Z :] > 0.1).all()
 
 
+def test_sigma_stays_between_its_floor_and_ceiling() -> None:
+    log_variances = torch.tensor([[-1e3, -2.0, 0.0, 2.0, 1e3]], dtype=torch.float64)
+    outputs = torch.cat([torch.zeros(1, 10, dtype=torch.float64), log_variances], dim=1)  # K = 5, Z = 1
+    bounded = mdn.from_outputs(outputs, 5, 1, log_sigma_floor=-30.0, log_sigma_ceiling=40.0).log_sigmas.flatten()
+    assert bounded.tolist() == pytest.approx([-30.0, -1.0, 0.0, 1.0, 40.0], abs=1e-9)
+    assert mdn.from_outputs(outputs, 5, 1, -30.0).log_sigmas.max() == 500.0, "there need not be a ceiling"
+
+
 def test_coefficients_sum_to_one() -> None:
     torch.testing.assert_close(random_mixture(N).log_weights.exp().sum(-1), torch.ones(N, dtype=torch.float64))
 
@@ -110,7 +118,7 @@ def test_likeliest_is_the_mean_of_the_largest_component() -> None:
 
 
 def test_average_is_over_coefficients_means_and_variances() -> None:
-    samples = random_mixture(5, N)
+    samples = random_mixture(5, 2, N)
     averaged = mdn.average(samples)
     torch.testing.assert_close(averaged.log_weights.exp(), samples.log_weights.exp().mean(0))
     torch.testing.assert_close(averaged.means, samples.means.mean(0))

@@ -70,7 +70,7 @@ def test_single_samples_and_components_have_no_spread() -> None:
 
 @pytest.mark.parametrize(("name", "expected"), [("sum", 6.0), ("mean", 2.0), ("max", 3.0)])
 def test_reductions_by_name(name: str, expected: float) -> None:
-    assert reduction(name)(torch.tensor([[1.0, 2.0, 3.0]])).tolist() == [expected]
+    assert reduction(name)(torch.tensor([[[1.0, 2.0, 3.0]] * 2])).tolist() == [[expected] * 2]
 
 
 def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
@@ -86,8 +86,22 @@ def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
         assert found.item() == pytest.approx(variance, rel=1e-5)
 
 
+VALUES = torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
+
+
+def test_components_count_by_their_posterior() -> None:
+    mixtures = samples(torch.float64)
+    averaged = mdn.average(mixtures)
+    log_joint = averaged.log_weights + torch.distributions.Normal(averaged.means, averaged.log_sigmas.exp()).log_prob(
+        VALUES[:, None]
+    ).sum(-1)  # [N, K]
+    own = (2.0 * mixtures.log_sigmas).exp().mean(0) + mixtures.means.var(0, correction=0)  # [N, K, Z]
+    expected = (log_joint.softmax(-1) * own.sum(-1)).sum(-1)
+    torch.testing.assert_close(sampled_component_variance(mixtures, averaged, VALUES), expected)
+
+
 def test_nll_is_that_of_all_weight_samples_together() -> None:
-    mixtures, values = samples(torch.float64), torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
+    mixtures, values = samples(torch.float64), VALUES
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), values).exp() for t in range(T)]
     torch.testing.assert_close(nll(mixtures, values), -torch.stack(densities).mean(dim=0).log())
 

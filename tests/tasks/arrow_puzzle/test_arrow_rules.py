@@ -12,7 +12,7 @@ from imagine_bench.tasks.arrow_puzzle.spec import make_env, spec_of
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import evaluate, facts, greedy, optimal_policy, tabulate
+from imagine_bench.rules import evaluate, facts, fewest_actions, greedy, is_random, optimal_policy, tabulate
 
 FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(ArrowPuzzleRules(goal) for goal in GOALS.values())
 NAMES = ["easy", "hard", "toward", "clockwise"]
@@ -25,6 +25,7 @@ def test_counts_of_macrostates():
     assert len(legal) == 72
     assert [sum(map(rules.is_goal, rules.states)) for rules in FAMILY] == [18, 6, 18, 6]
     assert [len(rules.start_states) for rules in FAMILY] == [54, 66, 54, 66]
+    assert not any(map(is_random, FAMILY))
 
 
 def test_goals_are_what_their_tasks_say():
@@ -111,7 +112,7 @@ def test_optimal_plans_are_as_short_as_breadth_first_search_says(rules):
             (outcome,) = rules.outcomes(state, rules.optimal_action(state))
             state, terminated, steps, total = outcome.macrostate, outcome.terminated, steps + 1, total + outcome.reward
         assert outcome.success
-        assert steps == shortest
+        assert steps == shortest == fewest_actions(rules, start)
         assert total == 50.0 - (steps - 1)
         lengths[steps] += 1
     assert set(lengths) == set(range(1, 7 if len(rules.start_states) == 66 else 6))

@@ -19,7 +19,7 @@ from imagine_bench.tasks.pick_place.spec import HORIZON
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome, State
-from imagine_bench.rules import advance, facts, optimal_values, tabulate
+from imagine_bench.rules import advance, facts, is_random, optimal_values, require_macrostates, tabulate
 
 RULES = PickPlaceRules()
 PLAY = [state for state in RULES.states if not RULES.is_terminal(state)]
@@ -35,6 +35,7 @@ def test_play_is_table_3_1_in_its_order():
     assert list(RULES.states[:12]) == TABLE_3_1 == PLAY
     assert len(set(RULES.states)) == len(RULES.states) == 19
     assert RULES.start_states == tuple(TABLE_3_1[:3])
+    assert is_random(RULES)
 
 
 def test_outcomes_are_distributions_over_known_states():
@@ -84,6 +85,7 @@ def test_a_handover_ends_well_only_into_an_open_palm():
     assert (good.macrostate, good.reward, good.success) == ((0, 0, HANDED_OVER, OPEN_PALM), 5.0, True)
     (early,) = RULES.outcomes((0, 0, 1, 0), HAND_OVER)
     assert (early.macrostate, early.reward, early.success) == ((0, 0, PICKED, WITHDRAWN), -5.0, False)
+    assert RULES.objects_after((0, 0, PICKED, WITHDRAWN), HAND_OVER) == (0, 0, PICKED), "into no hand that is gone"
 
 
 def test_a_fault_counts_as_a_wrong_action():
@@ -134,6 +136,15 @@ def test_the_held_object_is_named():
 def test_unknown_actions_are_refused(action):
     with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 3"):
         RULES.outcomes((0, 0, 0, 0), action)
+
+
+@pytest.mark.parametrize(
+    "given", [np.zeros(4, np.int64), np.zeros((1, 3), np.int64), np.zeros((1, 4)), np.zeros((1, 4, 1), np.int64)]
+)
+def test_macrostates_of_another_shape_or_type_are_refused(given):
+    with pytest.raises(InvalidValueError, match=r"Macrostates must be integers of shape \(N, 4\), not"):
+        require_macrostates(RULES, given)
+    assert require_macrostates(RULES, PLAY).tolist() == [list(state) for state in PLAY]
 
 
 def test_a_belief_advances_by_hand() -> None:

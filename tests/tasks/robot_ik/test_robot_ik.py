@@ -131,7 +131,7 @@ def test_decisions_are_carried_out_by_the_arm() -> None:
         said = {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
         scores = {name: rng.random(shape) for name in ("stationarity", "sampled_variance", "nll")}
         told = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
-        return Prediction(prediction=told, **said, **scores, predictive=None)  # type: ignore[arg-type]
+        return Prediction(prediction=told, **said, **scores, predictive=None, drawn=None)  # type: ignore[arg-type]
 
     found = ik.evaluate("1000", predict, (SeedTree(0), SeedTree(1)))
     for part in ("decision", "disc"):

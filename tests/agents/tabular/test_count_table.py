@@ -8,10 +8,10 @@ import fake_codes
 import numpy as np
 import pytest
 from agent_states import same
-from imagine_bench.agents.count_table.agent import CountTableAgent
-from imagine_bench.agents.count_table.settings import HYPERPARAMETERS
-from imagine_bench.agents.count_table.table import CountTable
 from imagine_bench.agents.factored.perception import CodePerception
+from imagine_bench.agents.tabular.count_table import CountTableAgent
+from imagine_bench.agents.tabular.counts import CountTable
+from imagine_bench.agents.tabular.settings import HYPERPARAMETERS
 from small_runs import small
 
 from imagine_bench import registry, rules

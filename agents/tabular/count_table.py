@@ -17,16 +17,15 @@ from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
 from ..dqn import epsilon
-from ..encoders.perception import prepare_torch
-from ..factored.perception import CodePerception, load_code_perception
+from ..factored.perception import CodePerception
 from ..meters import Meters
 from ..settings import flatten
+from .counts import CountTable
 from .settings import HYPERPARAMETERS, CountTableSettings
-from .table import CountTable
+from .states import epsilon_greedy, load_codes, read_codes
 
 _LEAST = 1e-3
 """What ``1 - discount`` counts as at least, so that the best return is finite without discount."""
-_TIE = 1e-9
 
 
 class CountTableAgent:
@@ -39,7 +38,8 @@ class CountTableAgent:
         self, perception: CodePerception, n_actions: int, settings: CountTableSettings, seeds: SeedTree, *,
         directed: bool,
     ) -> None:  # fmt: skip
-        self.perception, self.n_actions, self.settings, self.directed = perception, n_actions, settings, directed
+        self.n_actions, self.settings, self.directed = n_actions, settings, directed
+        self.code_sizes, self.read = perception.sizes, read_codes(perception)
         self.rng = seeds.child("exploration").generator()
         self.table = CountTable(n_actions)
         self.meters = Meters()
@@ -57,16 +57,15 @@ class CountTableAgent:
         return self._plans[optimistic].get(self._state(observation), unknown)
 
     def _state(self, observation: Observation) -> int:
-        return self.perception.code(observation.frame)[0]
+        return self.read(observation)[0]
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The action of the largest value; exploring, by chance among equals, and with epsilon or optimism."""
         if not explore:
             return int(self._values(observation, optimistic=False).argmax())
-        if not self.directed and self.rng.random() < epsilon(self.steps, self.settings.controller):
-            return int(self.rng.integers(self.n_actions))
-        values = self._values(observation, optimistic=self.directed)
-        return int(self.rng.choice(np.flatnonzero(values >= values.max() - _TIE)))
+        chance = 0.0 if self.directed else epsilon(self.steps, self.settings.controller)
+        values = partial(self._values, observation, optimistic=self.directed)
+        return epsilon_greedy(values, self.n_actions, chance, self.rng)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Count the transition; if the table then predicts otherwise, plan anew when next asked."""
@@ -92,7 +91,7 @@ class CountTableAgent:
         values = {
             "steps": self.steps, "exploration": self.rng.bit_generator.state, "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)), "directed": self.directed,
-            "code_sizes": list(self.perception.sizes), "n_actions": self.n_actions,
+            "code_sizes": list(self.code_sizes), "n_actions": self.n_actions,
         }  # fmt: skip
         return AgentState(arrays=snapshot.prefixed("table", self.table.arrays()), values=values)
 
@@ -108,9 +107,7 @@ class CountTableAgent:
 def build(context: AgentContext, *, directed: bool) -> CountTableAgent:
     """A count table; InvalidValueError if the context's encoder gives no codes."""
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
-    prepare_torch(context.device)
-    perception = load_code_perception(context, factored=False)
-    return CountTableAgent(perception, context.n_actions, settings, context.seeds, directed=directed)
+    return CountTableAgent(load_codes(context), context.n_actions, settings, context.seeds, directed=directed)
 
 
 make = partial(build, directed=False)

@@ -1,0 +1,1 @@
+"""Agents that keep tables of numbered states, without networks: the thesis' ancestors and controls."""

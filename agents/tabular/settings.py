@@ -1,0 +1,47 @@
+"""Settings of the tabular agents: discount and exploration by the names and values of the DQN's, and the updates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ..dqn_settings import FAST_3, FAST_5, GreedySettings
+from ..settings import RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountTableSettings:
+    """All settings of the count tables; where exploration is directed, the epsilons do nothing."""
+
+    controller: GreedySettings = field(default_factory=GreedySettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateSettings:
+    """How action values in a table are updated; the thesis gives no numbers, these are Sutton & Barto's (8.1).
+
+    On tuning seeds step sizes of 0.1, 0.3 and 0.5 did not differ.
+    """
+
+    step_size: float = setting(0.1, RATE)  #: alpha, the share of each error that is corrected
+    planning_steps: int = setting(50, UPDATES)  #: updates by the model a real step; 0 is Q-learning
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynaQSettings(CountTableSettings):
+    """All settings of Q-learning and Dyna-Q."""
+
+    table: UpdateSettings = field(default_factory=UpdateSettings)
+
+
+def _hyperparameters(published: S, *unused: str) -> Hyperparameters[S]:
+    def group(fast: dict[str, Override]) -> ConfigGroup[S]:
+        own = {name: value for name, value in fast.items() if name == "controller.epsilon_decay"}
+        return ConfigGroup(published, {"minimal": own, "fast": own, "published": {}}, frozenset(unused))
+
+    return Hyperparameters({"chapter_3": group(FAST_3), "chapter_5": group(FAST_5)})
+
+
+HYPERPARAMETERS = _hyperparameters(CountTableSettings())
+DYNA_Q = _hyperparameters(DynaQSettings())
+Q_LEARNING = _hyperparameters(DynaQSettings(table=UpdateSettings(planning_steps=0)), "table.planning_steps")
+"""No override makes it plan, so that both can be compared in one bench."""

@@ -1,0 +1,98 @@
+"""Equation 4.8 (appendix A of the thesis): the expected squared error is the sum of its causes, and of no fewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench.agents.imagination.mixture import Mixture
+from imagine_bench.agents.imagination.uncertainty import decompose
+from imagine_bench.tasks import toy_regression as toy
+
+from imagine_bench.bench.bench import plan
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.regression.report_toy_regression import sections, squared_error_terms
+from imagine_bench.regression.results import RegressionResult
+from imagine_bench.regression.runner import run
+
+PAIRS = 400_000
+SURE = 4.5
+"""Standard errors beyond which chance is no explanation."""
+X = 12.5
+"""Where all of the causes are worth mentioning: the branches are 13 apart (standard deviation)."""
+
+
+def posterior() -> Mixture:
+    """Four weight samples, mixtures of two components that lie beside the truth at X. Leading axes (4, 1)."""
+    weights = torch.tensor([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8], [0.4, 0.6]], dtype=torch.float64)
+    means = torch.tensor([[20.0, 45.0], [30.0, 10.0], [35.0, 40.0], [22.0, 50.0]], dtype=torch.float64)
+    sigmas = torch.tensor([[4.0, 6.0], [5.0, 5.0], [7.0, 3.0], [9.0, 2.0]], dtype=torch.float64)
+    return Mixture(weights.log().view(4, 1, 2), means.view(4, 1, 2, 1), sigmas.log().view(4, 1, 2, 1))
+
+
+def causes(samples: Mixture, sigma: float) -> dict[str, float]:
+    parts = decompose(samples)
+    mean = (samples.log_weights.exp()[..., None] * samples.means).sum(dim=-2).mean()
+    return {
+        "bias²": (toy.true_mean(np.array(X)) - float(mean)) ** 2, "epistemic": float(parts.epistemic),
+        "aleatoric": sigma**2, "modal": float(toy.true_modal(np.array(X))),
+        "spread": float(parts.aleatoric + parts.modal),
+    }  # fmt: skip
+
+
+def drawn(samples: Mixture, rng: np.random.Generator, *, means_only: bool) -> np.ndarray:
+    """Predictions of drawn weight samples: values of their mixtures, or the mixtures' means. Shape (PAIRS,)."""
+    weights, means, sigmas = (
+        part.numpy().reshape(4, 2) for part in (samples.log_weights.exp(), samples.means, samples.log_sigmas.exp())
+    )
+    t = rng.integers(len(weights), size=PAIRS)
+    if means_only:
+        return (weights * means).sum(axis=1)[t]
+    k = (rng.random(PAIRS) > weights[t, 0]).astype(int)
+    return means[t, k] + sigmas[t, k] * rng.standard_normal(PAIRS)
+
+
+def targets(sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Of the process of thesis 4.5.1 at X, by its definition. Shape (PAIRS,)."""
+    f = np.array([7 * np.sin(0.75 * X) + 0.5 * X, 3 * np.sin(0.5 * X) + 3 * X - 5, 2 * np.sin(0.3 * X) - 0.2 * X + 20])
+    return f[rng.integers(3, size=PAIRS)] + sigma * rng.standard_normal(PAIRS)
+
+
+@pytest.mark.parametrize("means_only", [False, True])
+def test_the_error_is_the_sum_of_its_causes_and_of_no_fewer(means_only: bool) -> None:
+    """Of drawn values there are five; of drawn weight samples' means four, for they have no spread."""
+    rng, sigma, samples = np.random.default_rng(0), 3.0, posterior()
+    squared = (targets(sigma, rng) - drawn(samples, rng, means_only=means_only)) ** 2
+    error = squared.std() / np.sqrt(PAIRS)
+    terms = causes(samples, sigma)
+    if means_only:
+        del terms["spread"]
+    assert abs(squared.mean() - sum(terms.values())) < SURE * error
+    for name in terms:
+        left = sum(value for other, value in terms.items() if other != name)
+        assert squared.mean() - left > SURE * error, f"{name} could be left out"
+
+
+def test_networks_err_by_the_sum_of_the_causes(tmp_path: Path) -> None:
+    """Of any network, however bad: what is measured minus the sum of the terms is 0 but for sampling."""
+    settings = {"components": 3, "epochs": 20, "hidden": (16, 16), "weight_samples": 5, "learning_rate": 0.01}
+    protocol, _ = plan(
+        "toy_regression", "smoke", test_points=2, recorded=False, overrides=tuple(settings.items()),
+        agents=("mc_dropout",), variants=("base", "high_noise"),
+    )  # fmt: skip
+    done = run(RunSpec(protocol=protocol, agent="mc_dropout", seed=0), tmp_path, lambda _: None)
+    result = RegressionResult(protocol=protocol, runs=(done,), environment={}, folder=tmp_path, wall_s=1.0)
+    for variant in protocol.variants:
+        terms = squared_error_terms(result, "mc_dropout", variant)
+        rest = terms.pop("measured") - sum(terms.values())
+        error = rest.std() / np.sqrt(rest.size)
+        assert abs(rest.mean()) < SURE * error
+        for name in ("modal", "spread"):
+            assert (rest + terms[name]).mean() > SURE * error, f"{name} could be left out"
+    (table,) = sections(result)[-1].tables
+    assert [row[0] for row in table.rows[:3]] == ["base: data", "base: region", "base: beyond"] and len(table.rows) == 6
+    for row in table.rows:
+        rest, interval = (float(part.replace("−", "-")) for part in str(row[-2]).split(" ± "))
+        assert abs(rest) < SURE / 1.96 * interval, row
