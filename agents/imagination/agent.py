@@ -21,6 +21,7 @@ from ..dqn import DQN, Controller, epsilon
 from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..networks.precision import settle
+from ..settings import Hyperparameters
 from .futures import sample_futures
 from .rollouts import TERMINAL, Imagination, Imagined
 from .settings import HYPERPARAMETERS, Settings
@@ -178,9 +179,12 @@ class ImaginingAgent(DQN):
         )
 
 
-def build(kind: type[_Kind], context: AgentContext, *, filtered: bool) -> _Kind:
+def build(
+    kind: type[_Kind], context: AgentContext, *, filtered: bool,
+    hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS,
+) -> _Kind:  # fmt: skip
     """An imagining agent of a kind, with or without the filter; the precision is that of its device."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
     precision = settle(settings.model.precision, context.device)
     settings = replace(settings, model=replace(settings.model, precision=precision))
     device, perception = prepare_torch(context.device), load_perception(context)
