@@ -255,6 +255,7 @@ def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     rollout = learner.imagine(frame((0, 2, 1)), actions=actions, depth=3, rng=np.random.default_rng(1))
     assert same(before, learner.state())
     assert np.array_equal(rollout.actions, actions)
+    assert rollout.accepted.all() and not blank.accepted.any(), "what is unknown is not accepted"
     assert rollout.frames.shape == (3, 64, 64)
     assert rollout.q_values.shape == (3, ACTIONS)
     code = (0, 2, 1)
