@@ -65,7 +65,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }  # fmt: skip
 
-_TRUE_STATE = "the true macrostate, which no other learner is shown (privileged)"
+_TRUE_STATE = "the true macrostate (privileged: other learners see frames)"
 _COUNT_TABLE_SETTINGS = "imagine_bench.agents.tabular.settings:HYPERPARAMETERS"
 _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 

@@ -21,6 +21,7 @@ from ..dqn import DQN, Controller, epsilon
 from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..networks.precision import settle
+from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
 from .futures import sample_futures
 from .rollouts import TERMINAL, Imagination, Imagined
@@ -73,6 +74,15 @@ class ImaginingAgent(DQN):
                     self.meters.add(f"loss/{name}", value)
                 self.updates += 1
         self.meters.count("time/model_s")
+
+    def draw_batch(self, memory: Transitions) -> Batch:
+        """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
+        batch, weight = super().draw_batch(memory), self.settings.imagination.curiosity
+        if weight == 0.0 or memory is not self.real:
+            return batch
+        paid = weight * self.imagination.ignorance(batch.z, batch.action)
+        self.meters.add("imagination/intrinsic_reward", float(paid.mean()))
+        return replace(batch, reward=batch.reward + paid)
 
     def _imagine(self, z: Tensor) -> None:
         with self.meters.cpu_time("time/imagination_s"):

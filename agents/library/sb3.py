@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 from functools import partial
 from typing import Any
 
@@ -22,7 +23,7 @@ from ..imagination.agent import ImaginingAgent, build
 from ..settings import Hyperparameters
 from .latent_observation import LatentObservation
 from .mixed_experience import MixedExperience
-from .settings import HYPERPARAMETERS, IMAGINING, IMAGINING_PPO, PPO
+from .settings import HYPERPARAMETERS, IMAGINING, IMAGINING_PPO, PPO, PPOSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -46,6 +47,7 @@ class LibraryAgent:
         prepare_torch(context.device)
         self._algorithm, self._device = _load(algorithm), context.device
         self.settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self._keywords = self.settings.ppo if hasattr(self.settings, "ppo") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS
         self._encoder = None if context.encoder is None else load_perception(context).encoder
         self._model: Any = None
@@ -54,7 +56,7 @@ class LibraryAgent:
         """Train in the library's own loop; see :class:`imagine_bench.capabilities.ExternalTrainer`."""
         from .training_loop import learn  # noqa: PLC0415 - needs the library
 
-        keywords = dataclasses.asdict(self.settings.sb3 if hasattr(self.settings, "sb3") else self.settings.ppo)
+        keywords = dataclasses.asdict(self._keywords)
         explores = keywords.pop("exploration_steps", 0)
         steps = max(episodes * self._steps_an_episode(horizon), explores)  # on_episode ends training before
         if explores:
@@ -90,6 +92,8 @@ class LibraryAgent:
             "epsilon": getattr(self._model, "exploration_rate", None),
             "gradient_updates": logged.get("train/n_updates"),
         }
+        if isinstance(self._keywords, PPOSettings) and values["gradient_updates"]:  # it counts epochs of batches
+            values["gradient_updates"] *= math.ceil(self._keywords.n_steps / self._keywords.batch_size)
         return {name: float(value) for name, value in values.items() if value is not None}
 
     def state(self) -> AgentState:
@@ -120,8 +124,9 @@ class ImaginingLibraryAgent(LibraryAgent):
 
     def diagnostics(self) -> dict[str, float]:
         """As without a world model, with that model's losses and how much the filter kept."""
-        real = {"real_transitions": float(self._learner.real.added)}
-        return {**super().diagnostics(), **self._learner.meters.read(), **real}
+        found = {**super().diagnostics(), **self._learner.meters.read()}
+        updates = found.get("gradient_updates", 0.0) + self._learner.updates
+        return {**found, "gradient_updates": updates, "real_transitions": float(self._learner.real.added)}
 
 
 def _load(target: str) -> Any:

@@ -29,7 +29,7 @@ pytest.importorskip("sb3_contrib")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 LATENTS = "sb3_dqn_latents"
 FEW: dict[str, Any] = {
-    "sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 16, "ppo.batch_size": 8,
+    "sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 8, "ppo.batch_size": 4,
     "imagination.start_episode": 3, "mix.imagined_episodes": 2,
 }  # fmt: skip
 IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
@@ -57,8 +57,12 @@ def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: s
     assert (first.test_episodes, last.test_episodes) == (4, 4)
     if "ppo" not in agent:
         assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
+    if agent == "sb3_ppo_latents":  # ten epochs of two batches for each 8 macro-actions
+        assert last.diagnostics["gradient_updates"] == 20 * ((last.env_steps - 1) // 8) > 0
     if agent in IMAGINING:
         assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [first.env_steps, last.env_steps]
+        of_the_model = last.env_steps  # one a real step with this set
+        assert last.diagnostics["gradient_updates"] > of_the_model
         assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
 
 

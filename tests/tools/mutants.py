@@ -59,7 +59,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "resume": {
         "imagine_bench/store/checkpoints.py": _CHECKPOINTS,
         "imagine_bench/store/counters.py": _CHECKPOINTS,
-        "imagine_bench/bench/run_state.py": _CHECKPOINTS[::-1],
+        "imagine_bench/bench/run_state.py": ("tests/bench/test_run_state.py", *_CHECKPOINTS[::-1]),
     },
     "report": {
         "imagine_bench/report/data.py": (
