@@ -22,7 +22,7 @@ from worlds import WORLDS
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, SceneReader
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, HELD_OUT, SceneReader
 
 TASKS = tuple(registry.TASKS)
 INFO_KEYS = {"macrostate", "is_success", "success", "legal", "fault", "sim_time_s", "ik_error_m"}
@@ -503,4 +503,4 @@ def test_the_human_view_shows_the_whole_scene_at_the_asked_size():
 def test_appearances_are_those_of_the_interfaces():
     from imagine_bench.tasks.scenes.appearance import LEVELS
 
-    assert tuple(LEVELS) == APPEARANCES
+    assert tuple(LEVELS) == (*APPEARANCES, *HELD_OUT.values())
