@@ -93,7 +93,7 @@ test-slow: ready  ## Run the tests that take minutes each
 storm: ready  ## Try every death, damage and hostile input on small runs; prints its counts
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 0 tests/storm $(ARGS)
 
-mutants: ready  ## Plant 300 small bugs one at a time and count those that a test notices (about an hour)
+mutants: ready  ## Plant 300 small bugs one at a time and count those that a test notices (half an hour)
 	@PATH="$$PATH:$(BIN)" uv pip install -q --python $(BIN)/python 'cosmic-ray>=8.7,<9'
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/tools/mutants.py $(ARGS)
 

@@ -137,9 +137,13 @@ class DQN:
         """Update the controller on batches of a memory, if that holds anything yet."""
         with self.meters.cpu_time("time/controller_s"):
             for _ in range(updates if len(memory) else 0):
-                batch = memory.sample(self.settings.controller.batch_size, self._replay)
+                batch = self.draw_batch(memory)
                 self.meters.add("loss/bellman", self.controller.update(batch))
                 self.updates += 1
+
+    def draw_batch(self, memory: Transitions) -> Batch:
+        """Transitions of a memory, with the rewards that the controller is to learn from."""
+        return memory.sample(self.settings.controller.batch_size, self._replay)
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""

@@ -63,7 +63,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }  # fmt: skip
 
-_TRUE_STATE = "the true macrostate, which no other learner is shown (privileged)"
+_TRUE_STATE = "the true macrostate (privileged: other learners see frames)"
 _COUNT_TABLE_SETTINGS = "imagine_bench.agents.tabular.settings:HYPERPARAMETERS"
 _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
@@ -147,6 +147,23 @@ AGENTS: dict[str, AgentEntry] = {
         )
         for twin in ("", "_macrostate")
     },
+    "sb3_ppo_latents": AgentEntry(
+        make="imagine_bench.agents.library.sb3:make_ppo", settings="imagine_bench.agents.library.settings:PPO",
+        external_training_loop=True, title="SB3 PPO (latents)",
+        description="Stable-Baselines3's PPO, which learns a policy, on the same latents.",
+    ),
+    "sb3_dqn_imagined": AgentEntry(
+        make="imagine_bench.agents.library.sb3:make_imagining_dqn",
+        settings="imagine_bench.agents.library.settings:IMAGINING", external_training_loop=True,
+        title="SB3 DQN + imagination",
+        description="The same DQN of the library, trained on real episodes and on those that a world model imagines.",
+    ),
+    "sb3_ppo_imagined": AgentEntry(
+        make="imagine_bench.agents.library.sb3:make_imagining_ppo",
+        settings="imagine_bench.agents.library.settings:IMAGINING_PPO", external_training_loop=True,
+        title="SB3 PPO + imagination",
+        description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
+    ),
 }  # fmt: skip
 
 AGENT_GROUP = "imagine_bench.agents"

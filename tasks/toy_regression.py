@@ -101,9 +101,8 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dic
 
     Returns:
         ``x``, ``true_mean``, ``true_modal``, ``true_aleatoric`` (GRID,); ``true_epistemic`` (equation 4.6, which needs
-        the networks' means), ``prediction``, ``mean`` and every score of :data:`SCORES`, (E, GRID); the left side of
-        equation 4.8 from new targets, ``squared_error``, and the same of ``prediction``, ``own_squared_error``
-        (E, GRID); the training data of the first network.
+        the networks' means), ``prediction``, ``mean``, every score of :data:`SCORES` and, from new targets, the left
+        side of equation 4.8, ``squared_error``, (E, GRID); the training data of the first network.
     """
     x = np.linspace(*TEST_DOMAIN, GRID)
     said = predict(np.broadcast_to(x[None, :, None], (len(seeds), GRID, 1)), "figure_4_1")
@@ -120,7 +119,6 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dic
         "prediction": said.prediction[..., 0],
         "mean": said.mean[..., 0],
         "squared_error": ((targets - said.drawn[..., 0]) ** 2).mean(axis=2),
-        "own_squared_error": ((targets - said.prediction) ** 2).mean(axis=2),
         "training_x": data.inputs[:, 0],
         "training_y": data.targets[:, 0],
         **{name: score(said) for name, score in SCORES.items()},

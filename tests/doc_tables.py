@@ -437,6 +437,13 @@ def claim(folder: str, network: str, text: str, column: str) -> str:
     return row[column]
 
 
+def decomposed(folder: str, network: str, where: str, column: str) -> str:
+    """A cell of the table of equation 4.8."""
+    with (RESULTS / folder / f"decomposition_{network}.csv").open() as file:
+        rows = {next(iter(row.values())): row for row in csv.DictReader(file)}
+    return rows[where][column]
+
+
 def speed(machine: str, what: str) -> str:
     """A measured figure of ``make speed``; an en dash where that machine has none."""
     found = [each for each in _json(f"speed/{machine}.json")["figures"] if each["what"].removeprefix(_TASK) == what]
@@ -480,7 +487,7 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
+        claim, decomposed, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
     )
 }  # fmt: skip
 

@@ -21,6 +21,8 @@ from ..dqn import DQN, Controller, epsilon
 from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..networks.precision import settle
+from ..replay import Batch, Transitions
+from ..settings import Hyperparameters
 from .futures import sample_futures
 from .rollouts import TERMINAL, Imagination, Imagined
 from .settings import HYPERPARAMETERS, Settings
@@ -72,6 +74,15 @@ class ImaginingAgent(DQN):
                     self.meters.add(f"loss/{name}", value)
                 self.updates += 1
         self.meters.count("time/model_s")
+
+    def draw_batch(self, memory: Transitions) -> Batch:
+        """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
+        batch, weight = super().draw_batch(memory), self.settings.imagination.curiosity
+        if weight == 0.0 or memory is not self.real:
+            return batch
+        paid = weight * self.imagination.ignorance(batch.z, batch.action)
+        self.meters.add("imagination/intrinsic_reward", float(paid.mean()))
+        return replace(batch, reward=batch.reward + paid)
 
     def _imagine(self, z: Tensor) -> None:
         with self.meters.cpu_time("time/imagination_s"):
@@ -178,9 +189,12 @@ class ImaginingAgent(DQN):
         )
 
 
-def build(kind: type[_Kind], context: AgentContext, *, filtered: bool) -> _Kind:
+def build(
+    kind: type[_Kind], context: AgentContext, *, filtered: bool,
+    hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS,
+) -> _Kind:  # fmt: skip
     """An imagining agent of a kind, with or without the filter; the precision is that of its device."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
     precision = settle(settings.model.precision, context.device)
     settings = replace(settings, model=replace(settings.model, precision=precision))
     device, perception = prepare_torch(context.device), load_perception(context)

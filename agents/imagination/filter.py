@@ -18,6 +18,7 @@ from .settings import Settings
 from .uncertainty import decompose, reduction
 from .world_model import WorldModel
 
+_CURIOSITY = "imagination.curiosity"
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
@@ -33,11 +34,14 @@ class EpistemicFilter:
 
     def __init__(self, settings: Settings, *, active: bool) -> None:
         samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
-        if active and samples * settings.model.members == 1:
+        if (active or settings.imagination.curiosity > 0.0) and samples * settings.model.members == 1:
+            who, without = (
+                ("The filter", "choose the agent without the filter") if active else (_CURIOSITY, "set it to 0")
+            )
             raise InvalidValueError(
-                "The filter compares what several networks say, and with model.members 1 and model.dropout 0, or "
+                f"{who} compares what several networks say, and with model.members 1 and model.dropout 0, or "
                 "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
-                "above 1, or model.members above 1, or choose the agent without the filter."
+                f"above 1, or model.members above 1, or {without}."
             )
         self.reads_reward = active and settings.imagination.reward_threshold is not None
         if self.reads_reward and samples == 1:

@@ -23,6 +23,7 @@ from . import mixture as mdn
 from .filter import EpistemicFilter
 from .mixture import Mixture
 from .settings import Settings
+from .uncertainty import decompose
 from .world_model import WorldModel
 
 TERMINAL = 0.5
@@ -120,6 +121,14 @@ class Imagination:
         """The mean of the likeliest component of what :meth:`step` samples from. Shape (N, Z)."""
         samples = self.model.predict(z, action, weights.dynamics)
         return mdn.likeliest(self._predicted(samples, z, action, weights, generator))
+
+    def ignorance(self, z: Tensor, action: Tensor) -> Tensor:
+        """Epistemic variance of where actions (N,) lead from z (N, Z), reduced as the filter does, at most 1: (N,).
+
+        Noise and the choice among several outcomes are no part of it (thesis 6): it is to be paid for exploring.
+        """
+        weights = self.model.draw_weights(self.settings.weight_samples, self.generators["dropout"])
+        return self.filter.score(decompose(self.model.predict(z, action, weights)).epistemic).clamp(max=1.0)
 
     def _predicted(
         self, samples: Mixture, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator

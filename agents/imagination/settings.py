@@ -113,6 +113,9 @@ class ImaginationSettings:
     predicts_with: str = setting("average", ("average", "network", "sample"))
     #: Smallest exploration probability inside rollouts; the real one counts where it is larger.
     exploration: float = setting(0.0, PROBABILITY)
+    #: Reward that the controller learns from on top of a real transition's own, for each squared unit of z of epistemic
+    #: variance in what the model predicts there, up to 1: artificial curiosity (thesis 6). Noise pays nothing. 0: none.
+    curiosity: float = setting(0.0, NOT_NEGATIVE)
     #: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
     weight_samples: int = setting(50, between(1, 1000))
     #: How the epistemic variances of the latent dimensions become one. The thesis has a vector (equation 4.25) and one

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -17,8 +19,11 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 
 from ..encoders.perception import load_perception, prepare_torch
+from ..imagination.agent import ImaginingAgent, build
+from ..settings import Hyperparameters
 from .latent_observation import LatentObservation
-from .settings import HYPERPARAMETERS
+from .mixed_experience import MixedExperience
+from .settings import HYPERPARAMETERS, IMAGINING, IMAGINING_PPO, PPO, PPOSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -30,15 +35,19 @@ class LibraryAgent:
     Args:
         context: Of the run. Its seed is that of torch's and numpy's global generators, which the library draws from.
         algorithm: The library's class, such as ``"stable_baselines3:DQN"``.
+        hyperparameters: Its settings, with the keywords of the class in a section ``sb3`` or ``ppo``.
 
     Raises:
         SetupError: The library is not installed.
     """
 
-    def __init__(self, context: AgentContext, algorithm: str) -> None:
+    def __init__(
+        self, context: AgentContext, algorithm: str, hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS
+    ) -> None:
         prepare_torch(context.device)
         self._algorithm, self._device = _load(algorithm), context.device
-        self.settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self.settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self._keywords = self.settings.ppo if hasattr(self.settings, "ppo") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS
         self._encoder = None if context.encoder is None else load_perception(context).encoder
         self._model: Any = None
@@ -47,18 +56,22 @@ class LibraryAgent:
         """Train in the library's own loop; see :class:`imagine_bench.capabilities.ExternalTrainer`."""
         from .training_loop import learn  # noqa: PLC0415 - needs the library
 
-        keywords = dataclasses.asdict(self.settings.sb3)
-        explores = keywords.pop("exploration_steps")
-        steps = max(episodes * horizon, explores)  # on_episode ends training; exploration depends on the step alone
-        self._model = self._algorithm(
-            "CnnPolicy" if self._encoder is None else "MlpPolicy",
-            env if self._encoder is None else LatentObservation(env, self._encoder),
-            exploration_fraction=explores / steps,
-            seed=self._seed,
-            device=self._device,
-            **keywords,
-        )
+        keywords = dataclasses.asdict(self._keywords)
+        explores = keywords.pop("exploration_steps", 0)
+        steps = max(episodes * self._steps_an_episode(horizon), explores)  # on_episode ends training before
+        if explores:
+            keywords["exploration_fraction"] = explores / steps  # exploration depends on the step alone
+        policy = "CnnPolicy" if self._encoder is None else "MlpPolicy"
+        self._model = self._algorithm(policy, self._experience(env), seed=self._seed, device=self._device, **keywords)
         learn(self._model, steps, on_episode)
+
+    def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        """What the library trains in."""
+        return env if self._encoder is None else LatentObservation(env, self._encoder)
+
+    def _steps_an_episode(self, horizon: int) -> int:
+        """The most steps that it makes for one real episode."""
+        return horizon
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The library's greedy action; ArtefactError before training."""
@@ -79,6 +92,8 @@ class LibraryAgent:
             "epsilon": getattr(self._model, "exploration_rate", None),
             "gradient_updates": logged.get("train/n_updates"),
         }
+        if isinstance(self._keywords, PPOSettings) and values["gradient_updates"]:  # it counts epochs of batches
+            values["gradient_updates"] *= math.ceil(self._keywords.n_steps / self._keywords.batch_size)
         return {name: float(value) for name, value in values.items() if value is not None}
 
     def state(self) -> AgentState:
@@ -91,6 +106,27 @@ class LibraryAgent:
     def restore(self, state: AgentState) -> None:
         """Raise ArtefactError: the library cannot go on from here bit for bit."""
         raise ArtefactError("An agent of Stable-Baselines3 cannot be taken up again; run its bench anew.")
+
+
+class ImaginingLibraryAgent(LibraryAgent):
+    """A learner of the library that trains on real and imagined episodes alike, the latter through the filter."""
+
+    def __init__(self, context: AgentContext, algorithm: str, hyperparameters: Hyperparameters[Any]) -> None:
+        super().__init__(context, algorithm, hyperparameters)
+        self._world_seed = context.seeds.child("imagined").integer()
+        self._learner = build(ImaginingAgent, context, filtered=True, hyperparameters=hyperparameters)
+
+    def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        return MixedExperience(env, self._learner, count=self.settings.mix.imagined_episodes, seed=self._world_seed)
+
+    def _steps_an_episode(self, horizon: int) -> int:
+        return horizon + self.settings.mix.imagined_episodes * self.settings.imagination.depth
+
+    def diagnostics(self) -> dict[str, float]:
+        """As without a world model, with that model's losses and how much the filter kept."""
+        found = {**super().diagnostics(), **self._learner.meters.read()}
+        updates = found.get("gradient_updates", 0.0) + self._learner.updates
+        return {**found, "gradient_updates": updates, "real_transitions": float(self._learner.real.added)}
 
 
 def _load(target: str) -> Any:
@@ -112,3 +148,11 @@ def make_dqn(context: AgentContext) -> LibraryAgent:
 def make_qrdqn(context: AgentContext) -> LibraryAgent:
     """The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018)."""
     return LibraryAgent(context, "sb3_contrib:QRDQN")
+
+
+make_ppo = partial(LibraryAgent, algorithm="stable_baselines3:PPO", hyperparameters=PPO)
+"""The ``sb3_ppo_latents`` agent: PPO (Schulman et al. 2017)."""
+make_imagining_dqn = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:DQN", hyperparameters=IMAGINING)
+"""The ``sb3_dqn_imagined`` agent."""
+make_imagining_ppo = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:PPO", hyperparameters=IMAGINING_PPO)
+"""The ``sb3_ppo_imagined`` agent."""

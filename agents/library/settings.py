@@ -1,10 +1,15 @@
-"""Settings of the agents from Stable-Baselines3: its own names, the same for every task and set of hyperparameters."""
+"""Settings of the agents from Stable-Baselines3: its own names, the same for every task and set of hyperparameters.
+
+Those that imagine have a world model too, with the settings of the suite's own agents that imagine.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
-from ..settings import COUNT, POSITIVE, PROBABILITY, ROWS, Hyperparameters, setting
+from ..imagination.settings import HYPERPARAMETERS as IMAGINATION
+from ..imagination.settings import Settings
+from ..settings import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY, ROWS, ConfigGroup, Hyperparameters, between, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,10 +30,71 @@ class SB3Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PPOSettings:
+    """Keywords of ``stable_baselines3.PPO`` that differ from the library's own, chosen where the rules were imagined.
+
+    A reward of 50 makes large losses of the value: they weigh less, and their gradients are clipped later.
+    """
+
+    learning_rate: float = setting(3e-3, POSITIVE)
+    n_steps: int = setting(128, between(2, 10_000))  #: macro-actions between updates
+    batch_size: int = setting(64, between(2, 10_000))
+    n_epochs: int = setting(10, COUNT)  #: how often each of them is learned from
+    gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
+    ent_coef: float = setting(0.5, NOT_NEGATIVE)  #: weight of the policy's entropy, against rewards of 50
+    vf_coef: float = setting(0.05, NOT_NEGATIVE)  #: weight of the value's loss
+    max_grad_norm: float = setting(5.0, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LibrarySettings:
     """All settings of an agent from Stable-Baselines3."""
 
     sb3: SB3Settings = field(default_factory=SB3Settings)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PPOLibrarySettings:
+    """All settings of the library's PPO."""
+
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixSettings:
+    """How real and imagined experience mix."""
+
+    imagined_episodes: int = setting(4, between(0, 1000))  #: after each real episode, once imagination has begun
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Mixing(Settings):
+    """The library learns values: ``controller``, and how the suite's own agents mix, are without effect."""
+
+    mix: MixSettings = field(default_factory=MixSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginingSettings(LibrarySettings, _Mixing):
+    """Of the library's DQN with a world model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginingPPOSettings(PPOLibrarySettings, _Mixing):
+    """Of the library's PPO with a world model."""
+
+
+def _imagining(kind: type[_Mixing]) -> Hyperparameters[_Mixing]:
+    """Those of the suite's own agents that imagine, with the library's."""
+
+    def joined(settings: Settings) -> _Mixing:
+        return kind(**{part.name: getattr(settings, part.name) for part in fields(settings)})
+
+    return Hyperparameters(
+        {name: ConfigGroup(joined(group.published), group.sets) for name, group in IMAGINATION.groups.items()}
+    )
+
+
 HYPERPARAMETERS = Hyperparameters.everywhere(LibrarySettings())
+PPO = Hyperparameters.everywhere(PPOLibrarySettings())
+IMAGINING, IMAGINING_PPO = _imagining(ImaginingSettings), _imagining(ImaginingPPOSettings)

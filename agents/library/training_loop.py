@@ -11,15 +11,17 @@ from imagine_bench.capabilities import OnEpisode
 
 
 class _EpisodeCounter(BaseCallback):
-    """Tells ``on_episode`` of each finished episode; training ends when it returns False."""
+    """Tells ``on_episode`` of each finished real episode; training ends when it returns False."""
 
     def __init__(self, on_episode: OnEpisode) -> None:
         super().__init__()
         self._on_episode, self._length = on_episode, 0
 
     def _on_step(self) -> bool:
-        self._length += 1
         (done,), (info,) = self.locals["dones"], self.locals["infos"]
+        if info.get("imagined"):
+            return True
+        self._length += 1
         if not done:
             return True
         length, self._length = self._length, 0
@@ -27,6 +29,6 @@ class _EpisodeCounter(BaseCallback):
 
 
 def learn(model: Any, steps: int, on_episode: OnEpisode) -> None:
-    """Train for at most ``steps`` macro-actions, until ``on_episode`` says that it is enough."""
+    """Train for at most ``steps`` macro-actions, imagined ones too, until ``on_episode`` says that it is enough."""
     model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves a folder a run among temporary files
     model.learn(steps, callback=_EpisodeCounter(on_episode), log_interval=None)

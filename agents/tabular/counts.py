@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from imagine_bench.interfaces import Floats
 
 from ..snapshot import Arrays
 
+Row = tuple[int, int, int, float, bool]
+"""State, action, following state, reward, and whether the episode ended there."""
 _ACCURACY = 1e-6
 """Value iteration stops when no value changes by more, relative to the largest."""
 
@@ -21,8 +25,8 @@ class CountTable:
     def __init__(self, n_actions: int) -> None:
         self._n_actions = n_actions
         self._index: dict[int, int] = {}
-        self._rows: dict[tuple[int, int, int, float, bool], int] = {}
-        self._branches: dict[tuple[int, int], int] = {}
+        self._rows: dict[Row, int] = {}
+        self._branches: dict[tuple[int, int], list[Row]] = {}
 
     @property
     def states(self) -> int:
@@ -47,8 +51,16 @@ class CountTable:
         seen = row in self._rows
         self._rows[row] = self._rows.get(row, 0) + 1
         if not seen:
-            self._branches[state, action] = self._branches.get((state, action), 0) + 1
-        return not seen or self._branches[state, action] > 1
+            self._branches.setdefault((state, action), []).append(row)
+        return not seen or len(self._branches[state, action]) > 1
+
+    def recall(self, count: int, rng: np.random.Generator) -> Iterator[Row]:
+        """Transitions of ``count`` tried pairs, each pair equally likely; of several of a pair one by its counts."""
+        branches = list(self._branches.values())
+        for drawn in rng.integers(len(branches), size=count):
+            rows = branches[drawn]
+            counts = np.array([self._rows[row] for row in rows]) if len(rows) > 1 else np.ones(1)
+            yield rows[rng.choice(len(rows), p=counts / counts.sum()) if len(rows) > 1 else 0]
 
     def action_values(self, discount: float, untried: float) -> dict[int, Floats]:
         """Optimal values (A,) of each known state in the model of the counts; an untried pair is worth ``untried``.

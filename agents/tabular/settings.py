@@ -19,7 +19,7 @@ class CountTableSettings:
 class UpdateSettings:
     """How action values in a table are updated; the thesis gives no numbers, these are Sutton & Barto's (8.1).
 
-    On tuning seeds step sizes of 0.1, 0.3 and 0.5 did not differ.
+    On three tuning seeds 0.1 to 0.5 showed no clear difference; 1 was better for Dyna-Q and worse for Q-learning.
     """
 
     step_size: float = setting(0.1, RATE)  #: alpha, the share of each error that is corrected

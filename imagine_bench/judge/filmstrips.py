@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import textwrap
+from collections.abc import Sequence
 from importlib import resources
 
 import numpy as np
@@ -76,6 +77,36 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
             draw.text((_MARGIN, top + 40), "the same start,\nimagined again", font=font(12), fill=FAINT)
         for step in range(len(compared.rollout.actions)):
             _sampled_cell(canvas, draw, compared, step, top, spec)
+    return np.asarray(canvas)
+
+
+def transition_sheet(
+    titles: Sequence[str],
+    rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]], Sequence[bool] | None]],
+) -> NDArray[np.uint8]:
+    """Draw single transitions side by side (thesis' figure 5.9): a title each, below it an image of each named row.
+
+    Images are square, RGB bytes. A row that is judged has a border around each image, blue where it is right and
+    orange where not, and says it below. The image has shape (height, width, 3), uint8.
+    """
+    height = _CELL + _SHEET_GAP + _SHEET_LINE
+    size = (_LABELS + len(titles) * _ROW + _GAP, HEADER_PX + len(rows) * height)
+    canvas = Image.new("RGB", size, PAPER)
+    draw = ImageDraw.Draw(canvas)
+    for column, title in enumerate(titles):
+        lines = "\n".join(textwrap.wrap(title, width=18)[:3])
+        draw.multiline_text((left_px(column), 8), lines, font=font(12, bold=True), fill=INK, spacing=3)
+    for row, (name, images, verdicts) in enumerate(rows):
+        top = HEADER_PX + row * height
+        label = "\n".join(textwrap.wrap(name, width=13))
+        draw.multiline_text((8, top + 40), label, font=font(13, bold=True), fill=INK, spacing=4)
+        for column, image in enumerate(images):
+            left = left_px(column)
+            _paste(canvas, image, (left, top))
+            if verdicts is not None:
+                color, words = (RIGHT, "as the rules say") if verdicts[column] else (WRONG, "not what happens")
+                draw.rectangle([left - 3, top - 3, left + _CELL + 2, top + _CELL + 2], outline=color, width=3)
+                draw.text((left, top + _CELL + 4), words, font=font(12, bold=True), fill=color)
     return np.asarray(canvas)
 
 

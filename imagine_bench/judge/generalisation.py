@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Imaginer, MapPredictor, ReplayReader
+from imagine_bench.capabilities import ImaginedRollout, Imaginer, MapPredictor, ReplayReader
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame, Outcome, TaskSpec
 from imagine_bench.judge.calibration import auroc
@@ -24,6 +24,7 @@ from imagine_bench.seeding import Purpose, SeedTree
 Mask = NDArray[np.bool_]
 
 CONSEQUENCES = ("success", "failure", "the episode goes on")  # of a transition, where the rules leave no choice
+_SHOWN = 6  # transitions of the figure
 _OFTEN = 10
 # How many real visits of a transition an agent remembers: least and most.
 VISIT_COUNTS = {
@@ -41,6 +42,8 @@ class TransitionSet:
     terminal: Mask  # whether no episode goes on from the macrostate: the transition cannot be in any training data
     legal: Mask  # whether the macrostate breaks no rule. Shape (N,).
     possible: tuple[tuple[Outcome, ...], ...]  # what may come of it, by the rules. Length N.
+    shown: NDArray[np.int64]  # a few out of terminal macrostates, for a figure; of legal ones if there are
+    frames_after: Frame  # a frame of the first outcome of each shown one. Shape (shown, 64, 64, 3).
 
     @property
     def consequences(self) -> list[str]:
@@ -67,6 +70,7 @@ class Predictions:
     likeliest_right: Mask | None = None
     # how many real visits of the transition the agent remembers; None if unknown
     visit_count: NDArray[np.int64] | None = None
+    examples: tuple[ImaginedRollout, ...] = ()  # what was imagined of the set's ``shown``
 
     def scores(self, part: Mask) -> Scores:
         """The scores of some of the transitions."""
@@ -117,14 +121,22 @@ def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evalu
             "out of them cannot be set apart. Choose another task."
         )
     macrostates = np.array([state for state, _ in pairs], dtype=np.int64)
-    rng = SeedTree(0).child(purpose, "generalisation", spec.id).generator()
+    seeds = SeedTree(0).child(purpose, "generalisation", spec.id)
+    rng, draw = seeds.generator(), seeds.child("shown").generator()
+    legal = np.array([rules.is_legal(state) for state, _ in pairs])
+    possible = tuple(tuple(rules.outcomes(state, action)) for state, action in pairs)
+    candidates = np.flatnonzero(terminal & legal if (terminal & legal).any() else terminal)
+    shown = np.sort(draw.choice(candidates, min(_SHOWN, len(candidates)), replace=False))
+    after = np.array([possible[index][0].macrostate for index in shown], dtype=np.int64)
     return TransitionSet(
         macrostates=macrostates,
         actions=np.array([action for _, action in pairs], dtype=np.int64),
         frames=spec.render_macrostates(macrostates, appearance, rng),
         terminal=terminal,
-        legal=np.array([rules.is_legal(state) for state, _ in pairs]),
-        possible=tuple(tuple(rules.outcomes(state, action)) for state, action in pairs),
+        legal=legal,
+        possible=possible,
+        shown=shown,
+        frames_after=spec.render_macrostates(after, appearance, draw),
     )
 
 
@@ -146,6 +158,7 @@ def predict(agent: Imaginer, transitions: TransitionSet, seeds: SeedTree) -> Pre
         end_right=np.array([(step.p_terminated[0] > 0.5) in {o.terminated for o in outs} for step, outs in imagined]),
         likeliest_right=None if likeliest is None else transitions.allows(likeliest),
         visit_count=_visit_count(agent, transitions),
+        examples=tuple(steps[index] for index in transitions.shown),
     )
 
 

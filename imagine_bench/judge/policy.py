@@ -56,15 +56,16 @@ def eval_states(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluati
     return EvalStates(macrostates=macrostates, frames=frames.reshape(len(macrostates), FRAMES, *frames.shape[1:]))
 
 
-def action_shares(agent: Agent, states: EvalStates, n_actions: int) -> Floats:
+def action_shares(agent: Agent, states: EvalStates, n_actions: int, *, privileged: bool = False) -> Floats:
     """In which share of the frames of each macrostate an agent takes each macro-action, greedily. Shape (A, N).
 
-    The agent is not changed.
+    The agent is not changed. A ``privileged`` one is shown the macrostate too.
     """
     counts = np.zeros((n_actions, len(states.macrostates)))
     for index, frames in enumerate(states.frames):
         for frame in frames:
-            counts[agent.act(Observation(frame=frame), explore=False), index] += 1.0
+            seen = Observation(frame=frame, macrostate=states.macrostates[index] if privileged else None)
+            counts[agent.act(seen, explore=False), index] += 1.0
     return np.asarray(counts / counts.sum(axis=0))
 
 

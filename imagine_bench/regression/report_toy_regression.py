@@ -58,12 +58,10 @@ def sections(result: RegressionResult) -> list[Section]:
         Section(
             title="Equation 4.8: the squared error, cause by cause",
             words=(
-                "The expected squared error of a value drawn from one weight sample's mixture is the sum of five terms "
-                "(equations 4.6 to 4.8): the squared bias of the mean and its variance over weight samples (together "
-                "the true epistemic uncertainty), true noise, true distance of the branches, and the spread of the "
-                "predicted distribution (estimated aleatoric and modal uncertainty). Measured: against targets drawn "
-                "anew; what remains is 0 but for sampling [95 %]. The last column is the same error of the predictions "
-                "of 4.5.1, drawn from averaged parameters, which the equation does not cover. Means over x, in y².",
+                "The expected squared error of a value drawn from one weight sample's mixture is the sum of five: "
+                "squared bias of the mean and its variance over weight samples (together equation 4.6), true noise, "
+                "true distance of the branches, and the spread of what is drawn (estimated aleatoric and modal). "
+                "Measured: against targets drawn anew; what remains is 0 but for sampling (95 %). Means over x, in y².",
             ),
             tables=[_decomposition(result, agent) for agent in result.protocol.agents],
         ),
@@ -179,16 +177,14 @@ def _decomposition(result: RegressionResult, agent: str) -> Table:
     rows = []
     for variant in result.protocol.variants:
         terms, x = squared_error_terms(result, agent, variant), result.first(agent, variant)["x"]
-        terms["own"] = result.arrays(agent, variant, "own_squared_error")
         for words, here in (("data", np.abs(x) <= _EDGE), ("region", np.abs(x) <= _REGION[1]), ("beyond", x > _EDGE)):
-            parts = {name: values[:, here] for name, values in terms.items()}
-            *causes, measured, own = parts.values()
+            *causes, measured = (values[:, here] for values in terms.values())
             rest = measured - np.sum(causes, axis=0)
             interval = f"{number(rest.mean())} ± {number(1.96 * rest.std() / np.sqrt(rest.size))}"
             cells = [number(float(values.mean())) for values in (*causes, measured)]
-            rows.append([f"{_TITLES[variant]}: {words}", *cells, interval, number(float(own.mean()))])
+            rows.append([f"{_TITLES[variant]}: {words}", *cells, interval])
     header = [registry.regressor_entry(agent).title, "bias²", "epistemic", "true aleatoric", "true modal", "spread"]
-    header += ["measured", "measured − sum", "of its predictions"]
+    header += ["measured", "measured − sum"]
     return Table(name=f"decomposition_{agent}", header=header, rows=rows)
 
 

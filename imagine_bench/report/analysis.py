@@ -8,10 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imagine_bench import registry
 from imagine_bench.bench.progress import counted
 from imagine_bench.errors import ArtefactError, require_known
 from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.filmstrips import png
 from imagine_bench.machine import describe_environment
 from imagine_bench.protocols.task_types import task_type
 from imagine_bench.report.text import agent_words, origin
@@ -78,8 +82,12 @@ class Analysis(ABC, Generic[Value]):
     def summary(self, value: Value) -> dict[str, Any]:
         """One run in a few numbers."""
 
+    def figure(self, runs: Sequence[Measured[Value]]) -> tuple[NDArray[np.uint8], str] | None:
+        """An image (height, width, 3) and what it shows; None where there is nothing to see."""
+        return None
+
     def write(self, folder: Path, runs: Sequence[Measured[Value]], provenance: dict[str, Any]) -> None:
-        """Write all rows, ``summary.json`` and ``<name>.md``.
+        """Write all rows, ``summary.json``, ``<name>.md`` and ``<name>.png`` if there is a figure.
 
         Raises:
             SetupError: The folder cannot be written.
@@ -88,7 +96,11 @@ class Analysis(ABC, Generic[Value]):
         write_bytes(folder / self.rows_file, csv_text(self.rows(runs)).encode())
         summaries = [{**run.head, **self.summary(run.value)} for run in runs]
         write_json(folder / "summary.json", {**provenance, "runs": with_null(summaries)})
-        page = f"# {self.spec.title}: {self.heading}\n\n{self.table(runs)}\n\n{origin(provenance)}\n"
+        shown, figure = "", self.figure(runs)
+        if figure is not None:
+            write_bytes(folder / f"{self.name}.png", png(figure[0]))
+            shown = f"![{figure[1]}]({self.name}.png)\n\n"
+        page = f"# {self.spec.title}: {self.heading}\n\n{self.table(runs)}\n\n{shown}{origin(provenance)}\n"
         write_bytes(folder / f"{self.name}.md", page.encode())
 
 

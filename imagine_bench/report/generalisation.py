@@ -8,12 +8,16 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imagine_bench import reference
 from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.filmstrips import rgb, transition_sheet
 from imagine_bench.judge.generalisation import Generalisation, Predictions, generalisation, predict, transition_set
 from imagine_bench.report.analysis import MEANS, Analysis, Groups, Measured, analyse, markdown
-from imagine_bench.report.text import mean_text
+from imagine_bench.report.text import agent_words, mean_text
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.trained import Trained
 
@@ -103,6 +107,20 @@ class GeneralisationAnalysis(Analysis[Found]):
                     int(transitions.terminal[index]), int(transitions.legal[index]), consequences[index], right, end,
                     f"{found.reward_error[index]:.6g}", f"{found.epistemic[index]:.6g}", likeliest, visits,
                 ]  # fmt: skip
+
+    def figure(self, runs: Sequence[Measured[Found]]) -> tuple[NDArray[np.uint8], str]:
+        """A few of the unseen transitions, as the first seed of each agent imagines them (thesis' figure 5.9)."""
+        there, shown = self.transitions, self.transitions.shown
+        first = {run.agent: run for run in reversed(runs)}
+        rows: list[tuple[str, Sequence[NDArray[np.uint8]], Sequence[bool] | None]] = [
+            ("before", list(there.frames[shown]), None), ("after, by the rules", list(there.frames_after), None),
+        ]  # fmt: skip
+        for run in (first[run.agent] for run in runs if run is first[run.agent]):
+            found, _ = run.value
+            images = [rgb(example.frames[0]) for example in found.examples]
+            rows.append((f"{agent_words(run.agent).title}, seed {run.seed}", images, found.right[shown].tolist()))
+        titles = [self.spec.action_names[there.actions[index]] for index in shown]
+        return transition_sheet(titles, rows), "Transitions out of terminal macrostates: real above, imagined below"
 
     def summary(self, value: Found) -> dict[str, Any]:
         """The figures of the table."""

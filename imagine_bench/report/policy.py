@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench import registry
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.policy import FRAMES, Terminations, action_shares, eval_states, optimal_length, terminations
 from imagine_bench.report.analysis import MEANS, Analysis, Groups, Measured, analyse, markdown
@@ -42,7 +43,8 @@ class PolicyAnalysis(Analysis[Terminations]):
 
     def measure(self, trained: Trained) -> Terminations:
         """Where its policy leads."""
-        shares = action_shares(trained.agent, self._states, self.spec.n_actions)
+        privileged = registry.agent_entry(trained.spec.agent).privileged
+        shares = action_shares(trained.agent, self._states, self.spec.n_actions, privileged=privileged)
         return terminations(self.spec, self._states, shares)
 
     def table(self, runs: Sequence[Measured[Terminations]]) -> str:

@@ -117,6 +117,21 @@ def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
     )  # fmt: skip
 
 
+_CURIOSITY = Study(
+    name="curiosity", question="Does a reward for epistemic uncertainty explore better?", budgets=(100, 250),
+    seeds=(1000, 1001, 1002, 1003, 1004), evaluation_episodes=300, appearance="mild", execution="kinematic",
+    variants=(
+        Variant(name=_FILTERED, factor=BASE, agent=_FILTERED),
+        _variant("curiosity", "curiosity 1", {"imagination.curiosity": 1.0}),
+        _variant("curiosity", "curiosity 10", {"imagination.curiosity": 10.0}),
+        _variant("exploration", "thesis' epsilon", {"controller.epsilon_decay": 0.03}),
+        Variant(
+            name="thesis' epsilon, curiosity 10", factor="exploration", agent=_FILTERED, against="thesis' epsilon",
+            settings={"controller.epsilon_decay": 0.03, "imagination.curiosity": 10.0},
+        ),
+    ),
+)  # fmt: skip
+
 _SMOKE = Study(
     name="smoke", question="Does every part of a study work?", budgets=(5,), seeds=(1000, 1001),
     evaluation_episodes=5, appearance="clean", execution="kinematic",
@@ -145,6 +160,7 @@ STUDIES: dict[str, Study] = {
             execution="kinematic",
             variants=_LADDER,
         ),
+        _CURIOSITY,
         _SMOKE,
     )
 }

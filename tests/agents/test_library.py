@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from small_runs import same_but_for_time, small
+from small_runs import measured, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
@@ -28,11 +28,16 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 LATENTS = "sb3_dqn_latents"
-FEW: dict[str, Any] = {"sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500}
+FEW: dict[str, Any] = {
+    "sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 8, "ppo.batch_size": 4,
+    "imagination.start_episode": 3, "mix.imagined_episodes": 2,
+}  # fmt: skip
+IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
 
 
 def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> RunResult:
-    few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": tuple(sorted(FEW.items()))}
+    own = tuple(sorted(registry.own_settings(agent, FEW).items()))
+    few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": own}
     path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
     result = run_observed(spec, folder, lambda progress: None)
@@ -40,7 +45,7 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
     return result
 
 
-@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS])
+@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])
 def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
     result = do(tmp_path / "run", agent)
     first, last = result.checkpoints
@@ -50,13 +55,22 @@ def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: s
     ]
     assert result.training_length.shape == (12,) and result.training_length.max() <= 10
     assert (first.test_episodes, last.test_episodes) == (4, 4)
-    assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
+    if "ppo" not in agent:
+        assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
+    if agent == "sb3_ppo_latents":  # ten epochs of two batches for each 8 macro-actions
+        assert last.diagnostics["gradient_updates"] == 20 * ((last.env_steps - 1) // 8) > 0
+    if agent in IMAGINING:
+        assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [first.env_steps, last.env_steps]
+        of_the_model = last.env_steps  # one a real step with this set
+        assert last.diagnostics["gradient_updates"] > of_the_model
+        assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
 
 
 def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
     """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
-    short = do(tmp_path / "short", budgets=(6,), overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
-    longer = do(tmp_path / "longer", overrides=tuple(sorted({**FEW, "sb3.exploration_steps": 80}.items())))
+    eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
+    short = do(tmp_path / "short", budgets=(6,), overrides=eighty)
+    longer = do(tmp_path / "longer", overrides=eighty)
     first, same = short.checkpoints[0], longer.checkpoints[0]
     assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
 
@@ -69,21 +83,27 @@ def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch:
     assert not list(temporary.iterdir())
 
 
-def test_the_same_seed_learns_the_same_even_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = do(tmp_path / "whole")
+@pytest.mark.parametrize("agent", [LATENTS, *(pytest.param(name, marks=pytest.mark.slow) for name in IMAGINING)])
+def test_the_same_seed_learns_the_same_even_after_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str
+) -> None:
+    whole = do(tmp_path / "whole", agent)
 
     def killed(*arguments: Any, **names: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(run_folder, "finish", killed)
-        do(tmp_path / "run")
+        do(tmp_path / "run", agent)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(phases, "play_test_episode", killed)
-        do(tmp_path / "run")
+        do(tmp_path / "run", agent)
     assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
-    assert same_but_for_time(whole, do(tmp_path / "run"))
-    other = do(tmp_path / "other", seed=1)
+    again = do(tmp_path / "run", agent)
+    assert measured(whole) == measured(again)
+    assert whole.training_length.tolist() == again.training_length.tolist()
+    assert whole.training_success.tolist() == again.training_success.tolist()
+    other = do(tmp_path / "other", agent, seed=1)
     assert whole.training_length.tolist() != other.training_length.tolist()
 
 
@@ -174,7 +194,8 @@ def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Excepti
 
 
 def spec(agent: str) -> RunSpec:
-    return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0)
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean") if registry.AGENTS[agent].needs_encoder else None
+    return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=path)
 
 
 @pytest.mark.slow

@@ -1,6 +1,9 @@
-"""A world model that counts, so that every imagined transition is known."""
+"""World models whose every transition is known: one that counts, one that is a task's rules."""
 
 from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Iterable
 
 import torch
 from imagine_bench.agents.dqn import Controller
@@ -9,6 +12,7 @@ from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings
 from imagine_bench.agents.replay import RealMemory
 
+from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -70,3 +74,60 @@ def remembering(count: int) -> RealMemory:
         z, sigma = torch.tensor([float(index), 5.0]), torch.zeros(2)
         real.add((z, sigma), 0, 0.0, (z, sigma), False)
     return real
+
+
+class RuledModel:
+    """A world model equal to a task's rules: a latent is the one-hot code of each coordinate of a macrostate.
+
+    ``uncertain`` pairs of macrostate and action are predicted rightly on average, by weight samples that disagree.
+    """
+
+    members = 1
+
+    def __init__(self, task: TaskSpec, uncertain: Collection[tuple[State, int]] = ()) -> None:
+        self.rules, self.n_actions, self.uncertain = task.rules, task.n_actions, frozenset(uncertain)
+        self._outcome = functools.cache(lambda state, action: task.rules.outcomes(state, action)[0])
+        self.sizes = [len(values) for values in task.macrostate_values]
+        self.latent_size = sum(self.sizes)
+
+    def encode(self, macrostates: Iterable[State]) -> torch.Tensor:
+        parts = torch.tensor(list(macrostates)).unbind(dim=1)
+        hot = [torch.nn.functional.one_hot(part, size) for part, size in zip(parts, self.sizes, strict=True)]
+        return torch.cat(hot, dim=1).float()
+
+    def decode(self, z: torch.Tensor) -> list[State]:
+        parts = [part.argmax(dim=1) for part in z.split(self.sizes, dim=1)]
+        return [tuple(row) for row in torch.stack(parts, dim=1).tolist()]
+
+    def draw_weights(self, count: int, dropout: torch.Generator) -> None:
+        return None
+
+    def _outcomes(self, z: torch.Tensor, action: torch.Tensor) -> list[Outcome]:
+        pairs = zip(self.decode(z), action.tolist(), strict=True)
+        return [self._outcome(*pair) for pair in pairs]
+
+    def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
+        following = self.encode(outcome.macrostate for outcome in self._outcomes(z, action))
+        pairs = zip(self.decode(z), action.tolist(), strict=True)
+        torn = torch.tensor([pair in self.uncertain for pair in pairs]).float()  # [N]
+        means = following.expand(T, *following.shape).clone()
+        means[..., 0] += torch.linspace(-1.0, 1.0, T)[:, None] * torn * 3.0
+        shape = (T, len(z), 1, self.latent_size)
+        return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full(shape, -9.0))
+
+    def predict_outcome(
+        self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        outcomes = self._outcomes(z, action)
+        rewards = torch.tensor([outcome.reward for outcome in outcomes])
+        return rewards, torch.tensor([float(outcome.terminated) for outcome in outcomes])
+
+
+def ruled(task: TaskSpec, *, filtered: bool = True, uncertain: Collection[tuple[State, int]] = ()) -> Imagination:
+    """What :class:`RuledModel` imagines."""
+    model = RuledModel(task, uncertain)
+    settings = Settings(imagination=ImaginationSettings(temperature=0.0, threshold=0.3, weight_samples=T))
+    size, n = model.latent_size, task.n_actions
+    imagination = Imagination(size, n, settings, filtered=filtered, seeds=SeedTree(0), device=CPU)
+    imagination.model = model  # type: ignore[assignment]
+    return imagination

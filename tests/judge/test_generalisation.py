@@ -14,6 +14,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, Outcome, TaskSpec
+from imagine_bench.judge import filmstrips
 from imagine_bench.judge.generalisation import TransitionSet, consequence
 from imagine_bench.report.analysis import Measured
 from imagine_bench.report.generalisation import GeneralisationAnalysis
@@ -81,6 +82,22 @@ def test_scores_and_uncertainties_by_hand(
     _, result = analysis.scored(Cheat(transitions, wrong), SeedTree(0))
     assert (result.unseen.right, result.seen.right, result.auroc) == numbers
     assert result.unseen_legal.right == numbers[0]
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_the_figure_shows_and_judges_unseen_transitions(
+    analysis: GeneralisationAnalysis, transitions: TransitionSet, right: bool
+) -> None:
+    shown = transitions.shown
+    assert len(set(shown.tolist())) == 6 and (transitions.terminal & transitions.legal)[shown].all()
+    found = analysis.scored(Cheat(transitions, np.full(len(transitions.actions), not right)), SeedTree(0))
+    runs = [Measured(agent="imagination", seed=seed, episodes=9, value=found) for seed in (0, 1)]
+    image, _ = analysis.figure(runs)
+    left = image.shape[1] - 6 * 140 - 12
+    before = image[62:190, left : left + 128]
+    assert np.array_equal(before[::2, ::2], transitions.frames[shown[0]])
+    colors = {tuple(color) for color in image[-200:].reshape(-1, 3).tolist()}
+    assert (filmstrips.RIGHT in colors, filmstrips.WRONG in colors) == (right, not right)
 
 
 def test_half_wrong_is_half(analysis: GeneralisationAnalysis, transitions: TransitionSet) -> None:

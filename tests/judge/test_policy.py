@@ -198,6 +198,14 @@ def test_every_frame_is_seen_once_and_acted_on_greedily(hard: EvalStates) -> Non
     assert np.array_equal(policy[5], np.full(66, 1 / FRAMES)) and np.array_equal(policy[2], np.full(66, 1 - 1 / FRAMES))
     assert np.array_equal(np.stack(Watched.seen), hard.frames.reshape(-1, 64, 64, 3))
 
+    class Told(FakeAgent):
+        def act(self, observation: Observation, *, explore: bool) -> int:
+            assert observation.macrostate is not None
+            return HARD.rules.optimal_action(tuple(observation.macrostate.tolist()))
+
+    best = [HARD.rules.optimal_action(tuple(state)) for state in hard.macrostates.tolist()]
+    assert action_shares(Told(), hard, 6, privileged=True).argmax(axis=0).tolist() == best
+
 
 def test_table_and_files(tmp_path: Path) -> None:
     good, bad = ends_of(HARD, HARD.rules.optimal_action), ends_of(HARD, other_way)

@@ -89,10 +89,13 @@ def test_networks_err_by_the_sum_of_the_causes(tmp_path: Path) -> None:
         rest = terms.pop("measured") - sum(terms.values())
         error = rest.std() / np.sqrt(rest.size)
         assert abs(rest.mean()) < SURE * error
+        found = result.first("mc_dropout", variant)
+        np.testing.assert_allclose(terms["bias²"], (found["true_mean"] - found["mean"]) ** 2, atol=1e-6)
+        np.testing.assert_array_equal(terms["aleatoric"][0], toy.noise_sigma(variant, found["x"]) ** 2)
         for name in ("modal", "spread"):
             assert (rest + terms[name]).mean() > SURE * error, f"{name} could be left out"
     (table,) = sections(result)[-1].tables
     assert [row[0] for row in table.rows[:3]] == ["base: data", "base: region", "base: beyond"] and len(table.rows) == 6
     for row in table.rows:
-        rest, interval = (float(part.replace("−", "-")) for part in str(row[-2]).split(" ± "))
+        rest, interval = (float(part.replace("−", "-")) for part in str(row[-1]).split(" ± "))
         assert abs(rest) < SURE / 1.96 * interval, row

@@ -85,7 +85,9 @@ def test_gains_are_of_learners_over_dqn(result: BenchResult) -> None:
     assert row.gain.value == pytest.approx((shares.mean() - base.mean()) / base.mean())
     assert row.thesis_gain == reference.gain("arrow_puzzle", "imagination")[2000]
     assert data.scores["dqn"][2000].thesis == reference.success("arrow_puzzle", "dqn")[2000]
-    assert data.scores["dqn"][2000].by_seed == tuple(base)
+    score = data.scores["dqn"][2000]
+    assert (score.over, score.by_seed, score.value) == ("seeds", tuple(base), statistics.iqm(base))
+    assert (score.low, score.high) == statistics.interval(base, trials=result.protocol.evaluation_episodes)
     assert (data.thesis_source, data.thesis_random) == (
         reference.success_source("arrow_puzzle"), reference.random_success("arrow_puzzle"),
     )  # fmt: skip

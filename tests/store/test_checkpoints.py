@@ -146,6 +146,7 @@ def test_a_whole_checkpoint_is_there_at_every_moment_of_a_save(tmp_path: Path) -
 
 
 def test_every_counter_comes_back(tmp_path: Path) -> None:
+    assert not any(vars(Counters()).values()) and not any(vars(EvaluationCounts()).values()), "all begin at nothing"
     counters = Counters(before=3, train_cpu_s=1.5)
     for success, length, queries in [(True, 3, 2), (False, 6, 0), (True, 1, 5)]:
         counters.add_episode(success, length, queries)

@@ -249,11 +249,13 @@ def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     assert isinstance(learner, ValueReader)
     blank = learner.imagine(frame((0, 1, 0)), actions=None, depth=2, rng=np.random.default_rng(0))
     assert (blank.epistemic == 1.0).all(), "before anything was seen, everything is unknown"
+    assert not blank.modal.any() and not blank.rewards.any() and not blank.p_terminated.any()
     live(learner, range(40), np.random.default_rng(0))
     before, actions = learner.state(), np.array([1, 1, 0])
     rollout = learner.imagine(frame((0, 2, 1)), actions=actions, depth=3, rng=np.random.default_rng(1))
     assert same(before, learner.state())
     assert np.array_equal(rollout.actions, actions)
+    assert rollout.accepted.all() and not blank.accepted.any(), "what is unknown is not accepted"
     assert rollout.frames.shape == (3, 64, 64)
     assert rollout.q_values.shape == (3, ACTIONS)
     code = (0, 2, 1)

@@ -185,6 +185,7 @@ def test_stochastic_rules_by_hand():
     assert known.chance_level == pytest.approx(0.125 + 0.375 * 0.125)
     assert known.optimal_return == pytest.approx(2.0 + 0.75 * 2.0)
     assert known.mean_plan_length == pytest.approx(1 + 0.75)
+    assert (facts(_Gamble(), 1).optimum, facts(_Gamble(), 1).mean_plan_length) == (0.25, 1.0)
     tables = tabulate(_Gamble())
     policy = optimal_policy(tables)
     assert policy.tolist() == [0, 0]

@@ -1,0 +1,164 @@
+"""A learned world model as a Gymnasium vector environment: any model-free algorithm can train in it (thesis 5.3).
+
+Like DIAMOND's world-model environment (Alonso et al. 2024): ``reset`` and ``step`` of many imagined episodes at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Floats, Frame
+
+from .agent import ImaginingAgent
+from .rollouts import LATENT_LIMIT, TERMINAL, Imagination, Imagined
+from .uncertainty import decompose
+
+Latents = NDArray[np.float32]
+Switches = NDArray[np.bool_]
+VERDICT = ("accepted", "epistemic", "aleatoric", "modal")
+"""What an info says of a transition."""
+
+
+class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
+    """N imagined episodes side by side; observations are latents (N, Z), float32, actions (N,) in [0, A).
+
+    An episode starts at a latent of the pool, ends where the model says so (``terminated``), and is cut after
+    ``horizon`` steps or by the filter (``truncated``). Of a transition that the filter discards nothing is shown: the
+    observation stays where it was, the reward is 0 and ``accepted`` in the info False. To a learner that bootstraps at
+    truncation nothing has happened; another can leave it out. Without a filter only latents that ran away are cut.
+
+    A step's info holds, of the transition that it returned, ``accepted`` and the variances ``epistemic``, ``aleatoric``
+    and ``modal``, in squared units of z, reduced as the filter does; all (N,). Ended episodes begin anew in the same
+    step, with ``final_obs`` and ``final_info`` as in Gymnasium. Everything is drawn from :attr:`np_random`, weight
+    samples anew at every step. The model is not copied: what it learns later is imagined here.
+
+    Args:
+        imagination: The world model with its filter.
+        starts: Where episodes begin, drawn uniformly: latents (P, Z) of real observations. It may be replaced later.
+        num_envs: Episodes side by side, N.
+        horizon: Most steps of an episode.
+
+    Raises:
+        InvalidValueError: No such number of episodes or steps, or a pool that is empty or of another size of latents.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+
+    def __init__(self, imagination: Imagination, starts: Latents, *, num_envs: int = 1, horizon: int = 10) -> None:
+        if num_envs < 1 or horizon < 1:
+            raise InvalidValueError(f"num_envs is {num_envs} and horizon {horizon}; each must be at least 1.")
+        model = imagination.model
+        if starts.ndim != 2 or len(starts) == 0 or starts.shape[1] != model.latent_size:
+            raise InvalidValueError(
+                f"The pool of starts has shape {starts.shape}; give at least one of shape (P, {model.latent_size})."
+            )
+        self.imagination, self.starts = imagination, starts
+        self.num_envs, self.horizon = num_envs, horizon
+        self._generator = torch.Generator(imagination.generators["rollouts"].device)
+        self.single_observation_space = gymnasium.spaces.Box(-LATENT_LIMIT, LATENT_LIMIT, (model.latent_size,))
+        self.single_action_space = gymnasium.spaces.Discrete(model.n_actions)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._z, self._steps = np.empty((0, model.latent_size), np.float32), np.zeros(num_envs, np.int64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Latents, dict[str, Any]]:
+        """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
+        super().reset(seed=seed)
+        self._z, self._steps[:] = self._draw_starts(self.num_envs), 0
+        return self._z.copy(), {}
+
+    def step(self, actions: NDArray[np.int64]) -> tuple[Latents, Floats, Switches, Switches, dict[str, Any]]:
+        """Imagine one transition of each episode: observations, rewards, terminated, truncated, info.
+
+        InvalidValueError before :meth:`reset`, or for actions that are none; DivergedError if the model predicts NaN.
+        """
+        if len(self._z) == 0:
+            raise InvalidValueError("No imagined episode has begun; call reset before step.")
+        if np.shape(actions) != (self.num_envs,) or not self.action_space.contains(np.asarray(actions, np.int64)):
+            raise InvalidValueError(
+                f"Actions {actions} must be {self.num_envs} in [0, {self.imagination.model.n_actions})."
+            )
+        step = self._imagine(np.asarray(actions, np.int64))
+        accepted = self.imagination.keeps(step).cpu().numpy()
+        reached = np.where(accepted[:, None], step.next_z.cpu().numpy(), self._z)  # [N, Z]
+        reward = np.where(accepted, step.reward.cpu().numpy(), 0.0).astype(np.float64)
+        self._steps += 1
+        terminated = accepted & (step.p_terminated > TERMINAL).cpu().numpy()
+        truncated = ~terminated & (~accepted | (self._steps >= self.horizon))
+        info = self._info(step, accepted, reached, terminated | truncated)
+        self._begin_anew(reached, terminated | truncated)
+        return self._z.copy(), reward, terminated, truncated, info
+
+    def _imagine(self, actions: NDArray[np.int64]) -> Imagined:
+        generator, imagination = self._generator, self.imagination
+        generator.manual_seed(int(self.np_random.integers(2**63)))
+        z, action = (torch.from_numpy(values).to(generator.device) for values in (self._z, actions))
+        return imagination.step(z, action, imagination.draw_weights(generator), generator)
+
+    def _info(self, step: Imagined, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
+        parts = decompose(step.samples)
+        values = {"accepted": accepted} | {
+            name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]
+        }
+        info: dict[str, Any] = {}
+        for index, over in enumerate(ended):
+            own = {name: column[index].item() for name, column in values.items()}
+            self._add_info(info, own, index)
+            if over:
+                self._add_info(info, {"final_obs": reached[index].copy(), "final_info": own}, index)
+        return info
+
+    def _begin_anew(self, reached: Latents, ended: Switches) -> None:
+        self._z = reached
+        self._z[ended], self._steps[ended] = self._draw_starts(int(ended.sum())), 0
+
+    def _draw_starts(self, count: int) -> Latents:
+        return self.starts[self.np_random.integers(len(self.starts), size=count)]
+
+
+class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
+    """One imagined episode after another, for learners that know no vectors: a world of one episode at a time."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, world: ImaginedVectorEnv) -> None:
+        if world.num_envs != 1:
+            raise InvalidValueError(f"This world has {world.num_envs} episodes side by side; give one of num_envs 1.")
+        self.world = world
+        self.observation_space, self.action_space = world.single_observation_space, world.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Latents, dict[str, Any]]:
+        """Begin an episode: latents (Z,)."""
+        super().reset(seed=seed)
+        seen, info = self.world.reset(seed=seed)
+        return seen[0], info
+
+    def step(self, action: np.int64) -> tuple[Latents, float, bool, bool, dict[str, Any]]:
+        """Imagine one transition; errors as of :meth:`ImaginedVectorEnv.step`."""
+        seen, (reward,), (terminated,), (truncated,), info = self.world.step(np.array([action]))
+        reached = info["final_obs"][0] if terminated or truncated else seen[0]
+        own = {name: info[name][0].item() for name in VERDICT}
+        return reached, float(reward), bool(terminated), bool(truncated), own
+
+
+def imagined_env(
+    agent: ImaginingAgent, *, frames: Frame | None = None, num_envs: int = 1, horizon: int = 10
+) -> ImaginedVectorEnv:
+    """The world that a trained agent has learned, with its filter.
+
+    Episodes start at ``frames`` (P, 64, 64, 3) or, without, in all states that the agent remembers to have acted in, as
+    means of their latents; otherwise as :class:`ImaginedVectorEnv`.
+    """
+    starts = agent.real.arrays()["mu"] if frames is None else agent.perception.encoder.encode(frames)[0].cpu().numpy()
+    return ImaginedVectorEnv(agent.imagination, starts.astype(np.float32), num_envs=num_envs, horizon=horizon)

@@ -1,0 +1,224 @@
+"""The own agent's formulas, each once more in plain loops over a small learned model."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+
+import numpy as np
+import pytest
+from imagine_bench.agents.factored.dynamics import FactorPrediction
+from imagine_bench.agents.factored.factors import Code, CodeTransition
+from imagine_bench.agents.factored.model import FactoredModel
+from imagine_bench.agents.factored.outcomes import Conjunctions, OutcomeModel
+from imagine_bench.agents.factored.settings import (
+    DynamicsSettings,
+    FactoredSettings,
+    OutcomeSettings,
+    PlanningSettings,
+)
+
+SIZES, ACTIONS = (2, 3), 2
+DYNAMICS = DynamicsSettings(parents=2, persistence=0.4, parent_decay=0.25, concentration=0.5, slip=0.02)
+SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1))
+CODES = list(itertools.product(*map(range, SIZES)))
+
+
+def lived() -> list[CodeTransition]:
+    """Twelve transitions; not every action was tried in every code."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(12):
+        code, following = CODES[rng.integers(6)], CODES[rng.integers(6)]
+        end = following == (1, 2)
+        rows.append(CodeTransition(code, int(rng.integers(2)), following, 5.0 if end else -1.0, end))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def model() -> FactoredModel:
+    learned = FactoredModel(SIZES, ACTIONS, SETTINGS)
+    for row in lived():
+        learned.add(row)
+    learned.outcomes.fit()
+    return learned
+
+
+def predicted(factor: int, code: Code, action: int) -> FactorPrediction:
+    """Averages over what a factor may depend on, each weighted by its prior and by how well it told what came next."""
+    values, own = SIZES[factor], code[factor]
+    pseudo = DYNAMICS.concentration
+    rows = [row for row in lived() if row.action == action]
+    prior = np.array([0.4, 0.6 / 1.25, 0.6 * 0.25 / 1.25])  # it stays; depends on itself; on both
+    told = [np.prod([0.98 if r.following[factor] == r.code[factor] else 0.02 / (values - 1) for r in rows])]
+    expected, seen, unknown = [np.eye(values)[own]], [np.eye(values)[own] * bool(rows)], [0.0]
+    for parents in ((factor,), (0, 1)):
+        counts: Counter[tuple[Code, int]] = Counter()
+        chance = 1.0
+        for row in rows:
+            key = tuple(row.code[parent] for parent in parents)
+            total = sum(counts[key, value] for value in range(values))
+            chance *= (counts[key, row.following[factor]] + pseudo) / (total + pseudo * values)
+            counts[key, row.following[factor]] += 1
+        here = np.array([counts[tuple(code[parent] for parent in parents), value] for value in range(values)])
+        told.append(chance)
+        expected.append((here + pseudo) / (here.sum() + pseudo * values))
+        seen.append(here / max(here.sum(), 1))
+        unknown.append(pseudo * values / (here.sum() + pseudo * values))
+    weight = prior * told / (prior * told).sum()
+    return FactorPrediction(weight @ np.array(expected), weight @ np.array(seen), weight @ np.array(unknown))
+
+
+@pytest.mark.parametrize("factor", [0, 1])
+def test_dynamics_average_over_what_a_factor_may_depend_on(model: FactoredModel, factor: int) -> None:
+    found = model.dynamics.predict(np.array(CODES))[factor]
+    for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
+        by_hand = predicted(factor, code, action)
+        assert found.expected[row, action] == pytest.approx(by_hand.expected)
+        assert found.seen[row, action] == pytest.approx(by_hand.seen)
+        assert found.unknown[row, action] == pytest.approx(by_hand.unknown)
+
+
+def test_each_conjunction_has_a_number_of_its_own() -> None:
+    """Single values and whole codes, of the code after, or of the one before together with the action."""
+    conjunctions = Conjunctions(SIZES, ACTIONS, OutcomeSettings(order=1, prior=0.1, order_decay=0.3))
+    numbers: dict[tuple[object, ...], int] = {}
+    for code, action, following in itertools.product(CODES, range(ACTIONS), CODES):
+        (active,) = conjunctions.active(np.array([code]), np.array([action]), np.array([following])).tolist()
+        keys = [*enumerate(following), following, (action,), *((*pair, action) for pair in enumerate(code)),
+                (*code, action)]  # fmt: skip
+        keys = [(name, *key) for name, key in zip("abcdefg", keys, strict=True)]
+        assert [numbers.setdefault(key, number) for key, number in zip(keys, active, strict=True)] == active
+    assert sorted(numbers.values()) == list(range(2 + 3 + 6 + 2 + 4 + 6 + 12)) == list(range(len(conjunctions.group)))
+    prior = conjunctions.prior[conjunctions.group]
+    for key, number in numbers.items():
+        assert prior[number] == pytest.approx(0.03 if key[0] == "g" else 0.1), "two values and the action are three"
+
+
+def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
+    """Probability of each outcome, and that something untested decides."""
+    causes, settings = model.outcomes.causes, SETTINGS.outcomes
+    assert causes is not None
+    (active,) = model.outcomes.conjunctions.active(np.array([code]), np.array([action]), np.array([following])).tolist()
+    chance, none, tested = {}, 1.0, 1.0
+    for outcome in range(len(causes.outcomes)):
+        silent = 1.0
+        for number in active:
+            silent *= 1.0 - causes.strength[outcome, number]
+        if outcome != causes.default:
+            chance[outcome], none = 1.0 - silent, none * silent
+    for number in active:
+        rate = causes.cause_rate[model.outcomes.conjunctions.group[number]]
+        tested *= 1.0 - rate * settings.pseudo_tests / (settings.pseudo_tests + causes.tests[number])
+    chance[causes.default] = none
+    return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, (1.0 - tested) * none
+
+
+def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
+    found = model.successors(np.array(CODES))
+    causes = model.outcomes.causes
+    assert causes is not None and len(causes.outcomes) == 2
+    dropped = 0
+    for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
+        factors = [predicted(factor, code, action) for factor in range(2)]
+        joint = {after: float(factors[0].expected[after[0]] * factors[1].expected[after[1]]) for after in CODES}
+        likely = {after: share for after, share in joint.items() if share >= min(0.1, max(joint.values()))}
+        dropped += len(joint) - len(likely)
+        reward = ends = untested = 0.0
+        goes_on = {}
+        for after, share in likely.items():
+            weight = share / sum(likely.values())
+            chance, unsure = by_noisy_or(model, code, action, after)
+            over = sum(share for outcome, share in chance.items() if causes.outcomes[outcome][1])
+            reward += weight * sum(share * causes.outcomes[outcome][0] for outcome, share in chance.items())
+            ends, untested, goes_on[after] = ends + weight * over, untested + weight * unsure, weight * (1.0 - over)
+        branches = zip(map(tuple, found.following[row, action].tolist()), found.p_continues[row, action], strict=True)
+        assert {after: share for after, share in branches if share > 0.0} == pytest.approx(goes_on)
+        assert found.reward[row, action] == pytest.approx(reward)
+        assert found.p_terminated[row, action] == pytest.approx(ends)
+        known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
+        assert found.unknown[row, action] == pytest.approx(1.0 - known * (1.0 - untested))
+    assert dropped > 0
+    for each in lived()[:3]:
+        probability, unknown = model.probability(each)
+        factors = [predicted(factor, each.code, each.action) for factor in range(2)]
+        chance, untested = by_noisy_or(model, each.code, each.action, each.following)
+        moved = factors[0].expected[each.following[0]] * factors[1].expected[each.following[1]]
+        assert probability == pytest.approx(moved * chance[causes.outcomes.index((each.reward, each.terminated))])
+        known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
+        assert unknown == pytest.approx(1.0 - known * (1.0 - untested))
+
+
+class ByLoops:
+    """Expectation maximisation over three outcomes; of conjunctions that were met alone."""
+
+    def __init__(self, learned: OutcomeModel, rows: list[CodeTransition]) -> None:
+        self.settings, self.prior = learned.settings, learned.conjunctions.prior
+        active = [learned.conjunctions.active(*(np.array([part]) for part in row[:3]))[0].tolist() for row in rows]
+        self.rows = list(
+            zip(active, [learned.outcomes.index((row.reward, row.terminated)) for row in rows], strict=True)
+        )
+        self.met = sorted({number for active, _ in self.rows for number in active})
+        self.group = {number: int(learned.conjunctions.group[number]) for number in self.met}
+        self.tried = Counter(self.group.values())
+
+    def silent(self, strength: dict[int, float], active: list[int]) -> float:
+        return float((1.0 - self.settings.leak) * np.prod([1.0 - strength[number] for number in active]))
+
+    def decided(self, strength: dict[int, float], outcome: int) -> dict[int, float]:
+        share = dict.fromkeys(self.met, 0.0)
+        for active, what in self.rows:
+            for number in active if what == outcome else ():
+                share[number] += min(strength[number] / (1.0 - self.silent(strength, active)), 1.0)
+        return share
+
+    def strengths(self, outcome: int, default: int) -> tuple[dict[int, float], list[float]]:
+        """Of each conjunction, and how likely those of each group are causes."""
+        pseudo, few, own = self.settings.pseudo_tests, self.settings.pseudo_conjunctions, list(self.prior / 2)
+        strength = {number: own[self.group[number]] for number in self.met}
+        weight = dict.fromkeys(self.met, 0.0)
+        for active, what in self.rows:
+            for number in active:
+                weight[number] += 1.0 if what in (outcome, default) else self.settings.masked_weight
+        for _ in range(self.settings.sweeps):
+            share = self.decided(strength, outcome)
+            strength = {n: (pseudo * own[self.group[n]] + share[n]) / (pseudo + weight[n]) for n in self.met}
+            found = [sum(strength[n] for n in self.met if self.group[n] == group) for group in range(len(own))]
+            own = [(few * self.prior[g] / 2 + found[g]) / (few + self.tried[g]) for g in range(len(own))]
+        return strength, own
+
+    def explain(self, default: int) -> tuple[dict[int, dict[int, float]], list[float], list[float], float]:
+        """Strengths by outcome, tests, rates, and the posterior's logarithm."""
+        few, strengths, posterior = self.settings.pseudo_conjunctions, {}, 0.0
+        rate = [0.5 * few * p / (few + self.tried[group]) for group, p in enumerate(self.prior)]
+        tests = [float(sum(n in active and what == default for active, what in self.rows)) for n in self.met]
+        for outcome in {0, 1, 2} - {default}:
+            strength, own = self.strengths(outcome, default)
+            strengths[outcome], rate = strength, [a + b for a, b in zip(rate, own, strict=True)]
+            tests = [a + b for a, b in zip(tests, self.decided(strength, outcome).values(), strict=True)]
+            before = {number: own[self.group[number]] for number in self.met}
+            posterior += sum(max(strength[n] - before[n], 0.0) * np.log(before[n]) for n in self.met)
+        for active, what in self.rows:
+            silent = {outcome: self.silent(strength, active) for outcome, strength in strengths.items()}
+            chance = {outcome: 1.0 - none for outcome, none in silent.items()}
+            chance[default] = float(np.prod(list(silent.values())))
+            posterior += np.log(chance[what] / sum(chance.values()))
+        return strengths, tests, rate, posterior
+
+
+def test_causes_are_found_by_expectation_maximisation() -> None:
+    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1, sweeps=6, masked_weight=0.3))
+    rows = [row._replace(reward=2.0) if row.following == (0, 1) else row for row in lived()]
+    for row in rows:
+        learned.add(row)
+    learned.fit()
+    assert learned.causes is not None and len(learned.outcomes) == 3
+    slow = ByLoops(learned, rows)
+    posteriors = [slow.explain(default)[3] for default in range(3)]
+    assert learned.causes.default == int(np.argmax(posteriors)), "whichever explains it best"
+    strengths, tests, rate, posterior = slow.explain(learned.causes.default)
+    for outcome, strength in strengths.items():
+        assert learned.causes.strength[outcome, slow.met] == pytest.approx(list(strength.values()))
+    assert learned.causes.tests[slow.met] == pytest.approx(tests)
+    assert learned.causes.cause_rate == pytest.approx(rate)
+    assert learned.causes.log_posterior == pytest.approx(posterior)
