@@ -42,7 +42,7 @@ def retrain(
     path = out / f"{name}.safetensors"
     refuse_existing(path)
     unfinished = path.with_name(f".{name}.unfinished.pt")
-    with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}") as bar:
+    with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
         show = partial(_show, bar)
         encoder = train_encoder(
             spec, recipe=recipe, appearance=appearance, seed=seed, progress=show, unfinished=unfinished
@@ -83,6 +83,8 @@ _ROWS: dict[str, Callable[[EncoderCard], str]] = {
 
 
 def _show(bar: tqdm, stage: str, done: float) -> None:
+    if bar.disable:
+        return
     if bar.desc != f"{stage}: ":
         bar.set_description(stage, refresh=False)
         bar.reset()
