@@ -78,7 +78,7 @@ def versions() -> dict[str, str]:
     found |= {package: installed(package) for package in PACKAGES}
     optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
     found |= {name: version for name, version in optional.items() if version != "missing"}
-    return found | {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.agent_packages().items()}
+    return found | {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.guest_packages().items()}
 
 
 def _sources(modules: Iterable[str]) -> str:

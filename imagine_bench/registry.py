@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, SetupError, require_known
+import gymnasium
+
+from imagine_bench.errors import InvalidValueError, SetupError, brief, plain, require_known
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
@@ -148,8 +150,8 @@ AGENTS: dict[str, AgentEntry] = {
         for twin in ("", "_macrostate")
     },
     "sb3_ppo_latents": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_ppo", settings="imagine_bench.agents.library.settings:PPO",
-        external_training_loop=True, title="SB3 PPO (latents)",
+        make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
+        title="SB3 PPO (latents)",
         description="Stable-Baselines3's PPO, which learns a policy, on the same latents.",
     ),
     "sb3_dqn_imagined": AgentEntry(
@@ -160,14 +162,15 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "sb3_ppo_imagined": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_imagining_ppo",
-        settings="imagine_bench.agents.library.settings:IMAGINING_PPO", external_training_loop=True,
+        settings="imagine_bench.agents.library.settings:IMAGINING", external_training_loop=True,
         title="SB3 PPO + imagination",
         description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
     ),
 }  # fmt: skip
 
-AGENT_GROUP = "imagine_bench.agents"
-"""Entry points in which installed packages offer agents of their own, each the ``"module:attr"`` of an AgentEntry."""
+TASK_GROUP, AGENT_GROUP = "imagine_bench.tasks", "imagine_bench.agents"
+"""Entry points in which installed packages offer tasks and agents of their own, each the ``"module:attr"`` of a
+TaskEntry or an AgentEntry."""
 
 DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
@@ -220,47 +223,92 @@ def load(target: str) -> Any:
     return getattr(found, attribute) if attribute else found
 
 
+def tasks() -> dict[str, TaskEntry]:
+    """All control tasks by name, also those of installed packages, without those that cannot be loaded."""
+    return {**TASKS, **_usable(TASK_GROUP)}
+
+
 def agents() -> dict[str, AgentEntry]:
-    """All agents by name, also those of installed packages. Raises SetupError: one offers no agent, or a taken name."""
-    return {**AGENTS, **_offered()}
+    """All agents by name, also those of installed packages, without those that cannot be loaded."""
+    return {**AGENTS, **_usable(AGENT_GROUP)}
+
+
+def _usable(group: str) -> dict[str, Any]:
+    return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
+
+
+def refused_offers() -> dict[str, SetupError]:
+    """What installed packages offer and is no task or agent that can be used, by name: why."""
+    both = {**offers(AGENT_GROUP), **offers(TASK_GROUP)}
+    return {name: entry for name, entry in both.items() if isinstance(entry, SetupError)}
 
 
 @functools.cache
-def _offered() -> dict[str, AgentEntry]:
-    found: dict[str, AgentEntry] = {}
-    for point in entry_points(group=AGENT_GROUP):
-        found[point.name] = _offered_entry(point, taken={*AGENTS, *REGRESSORS, *found})
+def offers(group: str) -> Mapping[str, Any]:
+    """What installed packages offer in a group of entry points, by name: an entry, or the error why it is none.
+
+    A name of this suite's own stays this suite's.
+    """
+    kind, own = (TaskEntry, {*TASKS, *REGRESSIONS}) if group == TASK_GROUP else (AgentEntry, {*AGENTS, *REGRESSORS})
+    found: dict[str, Any] = {}
+    for point in entry_points(group=group):
+        package = point.dist.name if point.dist else point.module
+        offer = f"The package {package} offers {point.value} as {group.rpartition('.')[2][:-1]} {point.name}"
+        if point.name in found or point.name in own:
+            found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
+            continue
+        try:
+            entry = point.load()
+        except Exception as error:  # whatever a package does wrong, it is one sentence and costs nobody else anything
+            why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
+            entry = SetupError(f"{offer}, which cannot be loaded ({why}); mend or uninstall the package.")
+        if not isinstance(entry, kind | SetupError):
+            entry = SetupError(
+                f"{offer}, which is {brief(entry)} and no {kind.__name__}; mend or uninstall the package."
+            )
+        found[point.name] = entry
     return found
 
 
-def _offered_entry(point: EntryPoint, taken: Collection[str]) -> AgentEntry:
-    offer = f"The package {point.dist.name if point.dist else point.module} offers {point.value} as agent {point.name}"
-    if point.name in taken:
-        raise SetupError(f"{offer}, a name that is taken; give it another, or uninstall the package.")
-    try:
-        entry = point.load()
-    except (ImportError, AttributeError) as error:
-        raise SetupError(f"{offer}, which cannot be loaded ({error}); mend or uninstall the package.") from error
-    if not isinstance(entry, AgentEntry):
-        raise SetupError(f"{offer}, which is {entry!r} and no AgentEntry; mend or uninstall the package.")
+def _entry(kind: str, name: str, own: Mapping[str, Any], group: str) -> Any:
+    if isinstance(name, str) and name in own:
+        return own[name]
+    there = offers(group)
+    entry = there[require_known(kind, name, {**own, **there})]
+    if isinstance(entry, SetupError):
+        raise entry
     return entry
 
 
-def agent_packages() -> dict[str, frozenset[str]]:
-    """The installed packages that offer agents, by name, and where their entries lie: names of top modules.
+def guest_packages() -> dict[str, frozenset[str]]:
+    """The installed packages that offer tasks or agents, by name, and where their entries lie: names of top modules.
 
     None of them is imported.
     """
     found: dict[str, frozenset[str]] = {}
-    for point in entry_points(group=AGENT_GROUP):
+    for point in (*entry_points(group=TASK_GROUP), *entry_points(group=AGENT_GROUP)):
         if point.dist:
             found[point.dist.name] = found.get(point.dist.name, frozenset()) | {point.module.partition(".")[0]}
     return dict(sorted(found.items()))
 
 
 def task_entry(name: str) -> TaskEntry:
-    """The registry line of a task. Raises UnknownNameError: no such task."""
-    return TASKS[require_known("task", name, TASKS)]
+    """The registry line of a task, this suite's or an installed package's.
+
+    Raises:
+        UnknownNameError: No such task.
+        SetupError: Its package offers something else under this name, or nothing that can be loaded.
+    """
+    entry: TaskEntry = _entry("task", name, TASKS, TASK_GROUP)
+    register_env(entry)
+    return entry
+
+
+def register_env(entry: TaskEntry) -> None:
+    """Register a task's environment with Gymnasium, unless its id is known already."""
+    if entry.env_id not in gymnasium.registry:
+        options = dict(entry.options)
+        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=options)
 
 
 def agent_entry(name: str) -> AgentEntry:
@@ -268,10 +316,9 @@ def agent_entry(name: str) -> AgentEntry:
 
     Raises:
         UnknownNameError: No such agent.
-        SetupError: As :func:`agents`.
+        SetupError: As :func:`task_entry`.
     """
-    known = agents()
-    return known[require_known("agent", name, known)]
+    return _entry("agent", name, AGENTS, AGENT_GROUP)
 
 
 def setting_names(agent: str) -> frozenset[str]:

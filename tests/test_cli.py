@@ -200,7 +200,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     words = set(re.split(r"[\s,]+", out))
     for kind in task_types().values():
-        assert words >= {*kind.tasks, *kind.learners(), *kind.presets}
+        assert words >= {*kind.tasks(), *kind.learners(), *kind.presets}
     assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
     assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}
 

@@ -36,7 +36,7 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
     path = out / f"{name}.safetensors"
     refuse_existing(path)
-    with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}") as bar:
+    with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
         show = partial(_show, bar)
         encoder = train_encoder(spec, recipe=recipe, appearance=appearance, seed=seed, progress=show)
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
@@ -74,6 +74,8 @@ _ROWS: dict[str, Callable[[EncoderCard], str]] = {
 
 
 def _show(bar: tqdm, stage: str, done: float) -> None:
+    if bar.disable:
+        return
     if bar.desc != f"{stage}: ":
         bar.set_description(stage, refresh=False)
         bar.reset()

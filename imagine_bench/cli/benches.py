@@ -157,7 +157,7 @@ class List:
         from imagine_bench.studies.catalogue import STUDIES  # noqa: PLC0415 - no other command but study needs them
 
         for title, names in {
-            **{f"{name} tasks": kind.tasks for name, kind in task_types().items()},
+            **{f"{name} tasks": kind.tasks() for name, kind in task_types().items()},
             **{f"{name} learners": kind.learners() for name, kind in task_types().items()},
             **{f"{name} presets": kind.presets for name, kind in task_types().items()},
             "studies": STUDIES,
@@ -167,6 +167,8 @@ class List:
             "encoders": bundled(),
         }.items():
             print(f"{title:22}{', '.join(names)}")
+        for error in registry.refused_offers().values():
+            print(f"\n{error}")
 
 
 def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:

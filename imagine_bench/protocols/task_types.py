@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 from typing import Protocol as Interface
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 
@@ -48,7 +48,7 @@ class Result(Interface):
 class TaskType(Generic[P]):
     """What a type of task brings along."""
 
-    tasks: Mapping[str, object]  #: Its registered tasks
+    tasks: Callable[[], Mapping[str, object]]  #: Gives its tasks, by name
     learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
     draws: bool  #: Whether its runs need OpenGL
     protocol: type[P]  #: The class of its protocols
@@ -68,11 +68,13 @@ def task_types() -> dict[str, TaskType[ProtocolData]]:
 
 
 def task_type(task: str) -> TaskType[ProtocolData]:
-    """The type of a registered task. Raises UnknownNameError: no such task."""
+    """The type of a registered task. Raises UnknownNameError, or SetupError: as :func:`.registry.task_entry`."""
     for kind in task_types().values():
-        if task in kind.tasks:
+        if task in kind.tasks():
             return kind
-    raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks])
+    if isinstance(error := registry.offers(registry.TASK_GROUP).get(task), SetupError):
+        raise error
+    raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks()])
 
 
 def require_options(task: str, options: Mapping[str, Any]) -> None:

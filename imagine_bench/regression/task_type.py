@@ -10,7 +10,7 @@ from imagine_bench.regression.runner import run
 from imagine_bench.store.bench_folder import load_bench
 
 REGRESSION = TaskType(
-    tasks=registry.REGRESSIONS,
+    tasks=lambda: registry.REGRESSIONS,
     learners=lambda: registry.REGRESSORS,
     draws=False,
     protocol=RegressionProtocol,

@@ -1,11 +1,15 @@
-"""Which encoder artefact a bench uses: the task's bundled one, another bundled one by name, or a file."""
+"""Which encoder artefact a bench uses: the task's own, bundled or trained once, a bundled one by name, or a file."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 from importlib import resources
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import platformdirs
 
 from imagine_bench.errors import ArtefactError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
@@ -20,16 +24,39 @@ def bundled() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob(f"*{_SUFFIX}"))}
 
 
+def cache_folder() -> Path:
+    """Where encoders of tasks that none is bundled for are kept: ``$IMAGINE_BENCH_CACHE``, or the user's cache."""
+    given = os.environ.get("IMAGINE_BENCH_CACHE")
+    return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("imagine_bench"))
+
+
+def cached(spec: TaskSpec, appearance: str, kind: str) -> Path:
+    """Where the trained encoder of a task's looks belongs, be it there or not; other looks are another folder."""
+    frames = spec.render_macrostates(np.array(spec.rules.states[:8]), appearance, np.random.default_rng(0))
+    looks = hashlib.sha256(f"{spec.preprocessing}/{spec.config_group}/".encode() + frames.tobytes()).hexdigest()[:12]
+    return cache_folder() / "encoders" / looks / f"{bundled_name(spec.encoder, appearance, kind)}{_SUFFIX}"
+
+
+def find(used: str) -> Path | None:
+    """The bundled or trained encoder of an identity; None where there is none."""
+    name = used.partition("@")[0]
+    there = [bundled()[name]] if name in bundled() else []
+    there += sorted((cache_folder() / "encoders").glob(f"*/{name}{_SUFFIX}"))
+    return next((path for path in there if identity(path) == used), None)
+
+
 def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str = "latents") -> Path:
     """The encoder file to use: ``given``, a bundled name or a path, or the task's own of a kind (latents or codes).
 
     Raises:
         UnknownNameError: ``given`` is neither.
-        ArtefactError: The task has no bundled encoder at this appearance level.
+        ArtefactError: The task has no encoder of its own at this appearance level, bundled or trained.
     """
     known = bundled()
     if given is None:
         name = bundled_name(spec.encoder, appearance, kind)
+        if name not in known and (path := cached(spec, appearance, kind)).is_file():
+            return path
         if name not in known:
             raise ArtefactError(
                 f"No encoder {name!r} is bundled; train one with "
@@ -57,8 +84,8 @@ def identity(path: Path) -> str:
 
 
 def card(used: str | None) -> dict[str, Any] | None:
-    """The card of a bundled encoder by its identity; None where none such is bundled. Raises ArtefactError: damaged."""
-    path = None if used is None else bundled().get(used.partition("@")[0])
-    if path is None or identity(path) != used or not path.with_suffix(".json").is_file():
+    """The card of an encoder that :func:`find` finds; None where it finds none. Raises ArtefactError: damaged."""
+    path = None if used is None else find(used)
+    if path is None or not path.with_suffix(".json").is_file():
         return None
     return read_json(path.with_suffix(".json"), "an encoder's card")

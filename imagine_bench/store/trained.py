@@ -79,7 +79,7 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
 
 def require_control(task: str, what: str) -> None:
     """Raise ArtefactError for a task in which no agent acts."""
-    if task not in registry.TASKS:
+    if task not in registry.tasks():
         raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
 
 
@@ -128,12 +128,12 @@ def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
     used = protocol.encoder_of(entry.encoder_kind)
     if not entry.needs_encoder or used is None:
         return None
-    task, name = registry.task(protocol.task), used.partition("@")[0]
+    task = registry.task(protocol.task)
     if given is not None and _is_other(task, protocol, given, used):
         given = None
-    if given is None and name not in encoders.bundled():
-        raise ArtefactError(f"The run saw through encoder {used}, which is not bundled; give its file with --encoder.")
-    path = encoders.resolve(task, protocol.appearance, given or name)
+    path = encoders.find(used) if given is None else encoders.resolve(task, protocol.appearance, given)
+    if path is None:
+        raise ArtefactError(f"The run saw through encoder {used}, which is not here; give its file with --encoder.")
     if encoders.identity(path) != used:
         raise ArtefactError(
             f"The run saw through encoder {used}, and {path} is {encoders.identity(path)}; give the right "

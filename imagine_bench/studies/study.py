@@ -19,7 +19,7 @@ from imagine_bench.bench.launchers import Launcher
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders, task_type
-from imagine_bench.registry import TASKS
+from imagine_bench.registry import tasks
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult
@@ -97,7 +97,7 @@ class Line:
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
-    if task not in TASKS:
+    if task not in tasks():
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run

@@ -64,10 +64,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     def write(point: str) -> None:
         (facts / "entry_points.txt").write_text(f"[{registry.AGENT_GROUP}]\n{point}\n")
-        registry._offered.cache_clear()
+        registry.offers.cache_clear()
 
     yield write
-    registry._offered.cache_clear()
+    registry.offers.cache_clear()
 
 
 def test_a_packages_agent_is_compared_like_one_of_ours(
@@ -99,19 +99,26 @@ def test_sources_that_changed_are_another_version(install: Install, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("point", "sentence"),
+    ("point", "name", "sentence"),
     [
-        ("dqn = their_package:ENTRY", "offers their_package:ENTRY as agent dqn, a name that is taken; give it another"),
-        ("ensemble = their_package:ENTRY", "as agent ensemble, a name that is taken"),
-        ("mine = their_package:ENTRY\nmine = their_package:ENTRY", "as agent mine, a name that is taken"),
-        ("mine = their_package:NONE", "offers their_package:NONE as agent mine, which cannot be loaded (module "),
-        ("mine = no_package:ENTRY", "offers no_package:ENTRY as agent mine, which cannot be loaded (No module named"),
-        ("mine = their_package:Constant", "as agent mine, which is <class 'their_package.Constant'> and no AgentEntry"),
+        ("dqn = their_package:ENTRY", "their-package:dqn", "as agent dqn, a name that is taken; give it another"),
+        ("ensemble = their_package:ENTRY", "their-package:ensemble", "as agent ensemble, a name that is taken"),
+        ("mine = their_package:NONE", "mine", "offers their_package:NONE as agent mine, which cannot be loaded (Attri"),
+        ("mine = no_package:ENTRY", "mine", "which cannot be loaded (ModuleNotFoundError: No module named 'no_package"),
+        ("mine = their_broken:ENTRY", "mine", "which cannot be loaded (ZeroDivisionError: division by zero)"),
+        ("mine = their_package:Constant", "mine", "which is <class 'their_package.Constant'> and no AgentEntry"),
     ],
 )
-def test_an_offer_that_is_no_agent_is_refused_by_name(install: Install, point: str, sentence: str) -> None:
-    install(point)
+def test_an_offer_that_is_no_agent_costs_nobody_anything(
+    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str], point: str, name: str, sentence: str
+) -> None:
+    (tmp_path / "site" / "their_broken.py").write_text("1 / 0")
+    install(f"{point}\nfine = their_package:ENTRY")
     assert versions()["their-package"].startswith("1.2+"), "what is broken can still be named"
-    with pytest.raises(SetupError) as caught:
-        registry.agent_entry("dqn")
-    assert str(caught.value).startswith("The package their-package ") and sentence in str(caught.value)
+    assert registry.agent_entry("dqn") is registry.AGENTS["dqn"] and registry.agent_entry("fine").title == "Theirs"
+    with pytest.raises(SetupError, match=r"^The package their-package offers ") as caught:
+        registry.agent_entry(name)
+    assert sentence in str(caught.value)
+    assert main(["list"]) == 0
+    said = capsys.readouterr().out
+    assert sentence in said and "fine" in said

@@ -302,7 +302,7 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
         with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
             load_trained(tmp_path, encoder=str(own))
     (tmp_path / "config.json").write_text(json.dumps(sealed(config)))
-    with pytest.raises(ArtefactError, match=r"own@\w+, which is not bundled; give its file with --encoder"):
+    with pytest.raises(ArtefactError, match=r"own@\w+, which is not here; give its file with --encoder"):
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"own@\w+, and .*arrow_puzzle-mild.* give the right file"):
         load_trained(tmp_path, encoder="arrow_puzzle-mild")

@@ -59,10 +59,10 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
 
 
 def test_every_kind_has_learners_and_all_names_load() -> None:
-    names = [name for kind in task_types().values() for name in kind.tasks]
+    names = [name for kind in task_types().values() for name in kind.tasks()]
     assert len(names) == len(set(names))
     for kind in task_types().values():
-        assert kind.tasks and kind.learners() and kind.presets
+        assert kind.tasks() and kind.learners() and kind.presets
     for name in registry.REGRESSIONS:
         spec = registry.regression(name)
         assert (

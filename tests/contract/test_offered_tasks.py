@@ -1,0 +1,114 @@
+"""A task that a package beside this one offers: plain MJCF, no arm, no encoder; used like one of ours."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from imagine_bench.agents.encoders import recipes
+from small_runs import Inline
+
+from imagine_bench import registry, rules
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.store import encoders
+from imagine_bench.store.trained import learners, load_trained
+
+GUEST = Path(__file__).parents[1] / "fakes" / "guest"
+
+
+@pytest.fixture
+def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A site folder with the package in it; encoders are made in seconds and kept in a folder of the test's own."""
+    site = tmp_path / "site"
+    shutil.copytree(GUEST, site)
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delitem(sys.modules, "lights_out", raising=False)
+    few = {"frames": 400, "held_out_frames": 50, "steps": 20, "probe_steps": 20}
+    for name in ("default", "codes"):
+        recipe = dataclasses.replace(recipes.RECIPES["chapter_5"][name], **few)
+        monkeypatch.setitem(recipes.RECIPES["chapter_5"], name, recipe)
+    registry.offers.cache_clear()
+    yield site
+    registry.offers.cache_clear()
+    gymnasium.registry.pop("lights_out/LightsOut-v0", None)
+
+
+def test_its_environment_is_an_ordinary_one(guest: Path) -> None:
+    entry = registry.task_entry("lights_out")
+    env = gymnasium.make(entry.env_id).unwrapped
+    check_env(env, skip_render_check=True)
+    spec = registry.task("lights_out")
+    frames = spec.render_macrostates(np.array(spec.rules.states), "clean", np.random.default_rng(0))
+    assert len(np.unique(frames.reshape(16, -1), axis=0)) == 16
+    for state, frame in zip(spec.rules.states, frames, strict=True):
+        assert np.array_equal(env.reset(options={"macrostate": state})[0], frame)
+    env.close()
+
+
+@pytest.mark.slow
+def test_it_goes_from_list_to_recording(guest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "lights_out" not in registry.TASKS
+    assert main(["list"]) == 0
+    assert re.search(r"^control tasks .*\blights_out\b", capsys.readouterr().out, re.MULTILINE)
+    wanted, paths = plan(
+        "lights_out", "smoke", agents=("oracle", "dqn", "factored"), execution="kinematic", budgets=(5,),
+        evaluation_episodes=4, open_loop_starts=2, recorded_episodes=1,
+    )  # fmt: skip
+    assert capsys.readouterr().out.count("one is trained into") == 2, "latents for one, codes for the other"
+    folder = bench(wanted, paths, root=tmp_path / "runs", launcher=Inline()).folder
+    assert main(["report", str(folder)]) == 0
+    chance, page = rules.facts(registry.task("lights_out").rules, 8).chance_level, folder / "report" / "index.html"
+    assert all(word in page.read_text() for word in ("Lights out", f"{100 * chance:.1f}"))
+    assert all((run / "recording.rrd").stat().st_size > 10_000 for run in learners(folder))
+
+    kept = sorted((tmp_path / "cache").rglob("*.safetensors"))
+    for run in learners(folder):  # the encoder is found again by its digest
+        assert load_trained(run).spec.encoder in kept
+    before = kept[0].read_bytes()
+    kept[0].write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+    with pytest.raises(ArtefactError, match="which is not here; give its file with --encoder"):
+        [load_trained(run) for run in learners(folder)]
+
+
+def test_agents_without_an_encoder_act_in_it(guest: Path, tmp_path: Path) -> None:
+    few = {"budgets": (5,), "evaluation_episodes": 20, "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted, paths = plan("lights_out", "smoke", agents=("random", "oracle"), execution="kinematic", **few)
+    runs = {run.agent: run.checkpoints[-1] for run in bench(wanted, paths, root=tmp_path, launcher=Inline()).runs}
+    assert not paths and runs["oracle"].success_rate == 1.0 > runs["random"].success_rate
+
+
+def test_other_looks_are_another_encoder(guest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = registry.task("lights_out")
+    dark = dataclasses.replace(spec, render_macrostates=lambda *given: spec.render_macrostates(*given) // 2)
+    places = [encoders.cached(each, "clean", "codes") for each in (spec, spec, dark)]
+    assert places[0] == places[1] != places[2]
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("lights_out = lights_out:SPEC", "and no TaskEntry"),
+        ("lights_out = lights_out:NONE", "which cannot be loaded (AttributeError"),
+    ],
+)
+def test_an_offer_that_is_no_task_costs_nobody_anything(
+    guest: Path, capsys: pytest.CaptureFixture[str], line: str, sentence: str
+) -> None:
+    (guest / "lights_out-1.0.dist-info" / "entry_points.txt").write_text(f"[imagine_bench.tasks]\n{line}\n")
+    with pytest.raises(SetupError, match=r"^The package lights-out offers ") as caught:
+        registry.task("lights_out")
+    assert sentence in str(caught.value) and registry.task("arrow_puzzle").id == "arrow_puzzle"
+    assert main(["bench", "--task", "lights_out"]) == 2
+    assert sentence in capsys.readouterr().err
+    assert main(["list"]) == 0 and sentence in capsys.readouterr().out
