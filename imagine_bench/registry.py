@@ -150,8 +150,8 @@ AGENTS: dict[str, AgentEntry] = {
         for twin in ("", "_macrostate")
     },
     "sb3_ppo_latents": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_ppo", settings="imagine_bench.agents.library.settings:PPO",
-        external_training_loop=True, title="SB3 PPO (latents)",
+        make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
+        title="SB3 PPO (latents)",
         description="Stable-Baselines3's PPO, which learns a policy, on the same latents.",
     ),
     "sb3_dqn_imagined": AgentEntry(
@@ -162,7 +162,7 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "sb3_ppo_imagined": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_imagining_ppo",
-        settings="imagine_bench.agents.library.settings:IMAGINING_PPO", external_training_loop=True,
+        settings="imagine_bench.agents.library.settings:IMAGINING", external_training_loop=True,
         title="SB3 PPO + imagination",
         description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
     ),

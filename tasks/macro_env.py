@@ -56,7 +56,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         spec: The task.
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
-        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
+        appearance: A name in :data:`.scenes.appearance.LEVELS`.
         render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
@@ -148,7 +148,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
-        self.world.vary(self.np_random)
+        self.world.vary(self.np_random, move_objects=self._execution == "kinematic")
         reading = self.world.read()
         self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
@@ -195,7 +195,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self._agent_camera.frame(self.world.data)
+        return self.world.develop(self._agent_camera.frame(self.world.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""

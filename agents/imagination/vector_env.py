@@ -87,22 +87,23 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
             raise InvalidValueError(
                 f"Actions {actions} must be {self.num_envs} in [0, {self.imagination.model.n_actions})."
             )
-        step = self._imagine(np.asarray(actions, np.int64))
-        accepted = self.imagination.keeps(step).cpu().numpy()
+        generator, imagination = self._generator, self.imagination
+        generator.manual_seed(int(self.np_random.integers(2**63)))
+        z, action = (
+            torch.tensor(values, device=generator.device) for values in (self._z, np.asarray(actions, np.int64))
+        )
+        step = imagination.step(z, action, imagination.draw_weights(generator), generator)
+        accepted = imagination.keeps(step).cpu().numpy()
         reached = np.where(accepted[:, None], step.next_z.cpu().numpy(), self._z)  # [N, Z]
         reward = np.where(accepted, step.reward.cpu().numpy(), 0.0).astype(np.float64)
         self._steps += 1
         terminated = accepted & (step.p_terminated > TERMINAL).cpu().numpy()
         truncated = ~terminated & (~accepted | (self._steps >= self.horizon))
-        info = self._info(step, accepted, reached, terminated | truncated)
-        self._begin_anew(reached, terminated | truncated)
+        ended = terminated | truncated
+        info = self._info(step, accepted, reached, ended)
+        reached[ended], self._steps[ended] = self._draw_starts(int(ended.sum())), 0
+        self._z = reached
         return self._z.copy(), reward, terminated, truncated, info
-
-    def _imagine(self, actions: NDArray[np.int64]) -> Imagined:
-        generator, imagination = self._generator, self.imagination
-        generator.manual_seed(int(self.np_random.integers(2**63)))
-        z, action = (torch.from_numpy(values).to(generator.device) for values in (self._z, actions))
-        return imagination.step(z, action, imagination.draw_weights(generator), generator)
 
     def _info(self, step: Imagined, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
         parts = decompose(step.samples)
@@ -116,10 +117,6 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
             if over:
                 self._add_info(info, {"final_obs": reached[index].copy(), "final_info": own}, index)
         return info
-
-    def _begin_anew(self, reached: Latents, ended: Switches) -> None:
-        self._z = reached
-        self._z[ended], self._steps[ended] = self._draw_starts(int(ended.sum())), 0
 
     def _draw_starts(self, count: int) -> Latents:
         return self.starts[self.np_random.integers(len(self.starts), size=count)]

@@ -23,7 +23,7 @@ from ..imagination.agent import ImaginingAgent, build
 from ..settings import Hyperparameters
 from .latent_observation import LatentObservation
 from .mixed_experience import MixedExperience
-from .settings import HYPERPARAMETERS, IMAGINING, IMAGINING_PPO, PPO, PPOSettings
+from .settings import HYPERPARAMETERS, IMAGINING, PPOSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -35,19 +35,18 @@ class LibraryAgent:
     Args:
         context: Of the run. Its seed is that of torch's and numpy's global generators, which the library draws from.
         algorithm: The library's class, such as ``"stable_baselines3:DQN"``.
-        hyperparameters: Its settings, with the keywords of the class in a section ``sb3`` or ``ppo``.
 
     Raises:
         SetupError: The library is not installed.
     """
 
-    def __init__(
-        self, context: AgentContext, algorithm: str, hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS
-    ) -> None:
+    hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS
+
+    def __init__(self, context: AgentContext, algorithm: str) -> None:
         prepare_torch(context.device)
         self._algorithm, self._device = _load(algorithm), context.device
-        self.settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
-        self._keywords = self.settings.ppo if hasattr(self.settings, "ppo") else self.settings.sb3
+        self.settings = self.hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self._keywords = self.settings.ppo if algorithm.endswith(":PPO") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS
         self._encoder = None if context.encoder is None else load_perception(context).encoder
         self._model: Any = None
@@ -111,10 +110,12 @@ class LibraryAgent:
 class ImaginingLibraryAgent(LibraryAgent):
     """A learner of the library that trains on real and imagined episodes alike, the latter through the filter."""
 
-    def __init__(self, context: AgentContext, algorithm: str, hyperparameters: Hyperparameters[Any]) -> None:
-        super().__init__(context, algorithm, hyperparameters)
+    hyperparameters = IMAGINING
+
+    def __init__(self, context: AgentContext, algorithm: str) -> None:
+        super().__init__(context, algorithm)
         self._world_seed = context.seeds.child("imagined").integer()
-        self._learner = build(ImaginingAgent, context, filtered=True, hyperparameters=hyperparameters)
+        self._learner = build(ImaginingAgent, context, filtered=True, hyperparameters=IMAGINING)
 
     def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         return MixedExperience(env, self._learner, count=self.settings.mix.imagined_episodes, seed=self._world_seed)
@@ -150,9 +151,9 @@ def make_qrdqn(context: AgentContext) -> LibraryAgent:
     return LibraryAgent(context, "sb3_contrib:QRDQN")
 
 
-make_ppo = partial(LibraryAgent, algorithm="stable_baselines3:PPO", hyperparameters=PPO)
+make_ppo = partial(LibraryAgent, algorithm="stable_baselines3:PPO")
 """The ``sb3_ppo_latents`` agent: PPO (Schulman et al. 2017)."""
-make_imagining_dqn = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:DQN", hyperparameters=IMAGINING)
+make_imagining_dqn = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:DQN")
 """The ``sb3_dqn_imagined`` agent."""
-make_imagining_ppo = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:PPO", hyperparameters=IMAGINING_PPO)
+make_imagining_ppo = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:PPO")
 """The ``sb3_ppo_imagined`` agent."""

@@ -33,7 +33,7 @@ class SB3Settings:
 class PPOSettings:
     """Keywords of ``stable_baselines3.PPO`` that differ from the library's own, chosen where the rules were imagined.
 
-    A reward of 50 makes large losses of the value: they weigh less, and their gradients are clipped later.
+    A reward of 50 makes large losses of the value: they weigh less, and gradients are clipped later.
     """
 
     learning_rate: float = setting(3e-3, POSITIVE)
@@ -41,22 +41,16 @@ class PPOSettings:
     batch_size: int = setting(64, between(2, 10_000))
     n_epochs: int = setting(10, COUNT)  #: how often each of them is learned from
     gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
-    ent_coef: float = setting(0.5, NOT_NEGATIVE)  #: weight of the policy's entropy, against rewards of 50
+    ent_coef: float = setting(0.5, NOT_NEGATIVE)  #: weight of the policy's entropy
     vf_coef: float = setting(0.05, NOT_NEGATIVE)  #: weight of the value's loss
     max_grad_norm: float = setting(5.0, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LibrarySettings:
-    """All settings of an agent from Stable-Baselines3."""
+    """All settings of an agent from Stable-Baselines3, of which an algorithm reads its own section."""
 
     sb3: SB3Settings = field(default_factory=SB3Settings)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PPOLibrarySettings:
-    """All settings of the library's PPO."""
-
     ppo: PPOSettings = field(default_factory=PPOSettings)
 
 
@@ -68,33 +62,16 @@ class MixSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Mixing(Settings):
-    """The library learns values: ``controller``, and how the suite's own agents mix, are without effect."""
+class ImaginingSettings(LibrarySettings, Settings):
+    """Those with a world model; ``controller``, and how our own agents mix experience, are without effect."""
 
     mix: MixSettings = field(default_factory=MixSettings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImaginingSettings(LibrarySettings, _Mixing):
-    """Of the library's DQN with a world model."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImaginingPPOSettings(PPOLibrarySettings, _Mixing):
-    """Of the library's PPO with a world model."""
-
-
-def _imagining(kind: type[_Mixing]) -> Hyperparameters[_Mixing]:
-    """Those of the suite's own agents that imagine, with the library's."""
-
-    def joined(settings: Settings) -> _Mixing:
-        return kind(**{part.name: getattr(settings, part.name) for part in fields(settings)})
-
-    return Hyperparameters(
-        {name: ConfigGroup(joined(group.published), group.sets) for name, group in IMAGINATION.groups.items()}
-    )
+def _joined(group: ConfigGroup[Settings]) -> ConfigGroup[ImaginingSettings]:
+    own = {part.name: getattr(group.published, part.name) for part in fields(group.published)}
+    return ConfigGroup(ImaginingSettings(**own), group.sets)
 
 
 HYPERPARAMETERS = Hyperparameters.everywhere(LibrarySettings())
-PPO = Hyperparameters.everywhere(PPOLibrarySettings())
-IMAGINING, IMAGINING_PPO = _imagining(ImaginingSettings), _imagining(ImaginingPPOSettings)
+IMAGINING = Hyperparameters({name: _joined(group) for name, group in IMAGINATION.groups.items()})

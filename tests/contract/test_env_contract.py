@@ -17,7 +17,7 @@ from imagine_bench.tasks.scenes.constants import ARM_GROUP
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, SceneReader
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, HELD_OUT, SceneReader
 
 TASKS = tuple(registry.TASKS)
 INFO_KEYS = {
@@ -440,4 +440,4 @@ def test_the_human_view_shows_the_whole_scene_at_the_asked_size():
 def test_appearances_are_those_of_the_interfaces():
     from imagine_bench.tasks.scenes.appearance import LEVELS
 
-    assert tuple(LEVELS) == APPEARANCES
+    assert tuple(LEVELS) == (*APPEARANCES, *HELD_OUT.values())
