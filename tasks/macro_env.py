@@ -48,14 +48,15 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     Episode End: terminated where the rules say so; truncation is the registered time limit.
 
-    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` (with ``fault_reason`` when
-    true), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action.
+    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty
+    where there is none), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action, ``action_mask`` (int8, (A,)); the
+    same keys at every reset and step, all numpy but the reason.
 
     Args:
         spec: The task.
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
-        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
+        appearance: A name in :data:`.scenes.appearance.LEVELS`.
         render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
@@ -147,7 +148,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
-        self.world.vary(self.np_random)
+        self.world.vary(self.np_random, move_objects=self._execution == "kinematic")
         reading = self.world.read()
         self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
@@ -166,6 +167,10 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         """Free the OpenGL contexts; may be called again."""
         for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
             renderer.close()
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
+        return np.ones(int(self.action_space.n), dtype=bool)  # type: ignore[attr-defined]
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
@@ -190,7 +195,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self._agent_camera.frame(self.world.data)
+        return self.world.develop(self._agent_camera.frame(self.world.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""
@@ -296,13 +301,14 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
-            "is_success": success,
-            "success": success,
-            "legal": legal,
-            "fault": fault is not None,
-            **({} if fault is None else {"fault_reason": fault}),
-            "sim_time_s": 0.0 if latest is None else float(latest.sim_time_s),
-            "ik_error_m": 0.0 if latest is None else float(latest.ik_error_m),
+            "is_success": np.bool_(success),
+            "success": np.bool_(success),
+            "legal": np.bool_(legal),
+            "fault": np.bool_(fault is not None),
+            "fault_reason": fault or "",
+            "sim_time_s": np.float64(0.0 if latest is None else latest.sim_time_s),
+            "ik_error_m": np.float64(0.0 if latest is None else latest.ik_error_m),
+            "action_mask": self.action_masks().astype(np.int8),
         }
 
 

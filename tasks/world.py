@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import PhysicsSettings
+from imagine_bench.interfaces import Frame, PhysicsSettings
 
 from .motion import orientation
 from .motion.executor import MacroResult, at_rest
@@ -19,6 +19,7 @@ from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
+from .scenes.fragments import Photographer
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -54,6 +55,7 @@ class World(abc.ABC):
         self._bodies = [model.body(body).id for body in objects]
         self._level, self._names = level, tuple(objects.values())
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
+        self._photographer = None if level.pool is None else Photographer(level)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._rest_qpos, self._rest_ctrl = at_rest(model)
@@ -84,8 +86,15 @@ class World(abc.ABC):
         self._gesture(gesture)
         self.update()
 
-    def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's light, colors, camera and hands as the appearance says."""
+    def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
+        """Draw this frame's light, colors, camera and hands as the appearance says.
+
+        Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
+        where physics left it lies there.
+        """
+        if self._photographer is not None:
+            self._patch(self._photographer, rng, move_objects=move_objects)
+            return
         if not self._level.varies_every_frame:
             return
         self._appearance.vary(rng)
@@ -94,6 +103,23 @@ class World(abc.ABC):
             offset_m = [self._level.hand_offset_m * each for each in wobble]
             self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
         self.update()
+
+    def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
+        (objects, _), gesture = self._objects(), self._read_gesture()
+        hand, fragments = photographer.draw(objects, gesture, rng)
+        for index, (value, fragment) in enumerate(zip(objects, fragments, strict=True)):
+            if move_objects:
+                x, y, _, yaw = fragment.offset
+                self._put(index, value, (x, y, yaw))
+        if self._hands_vary():
+            *offset, yaw = hand.offset
+            offset_m = [self._level.hand_offset_m * each for each in offset]
+            self._gesture(gesture, offset_m, self._level.hand_yaw_rad * yaw)
+        self.update()
+
+    def develop(self, frame: Frame) -> Frame:
+        """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
+        return frame if self._photographer is None else self._photographer.develop(frame)
 
     @abc.abstractmethod
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
