@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -33,6 +33,18 @@ class Reading:
 
     macrostate: tuple[int, ...]  #: the nearest macrostate
     problem: str | None  #: what keeps the scene from being a proper macrostate, in words, or None
+
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldState:
+    """A scene's dynamic state, MuJoCo's with what starts its solvers, its looks, and the planner's latest error."""
+
+    physics: NDArray[np.float64]
+    looks: tuple[NDArray[np.float64], ...]
+    sensing: Sensing
 
 
 class World(abc.ABC):
@@ -75,6 +87,29 @@ class World(abc.ABC):
             model.body_mass[self._bodies] *= settings.object_mass
             model.body_inertia[self._bodies] *= settings.object_mass
             mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def get_state(self) -> WorldState:
+        """Everything in the scene that may change, copied."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, physics, _STATE)
+        looks = tuple(np.array(each) for each in self._looks())
+        return WorldState(physics=physics, looks=looks, sensing=replace(self.sensing))
+
+    def set_state(self, state: WorldState) -> None:
+        """Put the scene as it was, to the bit."""
+        mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
+        for mine, then in zip(self._looks(), state.looks, strict=True):
+            mine[:] = then
+        for name in ("aside_m", "turned_rad"):
+            setattr(self.sensing, name, getattr(state.sensing, name))
+        self.update()
+
+    def _looks(self) -> tuple[NDArray[np.float64], ...]:
+        """What :meth:`vary` writes into the model: views of it."""
+        model, headlight = self.model, self.model.vis.headlight
+        return (
+            headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat,
+        )  # fmt: skip
 
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
