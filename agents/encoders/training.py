@@ -35,8 +35,6 @@ from .vae import MlpVae, Vae
 
 Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
-Begun = tuple[Path, str]
-"""A file that keeps an unfinished training, and words that only this training has."""
 
 _CHUNK = 500  # frames rendered at once, to bound memory
 _PART = 250  # images whose gradients are added up: 2000 at once take twice as long, out of the processor's caches
@@ -92,21 +90,22 @@ def learning_rate_at(recipe: Recipe, step: int) -> float:
 
 
 def train_vae(
-    vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress, begun: Begun | None = None
-) -> float:
-    """Minimise the beta-VAE loss with Adam, in place; from where ``begun`` (file, training) says that it was left.
-
-    Returns:
-        CPU seconds that were spent on it before.
+    vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress,
+    unfinished: Unfinished | None = None,
+) -> float:  # fmt: skip
+    """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds of it, earlier processes' included.
 
     Raises:
         DivergedError: The loss is not finite any more; the message names the step.
-        ArtefactError: What was begun is damaged or another training.
+        ArtefactError: What is unfinished is damaged or another training.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
-    unfinished = None if begun is None else Unfinished(*begun, vae, optimiser, generator)
-    first, order = (0, torch.empty(0, dtype=torch.int64)) if unfinished is None else unfinished.restore()
-    n = len(data.images)
+    n, first, order, begun_s = len(data.images), 0, torch.empty(0, dtype=torch.int64), time.process_time()
+    if unfinished is not None and (kept := unfinished.load()) is not None:
+        first, order, begun_s = kept["step"], kept["order"], begun_s - kept["cpu_s"]
+        vae.load_state_dict(kept["vae"])
+        optimiser.load_state_dict(kept["optimiser"])
+        generator.set_state(kept["generator"])
     for step in range(first, recipe.steps):
         while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
@@ -123,9 +122,10 @@ def train_vae(
         if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not total.isfinite():
             raise DivergedError(f"The encoder's loss became {total.item()} at step {step} of {recipe.steps}.")
         if unfinished is not None:
-            unfinished.save(step + 1, order)
+            made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
+            unfinished.save({"step": step + 1, "order": order, "cpu_s": time.process_time() - begun_s, **made})
         progress("training", (step + 1) / recipe.steps)
-    return 0.0 if unfinished is None else unfinished.earlier_cpu_s
+    return time.process_time() - begun_s
 
 
 def train_encoder(
@@ -161,8 +161,9 @@ def train_encoder(
     if recipe.kind == "codes":
         network = discover(data.batch(torch.arange(recipe.frames)), generator)
     else:
-        begun = None if unfinished is None else (unfinished, f"{spec.id} {appearance} {seed} {recipe}")
-        network, earlier_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, begun)
+        kept = None if unfinished is None else Unfinished(unfinished, f"{spec.id} {appearance} {seed} {recipe}")
+        network, training_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, kept)
+        earlier_s = clock["frames"] + training_s - time.process_time()
         clock |= {stage: at - earlier_s for stage, at in clock.items()}
     _round_to_half(network)
     clock["training"] = time.process_time()
@@ -212,13 +213,13 @@ def _laps(clock: dict[str, float]) -> dict[str, float]:
 
 def _trained_vae(
     recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress,
-    begun: Begun | None,
+    unfinished: Unfinished | None,
 ) -> tuple[Vae, float]:  # fmt: skip
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
     if isinstance(vae, MlpVae):
         vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
-    return vae, train_vae(vae, data, recipe, generator, progress, begun)
+    return vae, train_vae(vae, data, recipe, generator, progress, unfinished)
 
 
 @torch.no_grad()

@@ -285,9 +285,12 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch:
 
     with pytest.raises(KeyboardInterrupt):
         train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0, progress=killed, unfinished=file)
-    assert torch.load(file, weights_only=True)["step"] == 4
-    with pytest.raises(ArtefactError, match=r"cannot be gone on with \(it is of another training\); remove it to"):
+    assert torch.load(file, weights_only=True)[1]["step"] == 4
+    with pytest.raises(ArtefactError, match="is of another training; remove it or choose"):
         train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=1, unfinished=file)
+    (damaged := tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:5000])
+    with pytest.raises(ArtefactError, match=r"damaged\.pt is damaged; remove it to begin anew"):
+        train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0, unfinished=damaged)
     steps: list[float] = []
     again = train_encoder(
         arrow_spec(), recipe=recipe, appearance="mild", seed=0, unfinished=file,
