@@ -23,7 +23,9 @@ Macrostate = NDArray[np.int64]  #: the discrete state of a task, one integer a c
 State = tuple[int, ...]  #: a macrostate that can be a key. Length M.
 Floats = NDArray[np.float64]
 
-APPEARANCES = ("clean", "mild", "strong")
+APPEARANCES = ("clean", "mild", "strong", "photo")
+HELD_OUT: Mapping[str, str] = {"photo": "photo_held_out"}
+"""By each appearance of finitely many looks, that of the looks kept for tests; training has none of them."""
 EXECUTIONS = ("physics", "kinematic")
 SENSES = ("true", "nominal")
 DEVICES = ("cpu", "cuda")
@@ -210,6 +212,11 @@ class TaskSpec:
     def value_names(self, macrostate: Sequence[int] | Macrostate) -> tuple[str, ...]:
         """The names of a macrostate's values, one a coordinate. Length M."""
         return tuple(names[int(value)] for names, value in zip(self.macrostate_values, macrostate, strict=True))
+
+
+def appearance_of_tests(appearance: str) -> str:
+    """The appearance that tests have where training has ``appearance``."""
+    return HELD_OUT.get(appearance, appearance)
 
 
 def bundled_name(encoder: str, appearance: str, kind: str) -> str:

@@ -6,12 +6,16 @@ Shapes: ``S`` macrostates, ``A`` macro-actions.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, RuleFacts, Rules, State
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _SWEEPS = 10_000
 _VALUE_TOLERANCE = 1e-12
@@ -24,7 +28,7 @@ class RuleTables:
 
     index: dict[State, int]  #: macrostate to row
     starts: NDArray[np.int64]  #: rows an episode may start in, equally likely
-    alive: Floats  #: probability of going on in each next macrostate. Shape (A, S, S).
+    alive: csr_array  #: probability of going on in each next macrostate, sparse. Shape (A S, S).
     reward: Floats  #: expected reward. Shape (A, S).
     success: Floats  #: probability of ending here as a success. Shape (A, S).
 
@@ -51,9 +55,12 @@ def tabulate(rules: Rules) -> RuleTables:
     Raises:
         InvalidValueError: The outcome probabilities of some (macrostate, action) do not sum to 1.
     """
+    from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
+
     index = {state: row for row, state in enumerate(rules.states)}
     shape = (rules.n_actions, len(index))
-    alive, reward, success = np.zeros((*shape, len(index))), np.zeros(shape), np.zeros(shape)
+    reward, success = np.zeros(shape), np.zeros(shape)
+    goes_on: list[tuple[float, int, int]] = []
     for state, row in index.items():
         for action in range(rules.n_actions):
             outcomes = rules.outcomes(state, action)
@@ -64,8 +71,10 @@ def tabulate(rules: Rules) -> RuleTables:
                 reward[action, row] += outcome.probability * outcome.reward
                 success[action, row] += outcome.probability * outcome.success
                 if not outcome.terminated:
-                    alive[action, row, index[outcome.macrostate]] += outcome.probability
+                    goes_on.append((outcome.probability, action * len(index) + row, index[outcome.macrostate]))
     starts = np.array([index[state] for state in rules.start_states], dtype=np.int64)
+    shares, rows, columns = zip(*goes_on, strict=True) if goes_on else ((), (), ())
+    alive = csr_array((shares, (rows, columns)), shape=(reward.size, len(index)), dtype=np.float64)
     return RuleTables(index=index, starts=starts, alive=alive, reward=reward, success=success)
 
 
@@ -73,16 +82,20 @@ def optimal_values(tables: RuleTables) -> Floats:
     """Action values of the largest undiscounted return without a horizon, by value iteration. Shape (A, S).
 
     Raises:
-        InvalidValueError: The return of some macrostate is unbounded.
+        InvalidValueError: The return of some macrostate is unbounded; the message names one.
     """
     values = np.full(tables.reward.shape[1], tables.reward.min(initial=0.0))
     for _ in range(_SWEEPS):
-        action_values: Floats = tables.reward + tables.alive @ values  # [A, S]
+        action_values: Floats = tables.reward + (tables.alive @ values).reshape(tables.reward.shape)  # [A, S]
         best = action_values.max(axis=0)
         if np.abs(best - values).max() < _VALUE_TOLERANCE:
             return action_values
-        values = best
-    raise InvalidValueError(f"Value iteration did not settle in {_SWEEPS} sweeps: the rules allow an endless return.")
+        values, before = best, values
+    endless = list(tables.index)[int(np.abs(values - before).argmax())]
+    raise InvalidValueError(
+        f"From macrostate {endless} the rules allow an endless return: it did not settle in {_SWEEPS} sweeps of value "
+        "iteration. Let every macrostate reach an end, or reward nothing on the way round."
+    )
 
 
 def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
@@ -105,9 +118,11 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     """Evaluate a stationary policy, action probabilities (A, S), exactly; truncated after ``horizon`` >= 1 actions."""
     if horizon < 1:
         raise InvalidValueError(f"Horizon {horizon} is too short; give at least 1 action.")
-    alive = np.einsum("as,ast->st", policy, tables.alive)
+    alive = tables.alive.multiply(policy.reshape(-1, 1)).tocoo()
+    n_states = policy.shape[1]
+    alive = type(tables.alive)((alive.data, (alive.row % n_states, alive.col)), shape=(n_states, n_states))
     reward, success = (policy * tables.reward).sum(axis=0), (policy * tables.success).sum(axis=0)
-    failure = 1.0 - alive.sum(axis=1) - success
+    failure = 1.0 - np.asarray(alive.sum(axis=1)).ravel() - success
     zeros = np.zeros(alive.shape[0])
     successes, failures, returns, length = zeros, zeros, zeros, zeros
     for _ in range(horizon):

@@ -42,5 +42,5 @@ def frames_of(
     for row, macrostate in enumerate(macrostates.tolist()):
         world.place(tuple(macrostate), rng)
         world.vary(rng)
-        frames[row] = camera.frame(world.data)
+        frames[row] = world.develop(camera.frame(world.data))
     return frames

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -21,7 +23,7 @@ from .scene_reader import DRAWN_GROUPS, body_names, poses_of, shapes_of
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
-from .world import World
+from .world import World, WorldState
 
 FRAME_PX = 64
 MAX_IMAGE_PX = 4096
@@ -33,6 +35,20 @@ def human_camera_view(camera: str, width: int, height: int) -> View:
     """A view for people: everything in it, soft edges, shadows and sky."""
     quality = {"shadow_px": 2048, "samples": 4, "slices": 28}
     return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS, sky=True, **quality)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvState:
+    """A snapshot of an environment: scene, looks, randomness and the episode so far. It can be pickled."""
+
+    task: str
+    execution: str
+    world: WorldState
+    generator: Mapping[str, Any]  #: state of the generator that everything random is drawn from
+    macrostate: tuple[int, ...]
+    begun: bool
+    latest: MacroResult | None = field(repr=False)
+    people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
 
 
 class MacroEnv(gymnasium.Env[Frame, np.int64]):
@@ -48,14 +64,15 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     Episode End: terminated where the rules say so; truncation is the registered time limit.
 
-    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` (with ``fault_reason`` when
-    true), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action.
+    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty
+    where there is none), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action, ``action_mask`` (int8, (A,)).
+    All are there at every reset and step, as numpy scalars or arrays but the reason.
 
     Args:
         spec: The task.
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
-        appearance: ``"clean"``, ``"mild"`` or ``"strong"``.
+        appearance: A name in :data:`.scenes.appearance.LEVELS`.
         render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
@@ -147,7 +164,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
-        self.world.vary(self.np_random)
+        self.world.vary(self.np_random, move_objects=self._execution == "kinematic")
         reading = self.world.read()
         self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
@@ -166,6 +183,33 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         """Free the OpenGL contexts; may be called again."""
         for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
             renderer.close()
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
+        return np.ones(int(self.action_space.n), dtype=np.bool_)  # type: ignore[attr-defined]
+
+    def get_state(self) -> EnvState:
+        """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
+        return EnvState(
+            task=self._id, execution=self._execution, world=self.world.get_state(),
+            generator=copy.deepcopy(self.np_random.bit_generator.state), macrostate=self._macrostate,
+            begun=self._begun, latest=self._latest, people=self._people,
+        )  # fmt: skip
+
+    def set_state(self, state: EnvState) -> None:
+        """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
+
+        Raises:
+            InvalidValueError: A state of another task or execution, or none at all.
+        """
+        kind = (self._id, self._execution)
+        if not isinstance(state, EnvState) or (state.task, state.execution) != kind:
+            raise InvalidValueError(f"{brief(state)} is no state of {kind[0]} in {kind[1]}; give one of get_state().")
+        self.world.set_state(state.world)
+        self.np_random.bit_generator.state = copy.deepcopy(state.generator)
+        self._macrostate, self._begun, self._latest, self._people = (
+            state.macrostate, state.begun, state.latest, state.people,
+        )  # fmt: skip
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
@@ -190,7 +234,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self._agent_camera.frame(self.world.data)
+        return self.world.develop(self._agent_camera.frame(self.world.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""
@@ -296,13 +340,14 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
-            "is_success": success,
-            "success": success,
-            "legal": legal,
-            "fault": fault is not None,
-            **({} if fault is None else {"fault_reason": fault}),
-            "sim_time_s": 0.0 if latest is None else float(latest.sim_time_s),
-            "ik_error_m": 0.0 if latest is None else float(latest.ik_error_m),
+            "is_success": np.bool_(success),
+            "success": np.bool_(success),
+            "legal": np.bool_(legal),
+            "fault": np.bool_(fault is not None),
+            "fault_reason": fault or "",
+            "sim_time_s": np.float64(0.0 if latest is None else latest.sim_time_s),
+            "ik_error_m": np.float64(0.0 if latest is None else latest.ik_error_m),
+            "action_mask": self.action_masks().astype(np.int8),
         }
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import PhysicsSettings
+from imagine_bench.interfaces import Frame, PhysicsSettings
 
 from .motion import orientation
 from .motion.executor import MacroResult, at_rest
@@ -19,6 +19,7 @@ from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
+from .scenes.fragments import Photographer
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -32,6 +33,18 @@ class Reading:
 
     macrostate: tuple[int, ...]  #: the nearest macrostate
     problem: str | None  #: what keeps the scene from being a proper macrostate, in words, or None
+
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldState:
+    """A scene's dynamic state, MuJoCo's with what starts its solvers, its looks, and the planner's latest error."""
+
+    physics: NDArray[np.float64]
+    looks: tuple[NDArray[np.float64], ...]
+    sensing: Sensing
 
 
 class World(abc.ABC):
@@ -54,6 +67,7 @@ class World(abc.ABC):
         self._bodies = [model.body(body).id for body in objects]
         self._level, self._names = level, tuple(objects.values())
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
+        self._photographer = None if level.pool is None else Photographer(level)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._rest_qpos, self._rest_ctrl = at_rest(model)
@@ -74,6 +88,29 @@ class World(abc.ABC):
             model.body_inertia[self._bodies] *= settings.object_mass
             mujoco.mj_setConst(model, mujoco.MjData(model))
 
+    def get_state(self) -> WorldState:
+        """Everything in the scene that may change, copied."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, physics, _STATE)
+        looks = tuple(np.array(each) for each in self._looks())
+        return WorldState(physics=physics, looks=looks, sensing=replace(self.sensing))
+
+    def set_state(self, state: WorldState) -> None:
+        """Put the scene as it was, to the bit."""
+        mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
+        for mine, then in zip(self._looks(), state.looks, strict=True):
+            mine[:] = then
+        for name in ("aside_m", "turned_rad"):
+            setattr(self.sensing, name, getattr(state.sensing, name))
+        self.update()
+
+    def _looks(self) -> tuple[NDArray[np.float64], ...]:
+        """What :meth:`vary` writes into the model: views of it."""
+        model, headlight = self.model, self.model.vis.headlight
+        return (
+            headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat,
+        )  # fmt: skip
+
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
         mujoco.mj_resetData(self.model, self.data)
@@ -84,8 +121,15 @@ class World(abc.ABC):
         self._gesture(gesture)
         self.update()
 
-    def vary(self, rng: np.random.Generator) -> None:
-        """Draw this frame's light, colors, camera and hands as the appearance says."""
+    def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
+        """Draw this frame's light, colors, camera and hands as the appearance says.
+
+        Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
+        where physics left it lies there.
+        """
+        if self._photographer is not None:
+            self._patch(self._photographer, rng, move_objects=move_objects)
+            return
         if not self._level.varies_every_frame:
             return
         self._appearance.vary(rng)
@@ -94,6 +138,23 @@ class World(abc.ABC):
             offset_m = [self._level.hand_offset_m * each for each in wobble]
             self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
         self.update()
+
+    def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
+        (objects, _), gesture = self._objects(), self._read_gesture()
+        hand, fragments = photographer.draw(objects, gesture, rng)
+        for index, (value, fragment) in enumerate(zip(objects, fragments, strict=True)):
+            if move_objects:
+                x, y, _, yaw = fragment.offset
+                self._put(index, value, (x, y, yaw))
+        if self._hands_vary():
+            *offset, yaw = hand.offset
+            offset_m = [self._level.hand_offset_m * each for each in offset]
+            self._gesture(gesture, offset_m, self._level.hand_yaw_rad * yaw)
+        self.update()
+
+    def develop(self, frame: Frame) -> Frame:
+        """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
+        return frame if self._photographer is None else self._photographer.develop(frame)
 
     @abc.abstractmethod
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:

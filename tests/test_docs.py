@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shlex
@@ -113,6 +114,18 @@ def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:
     assert not [row["element"] for row in compared if not (row["tests"] and (row["page"] or row["here"]))]
     assert ["memory" in row["element"] for row in rows if row["verdict"] == "missing"] == [True]
     assert thesis_elements.PAGE.read_text() == thesis_elements.page(), "python tests/thesis_elements.py"
+
+
+def test_planted_bugs_are_noticed_or_have_a_reason() -> None:
+    with (ROOT / "docs" / "results" / "mutants" / "mutants.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    reasons = [row["why"] for row in rows if row["result"] == "passed"]
+    assert all(reasons) and len(reasons) <= 0.08 * len(rows)
+    said = (
+        f"plants {len(rows)} small bugs and",
+        f": {len(rows) - len(reasons)}, and each of the other {len(reasons)} has",
+    )
+    assert all(words in (ROOT / "CONTRIBUTING.md").read_text() for words in said)
 
 
 def test_kept_numbers_are_what_every_json_reader_can_read() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from imagine_bench.errors import require_known
-from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
+from imagine_bench.interfaces import APPEARANCES, TaskSpec, appearance_of_tests, bundled_name
 from imagine_bench.seeding import SeedTree
 
 from .encoder import Encoder, EncoderCard, bundled_encoder, refuse_existing
@@ -20,11 +21,14 @@ from .recipes import Recipe, recipe_named
 from .training import draw_frames, train_encoder
 
 
-def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path) -> str:
+def retrain(
+    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None
+) -> str:
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
-    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own.
+    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps`` replaces its
+    number of gradient steps. A training that was killed goes on from ``.<name>.unfinished.pt`` in ``out``.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
@@ -33,19 +37,24 @@ def retrain(spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int,
         InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
+    recipe = recipe if steps is None else replace(recipe, steps=steps)
     name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
     path = out / f"{name}.safetensors"
     refuse_existing(path)
+    unfinished = path.with_name(f".{name}.unfinished.pt")
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
         show = partial(_show, bar)
-        encoder = train_encoder(spec, recipe=recipe, appearance=appearance, seed=seed, progress=show)
+        encoder = train_encoder(
+            spec, recipe=recipe, appearance=appearance, seed=seed, progress=show, unfinished=unfinished
+        )
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
-    frames, macrostates = draw_frames(spec, appearance, COLUMNS, seeds.generator())
+    frames, macrostates = draw_frames(spec, appearance_of_tests(appearance), COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())
     sheet = sample_sheet(encoder, spec, frames, macrostates, noise)
     picture = io.BytesIO()
     sheet.save(picture, format="png")
     encoder.save(path, picture.getvalue())
+    unfinished.unlink(missing_ok=True)
     bundled = bundled_encoder(name)
     other = bundled.is_file() and bundled.resolve() != path.resolve()
     return f"Wrote {path}.\n{compare(encoder.card, Encoder.load(bundled).card if other else None)}"

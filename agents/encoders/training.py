@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.errors import DivergedError, require_known
-from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec
+from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.seeding import SeedTree
 
@@ -28,13 +29,15 @@ from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
 from .network import EncoderNetwork
 from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
-from .recipes import Recipe, recipe_named
+from .recipes import RECIPES, Recipe, recipe_named
+from .unfinished import Unfinished
 from .vae import MlpVae, Vae
 
 Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
 
 _CHUNK = 500  # frames rendered at once, to bound memory
+_PART = 250  # images whose gradients are added up: 2000 at once take twice as long, out of the processor's caches
 _CHECK_EVERY = 50  # steps between checks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
@@ -86,41 +89,61 @@ def learning_rate_at(recipe: Recipe, step: int) -> float:
     return recipe.learning_rate * min(1.0, (done + 1e-3) / _RISE) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
-def train_vae(vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress) -> None:
-    """Minimise the beta-VAE loss with Adam, in place.
+def train_vae(
+    vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress,
+    unfinished: Unfinished | None = None,
+) -> float:  # fmt: skip
+    """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds of it, earlier processes' included.
 
     Raises:
         DivergedError: The loss is not finite any more; the message names the step.
+        ArtefactError: What is unfinished is damaged or another training.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
-    n, order = len(data.images), torch.empty(0, dtype=torch.int64)
-    for step in range(recipe.steps):
+    n, first, order, begun_s = len(data.images), 0, torch.empty(0, dtype=torch.int64), time.process_time()
+    if unfinished is not None and (kept := unfinished.load()) is not None:
+        first, order, begun_s = kept["step"], kept["order"], begun_s - kept["cpu_s"]
+        vae.load_state_dict(kept["vae"])
+        optimiser.load_state_dict(kept["optimiser"])
+        generator.set_state(kept["generator"])
+    for step in range(first, recipe.steps):
         while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
         rows, order = order[: recipe.batch], order[recipe.batch :]
         noise = torch.randn((len(rows), vae.latent_size), generator=generator)
-        elbo = vae.elbo(data.batch(rows), noise, beta_at(recipe, step))
         optimiser.param_groups[0]["lr"] = learning_rate_at(recipe, step)
         optimiser.zero_grad()
-        elbo.loss.backward()
+        total = torch.zeros(())
+        for part, its_noise in zip(rows.split(_PART), noise.split(_PART), strict=True):
+            loss = vae.elbo(data.batch(part), its_noise, beta_at(recipe, step)).loss * (len(part) / len(rows))
+            loss.backward()
+            total += loss.detach()
         optimiser.step()
-        if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not elbo.loss.isfinite():
-            raise DivergedError(f"The encoder's loss became {elbo.loss.item()} at step {step} of {recipe.steps}.")
+        if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not total.isfinite():
+            raise DivergedError(f"The encoder's loss became {total.item()} at step {step} of {recipe.steps}.")
+        if unfinished is not None:
+            made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
+            unfinished.save({"step": step + 1, "order": order, "cpu_s": time.process_time() - begun_s, **made})
         progress("training", (step + 1) / recipe.steps)
+    return time.process_time() - begun_s
 
 
 def train_encoder(
-    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, progress: Progress | None = None
-) -> Encoder:
+    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, progress: Progress | None = None,
+    unfinished: Path | None = None,
+) -> Encoder:  # fmt: skip
     """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
 
     A recipe is a name among the task's ``RECIPES``, or settings of one's own. ``seed`` is the root of the seed tree:
-    training frames come from its ``encoder_training`` branch and held-out ones from its ``encoder_probe`` branch.
+    training frames come from its ``encoder_training`` branch and held-out ones from its ``encoder_probe`` branch, of
+    looks kept for tests where the appearance has such. ``unfinished`` is a file in which a VAE's training is kept once
+    a minute and from which one that was killed goes on; when all is done it is removed.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
         DivergedError: The loss became NaN or infinite.
         InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
+        ArtefactError: The unfinished training is damaged or another one.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     require_known("appearance", appearance, APPEARANCES)
@@ -130,14 +153,18 @@ def train_encoder(
     train_seeds, probe_seeds = (seeds.child(use, spec.id, appearance) for use in ("encoder_training", "encoder_probe"))
     clock = {"": time.process_time()}
     data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress)
-    held_out = frame_set(spec, appearance, recipe.held_out_frames, probe_seeds.generator(), progress)
+    unseen = appearance_of_tests(appearance)
+    held_out = frame_set(spec, unseen, recipe.held_out_frames, probe_seeds.generator(), progress)
     clock["frames"] = time.process_time()
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
     network: EncoderNetwork
     if recipe.kind == "codes":
         network = discover(data.batch(torch.arange(recipe.frames)), generator)
     else:
-        network = _trained_vae(recipe, spec.preprocessing, data, generator, progress)
+        kept = None if unfinished is None else Unfinished(unfinished, f"{spec.id} {appearance} {seed} {recipe}")
+        network, training_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, kept)
+        earlier_s = clock["frames"] + training_s - time.process_time()
+        clock |= {stage: at - earlier_s for stage, at in clock.items()}
     _round_to_half(network)
     clock["training"] = time.process_time()
     cardinalities = tuple(len(values) for values in spec.macrostate_values)
@@ -165,11 +192,17 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
         cardinalities=tuple(len(values) for values in spec.macrostate_values),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
-        f"--recipe {recipe.name} --seed {seed}",
+        f"--recipe {recipe.name} --seed {seed}{_shorter(spec, recipe)}",
         data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
         versions={name: version(name) for name in _LIBRARIES},
         **measured,
     )
+
+
+def _shorter(spec: TaskSpec, recipe: Recipe) -> str:
+    """The option of the command that changed a recipe's number of gradient steps, if that was so."""
+    named = RECIPES[spec.config_group].get(recipe.name, recipe)
+    return "" if named.steps == recipe.steps else f" --steps {recipe.steps}"
 
 
 def _laps(clock: dict[str, float]) -> dict[str, float]:
@@ -179,14 +212,14 @@ def _laps(clock: dict[str, float]) -> dict[str, float]:
 
 
 def _trained_vae(
-    recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress
-) -> Vae:
+    recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress,
+    unfinished: Unfinished | None,
+) -> tuple[Vae, float]:  # fmt: skip
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
     if isinstance(vae, MlpVae):
         vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
-    train_vae(vae, data, recipe, generator, progress)
-    return vae
+    return vae, train_vae(vae, data, recipe, generator, progress, unfinished)
 
 
 @torch.no_grad()

@@ -108,6 +108,6 @@ def test(run: Run) -> EvaluationCounts:
         counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
     purpose, privileged = evaluation_split(run.spec.seed), run.entry.privileged
     while counters.test.episodes < run.protocol.evaluation_episodes:
-        play_test_episode(counters.test, run.env, run.agent, privileged=privileged, purpose=purpose)
+        play_test_episode(counters.test, run.test_env, run.agent, privileged=privileged, purpose=purpose)
         run.made_progress("testing")
     return counters.test

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,25 @@ _RECENT = 100
 _REPORT_EVERY_S = 0.25
 
 
-def make_env(protocol: Protocol, task: str) -> Env:
-    """The environment of a task as a protocol has it."""
+def make_env(protocol: Protocol, task: str, *, testing: bool = False) -> Env:
+    """The environment of a task as a protocol has it, for training or for tests."""
     return gymnasium.make(
         registry.task_entry(task).env_id,
         execution=protocol.execution,
-        appearance=protocol.appearance,
+        appearance=protocol.test_appearance if testing else protocol.appearance,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
+
+
+@contextmanager
+def environments(protocol: Protocol) -> Iterator[tuple[Env, Env]]:
+    """The environments of training and of tests; one and the same unless tests have looks of their own."""
+    with closing(make_env(protocol, protocol.task)) as env:
+        if protocol.test_appearance == protocol.appearance:
+            yield env, env
+            return
+        with closing(make_env(protocol, protocol.task, testing=True)) as test_env:
+            yield env, test_env
 
 
 class Run:
@@ -46,8 +57,9 @@ class Run:
         InvalidValueError: The agent cannot do what the protocol asks of it.
     """
 
-    def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env) -> None:
-        self.spec, self.protocol, self.folder, self.env = spec, spec.protocol, folder, env
+    def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:
+        self.spec, self.protocol, self.folder = spec, spec.protocol, folder
+        self.env, self.test_env = env, test_env
         self.task, self.entry = registry.task(spec.protocol.task), registry.agent_entry(spec.agent)
         self._require_its_encoder()
         self.agent: Agent = registry.make_agent(spec.agent, spec.context())

@@ -9,12 +9,11 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import TypedDict
 
 from imagine_bench.bench import phases
-from imagine_bench.bench.run_state import Run, make_env
+from imagine_bench.bench.run_state import Run, environments
 from imagine_bench.capabilities import ExternalTrainer
 from imagine_bench.errors import DivergedError
 from imagine_bench.protocols.control import Protocol
@@ -64,8 +63,8 @@ def run(
     make_folder(folder)
     with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):  # a killed parent's child may be dying
         if not run_folder.is_done(folder):
-            with closing(make_env(spec.protocol, spec.protocol.task)) as env:
-                _go_on(Run(spec, folder, on_progress, env), observers)
+            with environments(spec.protocol) as (env, test_env):
+                _go_on(Run(spec, folder, on_progress, env, test_env), observers)
     return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 

@@ -46,7 +46,7 @@ class Bench:
     execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
-    """How much light, colors and poses vary: clean, mild or strong."""
+    """How much light, colors and poses vary: clean, mild, strong, or photo (a finite pool)."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR")] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
     networks: Annotated[int | None, shown("INT")] = None

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, only
+from imagine_bench.cli.options import ANY, NEWEST, only, shown
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
@@ -51,6 +51,8 @@ class Encoder:
     for agents that read factors and their values."""
     seed: int = 0
     """Seed of data and training."""
+    steps: Annotated[int | None, shown("INT", "(default: the recipe's)")] = None
+    """Gradient steps, at least 1."""
     out: Path = Path("encoders")
     """Folder for artefact, card and figure; never overwritten."""
 
@@ -59,7 +61,8 @@ class Encoder:
         retrain = registry.load(_RETRAIN)
         spec = registry.task(self.task)
         require_writable(self.out)
-        print(retrain(spec, recipe=self.recipe, appearance=self.appearance, seed=self.seed, out=self.out))
+        choices = {"recipe": self.recipe, "appearance": self.appearance, "steps": self.steps}
+        print(retrain(spec, **choices, seed=self.seed, out=self.out))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, appearance_of_tests
 from imagine_bench.protocols.data import MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 
@@ -35,7 +35,7 @@ class Protocol(ProtocolData):
     budgets: tuple[int, ...] = (100, 250, 500)
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
-    appearance: str = "clean"  #: ``"clean"``, ``"mild"`` or ``"strong"``
+    appearance: str = "clean"  #: One of :data:`imagine_bench.interfaces.APPEARANCES`
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
     #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
@@ -81,6 +81,11 @@ class Protocol(ProtocolData):
         budgets = [budget for budget in self.budgets if until is None or budget <= until]
         tests = self.evaluation_episodes
         return self.episodes_before + budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+
+    @property
+    def test_appearance(self) -> str:
+        """The appearance that tests have."""
+        return appearance_of_tests(self.appearance)
 
     @property
     def episodes_before(self) -> int:

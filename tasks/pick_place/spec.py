@@ -81,7 +81,7 @@ SPEC = TaskSpec(
         error_mm=5.0,
         physics_per_cpu_s=60,
         kinematic_per_cpu_s=5_000,
-        encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98},
+        encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98, "photo": 0.995},
     ),
     presets=_PRESETS,
     success_threshold=0.98,

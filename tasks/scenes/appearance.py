@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import require_known
+from imagine_bench.interfaces import HELD_OUT
 
 _CHANNELS = 3
 
@@ -27,6 +28,10 @@ class Appearance:
     color_fraction: float = 0.0  #: of each color channel of each material, every frame
     camera_offset_m: float = 0.0  #: of the agent's camera, along each axis, every frame
     camera_angle_rad: float = 0.0  #: of the agent's camera, about each axis, every frame
+    #: None, or the seed of the finite pools of :mod:`.fragments`, which then decide poses, light and colors
+    pool: int | None = None
+    gamma_half_width: float = 0.0  #: of gamma about 1, every frame; with a pool only
+    noise_std: float = 0.0  #: of the sensor's Gaussian noise, of full scale, every frame; with a pool only
 
     @property
     def varies_every_frame(self) -> bool:
@@ -34,6 +39,19 @@ class Appearance:
         hand, camera = (self.hand_offset_m, self.hand_yaw_rad), (self.camera_offset_m, self.camera_angle_rad)
         return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.color_fraction))
 
+
+_PHOTO = Appearance(
+    name="photo",
+    object_offset_m=0.005,
+    object_yaw_rad=math.radians(4.6),
+    hand_offset_m=0.006,
+    hand_yaw_rad=math.radians(8.0),
+    light_fraction=0.15,
+    color_fraction=0.04,
+    pool=521,
+    gamma_half_width=0.5,
+    noise_std=0.015,
+)
 
 LEVELS: dict[str, Appearance] = {
     level.name: level
@@ -58,6 +76,8 @@ LEVELS: dict[str, Appearance] = {
             camera_offset_m=0.003,
             camera_angle_rad=math.radians(0.5),
         ),
+        _PHOTO,
+        replace(_PHOTO, name=HELD_OUT["photo"]),
     )
 }
 

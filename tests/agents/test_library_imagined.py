@@ -127,11 +127,11 @@ def test_imagined_episodes_follow_real_ones_once_they_may(monkeypatch: pytest.Mo
     overrides = {"imagination.start_episode": 2, "imagination.depth": 3}
     learner = imagination_agents.make_uncertainty(context(monkeypatch, overrides))
     env = MixedExperience(Ring(), learner, count=3, seed=1)
-    env.reset(seed=0)
+    start, _ = env.reset(seed=0)
     rng, kinds, real = np.random.default_rng(0), "", 0
     states = {tuple(row) for row in CODES[:6].tolist()}
     for _ in range(14):
-        over, length = False, 0
+        over, length, before = False, 0, start
         while not over:
             action = int(rng.integers(ACTIONS))
             seen, reward, terminated, truncated, info = env.step(action)
@@ -140,7 +140,9 @@ def test_imagined_episodes_follow_real_ones_once_they_may(monkeypatch: pytest.Mo
                 real += 1
                 rows = learner.real.arrays()
                 assert tuple(seen.tolist()) in states and np.array_equal(rows["next_mu"][-1], seen)
+                assert np.array_equal(rows["mu"][-1], before)
                 assert (rows["action"][-1], rows["reward"][-1], rows["terminated"][-1]) == (action, reward, 0.0)
+            before = seen
         kinds += "i" if info["imagined"] else "r"
         assert length == 2 if kinds[-1] == "r" else length <= 3
         start, _ = env.reset()

@@ -28,7 +28,15 @@ def test_success_thresholds_lie_between_chance_and_optimum(name):
     assert facts.chance_level < 0.5 < success_threshold <= facts.optimum
 
 
-@pytest.mark.parametrize("appearance", APPEARANCES)
+@pytest.mark.parametrize("name", TASKS)
+def test_photo_has_latents_and_says_that_it_has_no_codes(name):
+    wanted, paths = plan_control(name, "quick", appearance="photo", agents=("dqn",))
+    assert set(paths) == {"latents"} and "-photo@" in wanted.encoder
+    with pytest.raises(ArtefactError, match=r"No encoder '.*-photo-codes' is bundled; train one"):
+        plan_control(name, "quick", appearance="photo")
+
+
+@pytest.mark.parametrize("appearance", [name for name in APPEARANCES if name != "photo"])
 @pytest.mark.parametrize("name", TASKS)
 def test_quick_finds_encoders_at_every_appearance(name, appearance):
     wanted, paths = plan_control(name, "quick", appearance=appearance)

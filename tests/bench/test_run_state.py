@@ -38,7 +38,7 @@ def test_progress_counts_all_that_was_played() -> None:
     run.spec, run._reported_s, run._on_progress = RunSpec(protocol=small(), agent="table", seed=0), 0.0, told.append
 
     def tell(*, at_once: bool = True) -> tuple[int, float | None]:
-        run.tell("training", at_once=at_once)
+        run.tell("training", at_once=True) if at_once else run.tell("training")
         return told[-1].done, told[-1].success
 
     assert tell(at_once=False) == (123, 0.4) and told[0].episode == 110

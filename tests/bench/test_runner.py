@@ -16,6 +16,7 @@ import bench_fakes
 import gymnasium
 import numpy as np
 import pytest
+from imagine_bench.tasks.macro_env import MacroEnv
 from small_runs import context, do, final_arrays, same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
@@ -44,6 +45,23 @@ def test_a_tuning_run_is_shown_tuning_starts_alone(
         )
     do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
     assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("open_loop_starts", purpose)}
+
+
+def test_tests_have_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reset, seen, shown = MacroEnv.reset, set(), set()
+
+    def noted(env: MacroEnv, *, seed: int, options: Any = None) -> Any:
+        seen.add((seed >> 56, env.world._level.name))
+        return reset(env, seed=seed, options=options)
+
+    monkeypatch.setattr(MacroEnv, "reset", noted)
+    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
+        real = getattr(observers, name)
+        monkeypatch.setattr(observers, name, lambda *a, real=real, **k: shown.add(k["appearance"]) or real(*a, **k))
+    do(tmp_path / "run", "imaginer", 0, agents=("imaginer",), open_loop_starts=2, appearance="photo")
+    training, evaluation = (episode_seed(purpose, 0, 0) >> 56 for purpose in ("training", "evaluation"))
+    assert seen == {(training, "photo"), (evaluation, "photo_held_out")}
+    assert shown == {"photo_held_out"}
 
 
 def test_a_run_counts_what_happens(tmp_path: Path) -> None:

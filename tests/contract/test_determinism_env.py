@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -15,6 +16,7 @@ from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 
 SHADE = 16
@@ -177,3 +179,31 @@ def test_frames_of_macrostates_depend_on_the_generator_alone():
     assert np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(4)))
     assert not np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(6)))
     assert spec.render_macrostates(macrostates[:0], "clean", np.random.default_rng(4)).shape == (0, 64, 64, 3)
+
+
+@pytest.mark.parametrize("task", WORLDS)
+@pytest.mark.parametrize("execution", EXECUTIONS)
+def test_a_state_goes_on_to_the_same_bits(task, execution):
+    """In the middle of an episode, after something else was done, and in another environment."""
+    options = {"execution": execution, "appearance": "strong", "physics": {"plan_error_mm": 1.0, "plan_error_deg": 1.0}}
+    env, other = make(task, **options), make(task, **options)
+    env.reset(seed=3)
+    other.reset(seed=4)
+    env.step(1)
+    actions = (0, 2, 1) if execution == "physics" else (0, 2, 1, 3, 0)
+    state = pickle.loads(pickle.dumps(env.get_state()))
+    expected = [env.agent_view(), *(env.step(action) for action in actions), env.reset()]
+    for each in (env, other):
+        each.step(3)
+        each.set_state(state)
+        found = [each.agent_view(), *(each.step(action) for action in actions), each.reset()]
+        assert np.array_equal(found[0], expected[0])
+        for (frame, *rest), (wanted, *told) in zip(found[1:], expected[1:], strict=True):
+            assert np.array_equal(frame, wanted)
+            assert all(np.array_equal(a, b) for a, b in zip(rest[-1].values(), told[-1].values(), strict=True))
+            assert rest[:-1] == told[:-1]
+    assert np.array_equal(env.data.qpos, other.data.qpos)
+    with pytest.raises(InvalidValueError, match="is no state of"):
+        env.set_state(None)
+    env.close()
+    other.close()

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Outcome, RuleFacts, TaskSpec
 
-JITTER = {"clean": 0.1, "mild": 1.0, "strong": 2.0}  # pixels; turns and light scale with it
+JITTER = {"clean": 0.1, "mild": 1.0, "strong": 2.0, "photo": 1.0, "photo_held_out": 1.0}
+"""Pixels; turns and light scale with it."""
 _YX = np.mgrid[0:64, 0:64].astype(np.float32)
 
 

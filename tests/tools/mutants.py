@@ -230,7 +230,8 @@ def reported(tried: list[dict[str, Any]], seed: int, least: float) -> int:
     print(f"{noticed} of {len(tried)} small bugs are noticed, {noticed / len(tried):.1%}; wanted are {least:.0%}")
     print(f"{reasoned} of the other {len(tried) - noticed} may live, by {REASONS.name}")
     with (ROOT / "build" / "mutants.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, ("room", "file", "line", "operator", "change", "result", "seconds", "why"))
+        names = ("room", "file", "line", "operator", "change", "result", "seconds", "why")
+        table = csv.DictWriter(file, names, lineterminator="\n")
         table.writeheader()
         table.writerows(tried)
     counts = {"seed": seed, "count": len(tried), "noticed": noticed, "reasoned": reasoned}

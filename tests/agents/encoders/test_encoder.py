@@ -13,6 +13,7 @@ import pytest
 import torch
 from encoder_frames import arrow_spec
 from imagine_bench.agents.encoders import training as encoder_training
+from imagine_bench.agents.encoders import unfinished
 from imagine_bench.agents.encoders.cli import compare, retrain
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard, empty_vae, view
 from imagine_bench.agents.encoders.probe import Latents, Probe, accuracy, train_probe
@@ -273,6 +274,52 @@ def test_training_and_held_out_frames_differ(monkeypatch: pytest.MonkeyPatch) ->
     assert not any(torch.equal(a, b) for a in first for b in second)
 
 
+def test_a_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unfinished, "_SAVE_EVERY_S", 0.0)
+    recipe, file = replace(TINY_CONV, steps=7), tmp_path / "unfinished.pt"
+    whole = train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0)
+
+    def killed(stage: str, done: float) -> None:
+        if stage == "training" and done > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0, progress=killed, unfinished=file)
+    assert torch.load(file, weights_only=True)[1]["step"] == 4
+    with pytest.raises(ArtefactError, match="is of another training; remove it or choose"):
+        train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=1, unfinished=file)
+    (damaged := tmp_path / "damaged.pt").write_bytes(file.read_bytes()[:5000])
+    with pytest.raises(ArtefactError, match=r"damaged\.pt is damaged; remove it to begin anew"):
+        train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0, unfinished=damaged)
+    steps: list[float] = []
+    again = train_encoder(
+        arrow_spec(), recipe=recipe, appearance="mild", seed=0, unfinished=file,
+        progress=lambda stage, done: steps.append(done) if stage == "training" else None,
+    )  # fmt: skip
+    assert len(steps) == 3
+    for one, other in ((whole.network, again.network), (whole.probe, again.probe)):
+        assert all(torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+    assert replace(again.card, cpu_s={}) == replace(whole.card, cpu_s={})
+
+
+def test_gradients_of_parts_add_up_to_the_batch_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = replace(TINY_CONV, steps=1, frames=16)
+    weights = []
+    for part in (8, 3):
+        monkeypatch.setattr(encoder_training, "_PART", part)
+        network = train_encoder(arrow_spec(), recipe=recipe, appearance="mild", seed=0).network
+        weights.append(torch.cat([each.flatten() for each in network.parameters()]))
+    assert torch.allclose(*weights, atol=2e-4)
+    assert not torch.equal(*weights)
+
+
+def test_probes_read_looks_that_training_never_saw(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw, asked = encoder_training.frame_set, []
+    monkeypatch.setattr(encoder_training, "frame_set", lambda spec, *how: (asked.append(how[0]), draw(spec, *how))[1])
+    card = train_encoder(arrow_spec(), recipe=TINY_CONV, appearance="photo", seed=0).card
+    assert (asked, card.appearance) == (["photo", "photo_held_out"], "photo")
+
+
 def test_divergence_stops_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(encoder_training, "beta_at", lambda recipe, step: math.nan)
     with pytest.raises(DivergedError, match="The encoder's loss became nan at step 0 of 40"):
@@ -441,6 +488,15 @@ def test_retrain_names_wrong_choices_before_working(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="Known: clean, mild, strong"):
         retrain(arrow_spec(), recipe=TINY, appearance="x", seed=0, out=tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_retrain_with_fewer_steps_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unfinished, "_SAVE_EVERY_S", 0.0)
+    monkeypatch.setitem(CHAPTER_5, "tiny_conv", TINY_CONV)
+    retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path, steps=1)
+    card = Encoder.load(tmp_path / "drawn_arrows-mild.safetensors").card
+    assert card.recipe.steps == 1 and card.command.endswith("--recipe tiny_conv --seed 1 --steps 1")
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_comparison_shows_both_cards(tiny: Encoder) -> None:

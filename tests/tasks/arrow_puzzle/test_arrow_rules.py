@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import dataclass
 
@@ -206,5 +207,27 @@ class _Endless(_Gamble):
 
 
 def test_an_endless_return_is_refused():
-    with pytest.raises(InvalidValueError, match="the rules allow an endless return"):
+    with pytest.raises(InvalidValueError, match=r"From macrostate \(\d+,\) the rules allow an endless return"):
         facts(_Endless(), 2)
+
+
+class _Dials:
+    """Six dials of five digits, each turned one digit forth or back; all must show 0: 15,625 macrostates."""
+
+    n_actions = 12
+    states = tuple(itertools.product(range(5), repeat=6))
+    start_states = states[1:]
+
+    def outcomes(self, macrostate, action):
+        dial, way = divmod(action, 2)
+        after = tuple((digit + (1, 4)[way]) % 5 if index == dial else digit for index, digit in enumerate(macrostate))
+        done = not any(after)
+        return (Outcome(1.0, after, 10.0 if done else -1.0, terminated=done, success=done),)
+
+
+def test_a_large_machine_has_exact_facts_too():
+    """A table of every pair of macrostates would take 23 GB."""
+    found = facts(_Dials(), 30)
+    turns = [sum(min(digit, 5 - digit) for digit in state) for state in _Dials.start_states]
+    assert found.mean_plan_length == pytest.approx(np.mean(turns)) and found.optimum == 1.0
+    assert found.optimal_return == pytest.approx(11.0 - np.mean(turns))

@@ -1,0 +1,43 @@
+"""The training of an encoder as far as it has come, so that one that was killed goes on with the same bits."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from imagine_bench.errors import ArtefactError
+
+_SAVE_EVERY_S = 60.0
+
+
+class Unfinished:
+    """A file of a few MB at ``path`` that keeps a training; ``what`` are words that only this training has."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        self._path, self._what, self._saved_s = path, what, time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """What was kept, or None. Raises ArtefactError: damaged or of another training; the file is left untouched."""
+        if not self._path.exists():
+            return None
+        try:
+            what, kept = torch.load(self._path, weights_only=True)
+        except Exception as error:  # a damaged file can be wrong in any way
+            raise ArtefactError(f"{self._path} is damaged; remove it to begin anew.") from error
+        if what != self._what:
+            raise ArtefactError(f"{self._path} is of another training; remove it or choose another folder.")
+        return dict(kept)
+
+    def save(self, kept: dict[str, Any]) -> None:
+        """Keep numbers and tensors, whole or not at all; nothing within a minute of the last time."""
+        if time.monotonic() - self._saved_s < _SAVE_EVERY_S:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        partial = self._path.with_name(f"{self._path.name}.partial")
+        torch.save((self._what, kept), partial)
+        os.replace(partial, self._path)
+        self._saved_s = time.monotonic()

@@ -1,0 +1,91 @@
+"""Frames as the thesis made them (5.2.1): a finite pool of fragments for each microstate, patched together.
+
+The microstates are the direction of one cube's arrow (in general: where one object is) and what the hand points at. A
+fragment fixes how its subject lies and the light of its photograph. A frame is a row of the hand's fragment above one
+column for each object, so that light changes at their seams; then the sensor's noise and gamma change the whole.
+Not the thesis': the seed, the widths in :data:`.appearance.LEVELS`, and fragments kept for tests.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame
+from imagine_bench.seeding import SeedTree
+
+from .appearance import Appearance
+
+HAND_FRAGMENTS, OBJECT_FRAGMENTS = 50, 16
+"""Of each microstate, in training; as many others are held out."""
+HAND_SHARE = 34 / 64
+"""Of the rows of a frame, from its top: an object's fragment never covers the fingertip."""
+_WHITE = 255.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fragment:
+    """One photograph of one microstate."""
+
+    offset: tuple[float, float, float, float]  #: shares in [-1, 1] of the level's offsets x, y, z and of its yaw
+    light: NDArray[np.float64]  #: brightness at the patch's corners, by row, column and channel. Shape (2, 2, 3).
+
+
+@functools.cache
+def fragments(level: Appearance, subject: str, value: int) -> tuple[Fragment, ...]:
+    """The pool of a microstate: subject ``"hand"`` or ``"object 0"`` and on, at one of its values."""
+    rng = SeedTree(level.pool or 0).child(level.name, subject, value).generator()
+    pool = []
+    for _ in range(HAND_FRAGMENTS if subject == "hand" else OBJECT_FRAGMENTS):
+        x, y, z, yaw = rng.uniform(-1.0, 1.0, 4).tolist()
+        light = 1.0 + level.light_fraction * rng.uniform(-1.0, 1.0, (2, 2, 1))
+        light = light * (1.0 + level.color_fraction * rng.uniform(-1.0, 1.0, 3))
+        pool.append(Fragment(offset=(x, y, z, yaw), light=light))
+    return tuple(pool)
+
+
+class Photographer:
+    """Draws the fragments of each frame, and makes a rendered frame a photograph of them."""
+
+    def __init__(self, level: Appearance) -> None:
+        self._level = level
+        self._hand, self._objects = fragments(level, "hand", 0)[0], (fragments(level, "object 0", 0)[0],)
+        self._gamma, self._noise_seed = 1.0, 0
+
+    def draw(
+        self, objects: tuple[int, ...], gesture: int, rng: np.random.Generator
+    ) -> tuple[Fragment, tuple[Fragment, ...]]:
+        """New fragments of the hand and of each object, uniformly from their pools; gamma and noise with them."""
+        self._hand = fragments(self._level, "hand", gesture)[int(rng.integers(HAND_FRAGMENTS))]
+        chosen = rng.integers(OBJECT_FRAGMENTS, size=len(objects)).tolist()
+        self._objects = tuple(
+            fragments(self._level, f"object {index}", value)[which]
+            for index, (value, which) in enumerate(zip(objects, chosen, strict=True))
+        )
+        self._gamma = 1.0 + self._level.gamma_half_width * rng.uniform(-1.0, 1.0)
+        self._noise_seed = int(rng.integers(1 << 63))
+        return self._hand, self._objects
+
+    def develop(self, frame: Frame) -> Frame:
+        """The photograph of a rendered frame (H, W, 3): the same one until the next draw."""
+        height, width, channels = frame.shape
+        light = np.empty((height, width, channels))
+        top, seams = round(height * HAND_SHARE), np.linspace(0, width, len(self._objects) + 1).round().astype(int)
+        light[:top] = _spread(self._hand.light, top, width)
+        for left, right, fragment in zip(seams[:-1], seams[1:], self._objects, strict=True):
+            light[top:, left:right] = _spread(fragment.light, height - top, right - left)
+        generator = np.random.default_rng(self._noise_seed)
+        noise = generator.standard_normal(frame.shape)
+        seen = np.clip(frame / _WHITE * light + self._level.noise_std * noise, 0.0, 1.0)
+        return np.rint(_WHITE * seen**self._gamma).astype(np.uint8)
+
+
+def _spread(corners: NDArray[np.float64], height: int, width: int) -> NDArray[np.float64]:
+    """Corners (2, 2, C) interpolated bilinearly over a patch. Shape (height, width, C)."""
+    shares = (np.linspace(0.0, 1.0, pixels) for pixels in (height, width))
+    down, across = (np.stack([1.0 - share, share], axis=1) for share in shares)
+    sides = (down @ corners.reshape(2, -1)).reshape(height, 2, -1)  # [H, 2, C]
+    return across @ sides  # [H, W, C]

@@ -1,0 +1,136 @@
+"""Frames patched of fragments: finite pools, others in tests, gamma and noise, and the rules as everywhere."""
+
+from __future__ import annotations
+
+import itertools
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+from imagine_bench.tasks.scenes.appearance import appearance
+from imagine_bench.tasks.scenes.fragments import Photographer, fragments
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.interfaces import HELD_OUT
+
+PHOTO, HELD = appearance("photo"), appearance(HELD_OUT["photo"])
+STATE = (2, 0, 1, 1)
+TOP = 34
+
+
+def drawn_poses(level, draws):
+    """Poses of cubes (draws, 3, 7) and hand (draws, 7) of frames of one macrostate."""
+    world, rng, cubes, hands = ArrowWorld(level), np.random.default_rng(0), [], []
+    for _ in range(draws):
+        world.place(STATE, rng)
+        world.vary(rng)
+        cubes.append(world.object_poses())
+        hands.append(np.concatenate([world.data.mocap_pos[0], world.data.mocap_quat[0]]))
+        assert world.read().macrostate == STATE
+    return np.array(cubes), np.array(hands)
+
+
+def test_pools_hold_fifty_hands_and_sixteen_arrows():
+    """Of each microstate, as in the thesis; training never meets one that is held out."""
+    poses = {level.name: drawn_poses(level, 600) for level in (PHOTO, HELD)}
+    for cubes, hands in poses.values():
+        assert len(np.unique(hands, axis=0)) == 50
+        assert [len(np.unique(cubes[:, cube], axis=0)) for cube in range(3)] == [16, 16, 16]
+    (cubes, hands), (other_cubes, other_hands) = poses.values()
+    for seen, held in [(hands, other_hands), *zip(cubes.swapaxes(0, 1), other_cubes.swapaxes(0, 1), strict=True)]:
+        assert not {tuple(pose) for pose in seen} & {tuple(pose) for pose in held}
+
+
+def test_every_microstate_has_a_pool_of_its_own():
+    looks = [fragments(PHOTO, f"object {cube}", value) for cube in range(3) for value in range(4)]
+    looks += [fragments(PHOTO, "hand", value) for value in range(3)]
+    assert [len(pool) for pool in looks] == [16] * 12 + [50] * 3
+    assert len({look.offset for pool in looks for look in pool}) == 12 * 16 + 3 * 50
+
+
+def developed(level, photographer_seed, frame):
+    photographer = Photographer(level)
+    photographer.draw((0, 1, 2), 0, np.random.default_rng(photographer_seed))
+    return photographer.develop(frame)
+
+
+def test_gamma_covers_a_half_to_one_and_a_half():
+    """Measured from a flat gray frame without light of its own or noise."""
+    plain = appearance("photo").__class__(
+        name="plain", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, gamma_half_width=PHOTO.gamma_half_width
+    )
+    flat, gamma = np.full((64, 64, 3), 64, dtype=np.uint8), []
+    for seed in range(300):
+        (level,) = np.unique(developed(plain, seed, flat))
+        gamma.append(np.log(level / 255) / np.log(64 / 255))
+    assert 0.49 < min(gamma) < 0.52 and 1.48 < max(gamma) < 1.51
+    assert abs(np.mean(gamma) - 1.0) < 0.05
+
+
+def test_light_is_the_fragment_s_and_changes_at_the_seams_alone():
+    quiet = PHOTO.__class__(name="quiet", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, light_fraction=0.15)
+    image = developed(quiet, 3, np.full((64, 64, 3), 128, dtype=np.uint8)).astype(int)[..., 0]
+    down, across = np.abs(np.diff(image, axis=0)).max(axis=1), np.abs(np.diff(image[TOP:], axis=1)).max(axis=0)
+    assert np.flatnonzero(down > 3).tolist() == [TOP - 1]
+    assert np.flatnonzero(across > 4).tolist() == [20, 42]
+    assert 108 <= image.min() and image.max() <= 148
+
+
+def test_noise_is_drawn_anew_and_stays_until_then():
+    frame = np.full((64, 64, 3), 128, dtype=np.uint8)
+    noisy = PHOTO.__class__(name="noisy", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, noise_std=PHOTO.noise_std)
+    photographer, rng = Photographer(noisy), np.random.default_rng(0)
+    images = []
+    for _ in range(2):
+        photographer.draw((0, 1, 2), 0, rng)
+        images += [photographer.develop(frame), photographer.develop(frame)]
+    assert np.array_equal(images[0], images[1]) and np.array_equal(images[2], images[3])
+    assert not np.array_equal(images[0], images[2])
+    assert (images[0] / 255).std() == pytest.approx(PHOTO.noise_std, rel=0.05)
+
+
+def standardised(patches):
+    flat = patches.reshape(len(patches), -1)
+    return (flat - flat.mean(axis=1, keepdims=True)) / flat.std(axis=1, keepdims=True)
+
+
+def test_arrows_stay_readable():
+    """By the likest of the four arrows of clean frames, a few pixels aside or not."""
+    spec, rng = registry.task("arrow_puzzle"), np.random.default_rng(5)
+    states = np.array(spec.rules.states)[rng.integers(len(spec.rules.states), size=200)]
+    seen = spec.render_macrostates(states, HELD.name, rng).mean(axis=3)[:, 39:50]
+    clean = spec.render_macrostates(np.array([(value,) * 3 + (1,) for value in range(4)]), "clean", rng).mean(axis=3)
+    for cube, left in enumerate((4, 26, 49)):
+        patches, match = standardised(seen[:, :, left : left + 11]), []
+        for down, right in itertools.product(range(-2, 3), repeat=2):
+            match.append(patches @ standardised(clean[:, 39 + down : 50 + down, left + right : left + right + 11]).T)
+        assert (np.max(match, axis=0).argmax(axis=1) == states[:, cube]).mean() >= 0.98
+
+
+def test_rules_and_rewards_are_those_of_clean_frames():
+    spec, walks = registry.task("arrow_puzzle"), []
+    for level in ("clean", "photo"):
+        env = gymnasium.make(spec.env_id, appearance=level, execution="kinematic").unwrapped
+        walk = []
+        for seed in range(20):
+            env.reset(seed=seed, options={"macrostate": spec.rules.start_states[seed]})
+            for action in range(3):
+                _, reward, ended, _, info = env.step(action)
+                walk.append((reward, ended, info["fault"], *info["macrostate"]))
+        env.close()
+        walks.append(walk)
+    assert walks[0] == walks[1]
+    assert not any(fault for _, _, fault, *_ in walks[1])
+
+
+def test_in_physics_cubes_stay_where_the_arm_left_them():
+    world, rng = ArrowWorld(PHOTO), np.random.default_rng(0)
+    world.place(STATE, rng)
+    world.vary(rng)
+    before, hand = world.object_poses(), world.data.mocap_pos.copy()
+    for _ in range(5):
+        world.vary(rng, move_objects=False)
+        assert np.array_equal(world.object_poses(), before)
+    assert not np.array_equal(world.data.mocap_pos, hand)
