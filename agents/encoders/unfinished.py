@@ -15,7 +15,7 @@ _SAVE_EVERY_S = 60.0
 
 
 class Unfinished:
-    """A file of a few MB at ``path`` that keeps a training; ``what`` are words that only this training has."""
+    """Keeps a training in a file of three times its weights; ``what`` are words that only this training has."""
 
     def __init__(self, path: Path, what: str) -> None:
         self._path, self._what, self._saved_s = path, what, time.monotonic()
