@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.queries import require_able
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress, RunSpec
@@ -20,7 +18,6 @@ from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import BenchResult, RunResult
 
-_TRAIN_ENCODER = "imagine_bench.agents.encoders.cli:retrain"
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
@@ -82,7 +79,7 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
     needed = {entry.encoder_kind for entry in entries if entry.needs_encoder}
     spec = registry.task(wanted.task)
     if given is None:
-        return {kind: _own_encoder(spec, wanted.appearance, kind) for kind in sorted(needed)}
+        return {kind: encoders.own(spec, wanted.appearance, kind) for kind in sorted(needed)}
     path = encoders.resolve(spec, wanted.appearance, given)
     kind = encoders.kind(path)
     if needed and kind == "latents" and kind not in needed:
@@ -91,21 +88,8 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
             "'imagine-bench encoder --recipe codes', or leave --encoder out."
         )
     replaced = needed | {kind} if kind == "codes" else {kind}
-    own = {other: _own_encoder(spec, wanted.appearance, other) for other in sorted(needed - replaced)}
+    own = {other: encoders.own(spec, wanted.appearance, other) for other in sorted(needed - replaced)}
     return {**own, **dict.fromkeys(sorted(replaced), path)}
-
-
-def _own_encoder(spec: TaskSpec, appearance: str, kind: str) -> Path:
-    """The task's own; of a task of another package it is trained once."""
-    with suppress(ArtefactError):
-        return encoders.resolve(spec, appearance, kind=kind)
-    if spec.id in registry.TASKS:
-        return encoders.resolve(spec, appearance, kind=kind)  # says how to train one
-    path = encoders.cached(spec, appearance, kind)
-    print(f"{spec.id} has no encoder for {kind} at {appearance}; one is trained into {path.parent}, once.")
-    recipe = "codes" if kind == "codes" else "default"
-    registry.load(_TRAIN_ENCODER)(spec, recipe=recipe, appearance=appearance, seed=0, out=path.parent)
-    return path
 
 
 def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:

@@ -11,6 +11,7 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.cli.options import ANY, NEWEST, only, shown
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
@@ -99,6 +100,26 @@ class Speed:
         from imagine_bench.tools.speed import speed_report  # noqa: PLC0415 - nothing else needs it
 
         if not speed_report(self.out, self.turns):
+            sys.exit(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Say whether a task or an agent, of this suite or of another package, keeps the contract."""
+
+    task: Annotated[str | None, shown("STR", "(default: none)")] = None
+    """Task to check; with --agent, the one that it is checked in."""
+    agent: Annotated[str | None, shown("STR", "(default: none)")] = None
+    """Agent to check."""
+
+    def __call__(self) -> None:
+        """Check."""
+        from imagine_bench.tools.check import agent_checks, report, task_checks  # noqa: PLC0415 - nothing else needs it
+
+        if self.agent is None and self.task is None:
+            raise InvalidValueError("There is nothing to check; give --task or --agent.")
+        task = self.task or "arrow_puzzle"
+        if report(task_checks(task) if self.agent is None else agent_checks(self.agent, task)):
             sys.exit(1)
 
 

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import platformdirs
 
+from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
 from imagine_bench.store.files import read_json, sha256
 
+_TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _SUFFIX = ".safetensors"
 
 
@@ -50,13 +52,11 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 
     Raises:
         UnknownNameError: ``given`` is neither.
-        ArtefactError: The task has no encoder of its own at this appearance level, bundled or trained.
+        ArtefactError: The task has no bundled encoder at this appearance level.
     """
     known = bundled()
     if given is None:
         name = bundled_name(spec.encoder, appearance, kind)
-        if name not in known and (path := cached(spec, appearance, kind)).is_file():
-            return path
         if name not in known:
             raise ArtefactError(
                 f"No encoder {name!r} is bundled; train one with "
@@ -70,6 +70,18 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
     if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
         return path.resolve()
     raise UnknownNameError("encoder", given, known)
+
+
+def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
+    """The task's own encoder of a kind; that of another package's task is trained once. Raises as :func:`resolve`."""
+    if spec.id not in registry.TASKS and bundled_name(spec.encoder, appearance, kind) not in bundled():
+        path = cached(spec, appearance, kind)
+        if not path.is_file():
+            print(f"{spec.id} has no encoder for {kind} at {appearance}; one is trained into {path.parent}, once.")
+            recipe = "codes" if kind == "codes" else "default"
+            registry.load(_TRAIN)(spec, recipe=recipe, appearance=appearance, seed=0, out=path.parent)
+        return path
+    return resolve(spec, appearance, kind=kind)
 
 
 def kind(path: Path) -> str:

@@ -1,6 +1,6 @@
 """The page docs/thesis.md, made from docs/thesis.csv: every element of the thesis, where it is and what came of it.
 
-``python tests/thesis_elements.py`` writes it anew. In a cell, ``{iqm(500,arrow_puzzle-quick/dqn)}`` stands for what
+``python tests/docs/thesis_elements.py`` writes it anew. In a cell, ``{iqm(500,arrow_puzzle-quick/dqn)}`` is what
 :mod:`doc_tables` recomputes from the kept results.
 """
 

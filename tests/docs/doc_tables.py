@@ -6,7 +6,7 @@ A comment before a table names its folders and says what its cells are, in the w
 
 ``@`` is the number in the row's first cell or, where the comment has ``rows: ...|...;``, the row's own arguments.
 ``text`` is a column of words. Below a table that compares stands what its bold cells mean and the smallest difference
-that it could have shown. ``python tests/doc_tables.py`` writes all that anew.
+that it could have shown. ``python tests/docs/doc_tables.py`` writes all that anew.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
 PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "report")]
 """All but the reports that somebody has written of kept results, which git ignores."""

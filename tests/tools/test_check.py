@@ -1,0 +1,112 @@
+"""The contract's checks: content with our own, and each finds the fault that it is for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrow_puzzle.rules import ArrowPuzzleRules
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.interfaces import AgentState
+from imagine_bench.tools.check import agent_checks, report, task_checks
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_our_tasks_keep_the_contract(task: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(task_checks(task)) == 0
+    assert capsys.readouterr().out.count("ok  ") == 6
+
+
+@pytest.mark.parametrize("agent", ["random", "oracle", "dqn", "factored"])
+def test_our_agents_keep_the_contract(agent: str) -> None:
+    assert report(agent_checks(agent)) == 0
+
+
+def test_the_command_says_what_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check"]) == 2
+    assert "give --task or --agent" in capsys.readouterr().err
+    assert main(["check", "--agent", "random"]) == 0
+    assert capsys.readouterr().out.startswith("ok     it is made\n")
+
+
+class _Leaky(ArrowPuzzleRules):
+    def outcomes(self, macrostate: Any, action: int) -> Any:
+        return tuple(dataclasses.replace(each, probability=0.9) for each in super().outcomes(macrostate, action))
+
+
+class _Generous(ArrowPuzzleRules):
+    """Rewards a turn with 1 more than the environment does."""
+
+    def outcomes(self, macrostate: Any, action: int) -> Any:
+        return tuple(
+            dataclasses.replace(each, reward=each.reward + 1.0) for each in super().outcomes(macrostate, action)
+        )
+
+
+class _Forgetful(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Begins where it likes, and draws noise of its own."""
+
+    noise = np.random.default_rng(0)
+
+    def reset(self, **given: Any) -> Any:
+        frame, info = self.env.reset(seed=given.get("seed"))
+        return frame ^ self.noise.integers(2, size=frame.shape, dtype=np.uint8), info
+
+
+def _failed(capsys: pytest.CaptureFixture[str]) -> Iterator[str]:
+    for line in capsys.readouterr().out.splitlines():
+        if line.startswith("wrong"):
+            yield line.removeprefix("wrong  ")
+
+
+def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = registry.task("arrow_puzzle")
+
+    def check(**changes: Any) -> str:
+        monkeypatch.setattr(registry, "task", lambda name: dataclasses.replace(spec, **changes))
+        assert report(task_checks("arrow_puzzle")) > 0
+        return "\n".join(_failed(capsys))
+
+    assert "sum to 0.9, not 1" in check(rules=_Leaky(spec.rules.goal))  # type: ignore[attr-defined]
+    assert "macro-actions end as the rules say: action" in check(rules=_Generous(spec.rules.goal))  # type: ignore[attr-defined]
+    noise = np.random.default_rng(0)
+    assert "frames are int64 of shape" in check(render_macrostates=lambda states, *_: noise.integers(256, size=(2, 3)))
+    made = gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _Forgetful(made(*given, **named)))
+    said = check()
+    assert "every start is begun in, and told: begun in" in said and "episodes of seed 0 differ" in said
+
+
+class _Moody:
+    """Counts how often it was asked, and forgets half of it."""
+
+    asked = 0
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        self.asked += 1
+        return self.asked % 6
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        pass
+
+    def diagnostics(self) -> dict[str, float]:
+        return {}
+
+    def state(self) -> AgentState:
+        return AgentState(arrays={"asked": np.array(self.asked)}, values={})
+
+    def restore(self, state: AgentState) -> None:
+        self.asked = int(state.arrays["asked"]) // 2
+
+
+def test_wrong_agents_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(registry, "make_agent", lambda name, context: _Moody())
+    assert report(agent_checks("dqn")) == 2
+    moody, forgetful = _failed(capsys)
+    assert "asked twice with explore=False, it acts otherwise" in moody and "it acts otherwise" in forgetful
