@@ -122,6 +122,29 @@ def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> 
     return np.asarray(pieces.cumsum(axis=1) / episodes[1:])
 
 
+class PairedTests(NamedTuple):
+    """Tests of two trained agents from the same starts, by who alone solved them."""
+
+    first: int  #: Solved by the first alone
+    second: int  #: Solved by the second alone
+    p: float  #: Of so uneven a split or more, were both equally likely: McNemar's test (1947), exact
+
+
+def mcnemar(first: str, second: str) -> PairedTests:
+    """Compare two runs' tests, each a text of ``1`` (solved) and ``0`` for the same starts in the same order.
+
+    It tells two trained agents apart, not two ways of training.
+
+    Raises:
+        InvalidValueError: Texts of different lengths.
+    """
+    if len(first) != len(second):
+        raise InvalidValueError(f"{len(first)} and {len(second)} tests are no pairs; give those of the same starts.")
+    alone = [sum((a, b) == pair for a, b in zip(first, second, strict=True)) for pair in (("1", "0"), ("0", "1"))]
+    p = float(scipy.stats.binomtest(alone[0], sum(alone)).pvalue) if any(alone) else 1.0
+    return PairedTests(alone[0], alone[1], p)
+
+
 def difference(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, trim: float = _TRIM) -> Estimate:
     """Difference of the interquartile means of two agents' runs, (n,) and (m,): Yuen's test for unequal variances.
 

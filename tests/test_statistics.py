@@ -198,3 +198,21 @@ def test_a_ratio_that_every_run_has_is_certain() -> None:
     for values in np.random.default_rng(0).uniform(0.5, 0.8, (20, 5)):
         found = statistics.ratio(1.1 * values, values, paired=True)
         assert found[:3] == pytest.approx((1.1, 1.1, 1.1), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "alone", "p"),
+    [
+        ("1111100000", "0000000000", (5, 0), 2 / 2**5),
+        ("1100", "0011", (2, 2), 1.0),
+        ("1010", "1010", (0, 0), 1.0),
+        ("1111111100", "0000000011", (8, 2), 2 * (1 + 10 + 45) / 2**10),
+    ],
+)
+def test_equal_starts_are_compared_exactly(first: str, second: str, alone: tuple[int, int], p: float) -> None:
+    """The binomial of an even coin, by hand; tests that both solve or both fail say nothing."""
+    found = statistics.mcnemar(first + "1101", second + "1101")
+    assert (found.first, found.second) == alone and found.p == pytest.approx(p)
+    assert statistics.mcnemar(second, first) == (*reversed(alone), pytest.approx(p))
+    with pytest.raises(InvalidValueError, match="are no pairs"):
+        statistics.mcnemar(first, second + "1")

@@ -112,6 +112,7 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
         env_steps=run.counters.env_steps,
         test_episodes=test.episodes,
         successes=test.successes,
+        solved=test.solved,
         mean_return=test.return_sum / test.episodes,
         mean_length=test.env_steps / test.episodes,
         faults=test.faults,

@@ -44,6 +44,7 @@ class Comparison:
     detectable: float  # the smallest difference that this cell would have shown with probability 80 %; NaN likewise
     gain: statistics.Estimate  # (P_aug - P_base) / P_base of the means over seeds, with its interval
     thesis_gain: float | None  # the thesis' gain at this budget, or None
+    paired: statistics.PairedTests | None  # with one seed, the tests of the two agents from the same starts
 
     @property
     def shown(self) -> int:
@@ -262,8 +263,14 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
             detectable=statistics.detectable(*pair, cells=len(cells), trials=trials),
             gain=statistics.gain(*pair, trials=trials),
             thesis_gain=thesis[agent].get(budgets[index]),
+            paired=_paired(result.of(agent), result.of(BASE_AGENT), index),
         )
     return comparisons
+
+
+def _paired(treated: tuple[RunResult, ...], base: tuple[RunResult, ...], index: int) -> statistics.PairedTests | None:
+    one, other = (runs[0].checkpoints[index].solved for runs in (treated, base))
+    return None if len(treated) > 1 or one is None or other is None else statistics.mcnemar(one, other)
 
 
 def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:

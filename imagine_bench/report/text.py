@@ -11,7 +11,7 @@ import numpy as np
 from imagine_bench import registry, statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH
-from imagine_bench.statistics import Estimate
+from imagine_bench.statistics import Estimate, PairedTests
 
 _NAMED = 4  # missing runs that are named; the others are counted
 
@@ -153,12 +153,22 @@ def _verdict(data: ReportData, agent: str) -> str:
     score = percent(data.scores[agent][budget].value)
     head = f"“{agent_words(agent).title}” solves {score}\u00a0%, {_points(difference)}"
     if math.isnan(difference.low):
-        return f"{head}; one seed says nothing about how much of that is luck."
+        return f"{head}; {_alone(comparisons[budget].paired)}one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
     adjusted = comparisons[budget].p_adjusted
     chance = "p < 0.001" if adjusted < 0.001 else f"p = {adjusted:.3f}"
     verdict = {1: "it is ahead", -1: "it is behind", 0: "no difference is shown"}[comparisons[budget].shown]
     return f"{head} ({interval}; {chance}, corrected): at this budget {verdict}. {_over_budgets(comparisons)}"
+
+
+def _alone(paired: PairedTests | None) -> str:
+    if paired is None:
+        return ""
+    chance = "p < 0.001" if paired.p < 0.001 else f"p = {paired.p:.3f}"
+    return (
+        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({chance}, McNemar's exact "
+        "test of these two trained agents); "
+    )
 
 
 def _over_budgets(comparisons: dict[int, Comparison]) -> str:

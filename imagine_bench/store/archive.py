@@ -51,14 +51,14 @@ def archive_files(result: BenchResult) -> dict[str, str]:
 def results_csv(result: BenchResult) -> str:
     """One row an agent, seed and budget; every diagnostic the agents report has its column."""
     names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
-    rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, *names]]
+    rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, "solved", *names]]
     for agent in result.protocol.agents:
         for run in result.of(agent):
             for checkpoint in run.checkpoints:
                 low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
                 row = [agent, run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
                 row += [checkpoint.success_rate, low, high]
-                row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)]
+                row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)] + [checkpoint.solved or ""]
                 rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
     return csv_text(rows)
 
@@ -95,9 +95,11 @@ def load_archive(folder: Path) -> BenchResult:
 def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
     numbers: dict[str, Any] = {name: float(row[name]) for name in (*_MEANS, *_COSTS[1:])}
     numbers |= {name: int(row[name]) for name in (*_COUNTS, _COSTS[0])}
-    known = ("agent", "seed", *numbers, *_DERIVED)
+    known = ("agent", "seed", "solved", *numbers, *_DERIVED)
     return Checkpoint(
-        **numbers, diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""}
+        **numbers,
+        solved=row.get("solved") or None,
+        diagnostics={name: float(text) for name, text in row.items() if name not in known and text != ""},
     )
 
 

@@ -19,12 +19,17 @@ class EvaluationCounts:
     """Counts over test episodes; a checkpoint may carry them half way."""
 
     episodes: int = 0  #: Test episodes done
-    successes: int = 0  #: Those that ended in success
+    solved: str = ""  #: ``1`` for each of them that ended in success, ``0`` for each other, in their order
     env_steps: int = 0  #: Macro-actions in them
     return_sum: float = 0.0  #: Sum of their undiscounted returns
     faults: int = 0  #: Macro-actions whose physics disagreed with the rules
     cpu_s: float = 0.0  #: CPU seconds spent
     diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
+
+    @property
+    def successes(self) -> int:
+        """Test episodes that ended in success."""
+        return self.solved.count("1")
 
 
 @dataclass

@@ -82,6 +82,9 @@ class Checkpoint:
     env_steps: int  #: Real training macro-actions so far
     test_episodes: int  #: Greedy test episodes
     successes: int  #: Test episodes that ended in success
+    #: Which: ``1`` or ``0`` for each, in their order; the same places are the same starts in every run of a bench. None
+    #: in results of before 2026-11-24.
+    solved: str | None = None
     mean_return: float  #: Mean undiscounted return of the test episodes
     mean_length: float  #: Mean macro-actions of the test episodes
     faults: int  #: Macro-actions of the test episodes whose physics disagreed with the rules

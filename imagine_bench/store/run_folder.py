@@ -189,7 +189,7 @@ def load_unfinished(folder: Path) -> RunResult:
 
 def _read_checkpoints(folder: Path) -> tuple[Checkpoint, ...]:
     values = []
-    for row in table_rows((folder / _METRICS).read_text()):
+    for row in table_rows((folder / _METRICS).read_text(), texts=("solved",)):
         diagnostics = {k.removeprefix(_DIAGNOSTIC): value for k, value in row.items() if k.startswith(_DIAGNOSTIC)}
         values.append({**row, "diagnostics": diagnostics})
     return unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))

@@ -27,7 +27,7 @@ from imagine_bench.report.sections.imagination import encoder_views
 from imagine_bench.report.sections.success import gain
 from imagine_bench.report.text import percent, signed_percent
 from imagine_bench.statistics import Estimate
-from imagine_bench.store.results import BenchResult
+from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
 class Cells(HTMLParser):
@@ -288,6 +288,18 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     assert all(math.isnan(row.gain.low) for budgets in data.comparisons.values() for row in budgets.values())
     assert "one seed says nothing about how much of that is luck" in " ".join(words.answers(data))
     write_report(result)
+
+    def told(run: RunResult, row: Checkpoint) -> Checkpoint:
+        solved = "1" * row.successes + "0" * (row.test_episodes - row.successes)
+        return dataclasses.replace(row, solved=solved if run.agent == "dqn" else solved[::-1])
+
+    rows = {id(run): tuple(told(run, row) for row in run.checkpoints) for run in result.runs}
+    runs = [dataclasses.replace(run, checkpoints=rows[id(run)]) for run in result.runs]
+    data = collect(dataclasses.replace(result, runs=tuple(runs)))
+    tests = {run.agent: run.checkpoints[result.protocol.budgets.index(data.decisive_budget)].solved for run in runs}
+    pairs = list(zip(tests["imagination"], tests["dqn"], strict=True))
+    alone = f"it alone solves {pairs.count(('1', '0'))} and DQN alone {pairs.count(('0', '1'))} (p "
+    assert alone in " ".join(words.answers(data)) and "McNemar's exact test" in " ".join(words.answers(data))
 
 
 def test_agents_alone_and_without_imagination(tmp_path: Path) -> None:
