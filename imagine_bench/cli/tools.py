@@ -124,6 +124,24 @@ class Check:
 
 
 @dataclass(frozen=True, kw_only=True)
+class New:
+    """Write a package of your own with a task or an agent in it, ready to be changed."""
+
+    kind: Annotated[str, tyro.conf.Positional]
+    """task or agent."""
+    name: Annotated[str, tyro.conf.Positional]
+    """Name of the package and of what it offers."""
+    out: Path = Path()
+    """Folder in which the package's folder is made."""
+
+    def __call__(self) -> None:
+        """Write."""
+        from imagine_bench.tools.new import new_package  # noqa: PLC0415 - nothing else needs it
+
+        print(new_package(self.kind, self.name, self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
     """Simulate whether intervals and tests keep their promise on scores such as the kept ones."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from guest_packages import install
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.agents.encoders import recipes
 from small_runs import Inline
@@ -22,15 +22,14 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.store import encoders
 from imagine_bench.store.trained import learners, load_trained
-
-GUEST = Path(__file__).parents[1] / "fakes" / "guest"
+from imagine_bench.tools.new import new_package
 
 
 @pytest.fixture
 def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A site folder with the package in it; encoders are made in seconds and kept in a folder of the test's own."""
-    site = tmp_path / "site"
-    shutil.copytree(GUEST, site)
+    new_package("task", "lights_out", tmp_path)
+    site = install(tmp_path / "lights_out")
     monkeypatch.syspath_prepend(site)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.delitem(sys.modules, "lights_out", raising=False)
@@ -105,8 +104,8 @@ def test_other_looks_are_another_encoder(guest: Path, monkeypatch: pytest.Monkey
 def test_an_offer_that_is_no_task_costs_nobody_anything(
     guest: Path, capsys: pytest.CaptureFixture[str], line: str, sentence: str
 ) -> None:
-    (guest / "lights_out-1.0.dist-info" / "entry_points.txt").write_text(f"[imagine_bench.tasks]\n{line}\n")
-    with pytest.raises(SetupError, match=r"^The package lights-out offers ") as caught:
+    (guest / "lights_out-0.1.dist-info" / "entry_points.txt").write_text(f"[imagine_bench.tasks]\n{line}\n")
+    with pytest.raises(SetupError, match=r"^The package lights_out offers ") as caught:
         registry.task("lights_out")
     assert sentence in str(caught.value) and registry.task("arrow_puzzle").id == "arrow_puzzle"
     assert main(["bench", "--task", "lights_out"]) == 2

@@ -1,0 +1,58 @@
+"""A package of one's own with a task or an agent in it, ready to be changed: ``imagine-bench new``."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from importlib import resources
+from pathlib import Path
+
+import jinja2
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.store.files import make_folder, write_bytes
+
+KINDS = {"task": registry.TASK_GROUP, "agent": registry.AGENT_GROUP}
+_PYPROJECT = """[build-system]
+requires = ["setuptools>=77"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "{name}"
+version = "0.1"
+dependencies = ["imagine-bench"]
+
+[project.entry-points."{group}"]
+{name} = "{name}:ENTRY"
+
+[tool.setuptools]
+py-modules = ["{name}"]
+"""
+
+
+def new_package(kind: str, name: str, out: Path) -> str:
+    """Write ``out/<name>/`` with ``pyproject.toml`` and ``<name>.py``: a small task or agent that passes its checks.
+
+    Returns what to do next.
+
+    Raises:
+        UnknownNameError: ``kind`` is neither ``"task"`` nor ``"agent"``.
+        InvalidValueError: A name that no module can have or that is taken, or a folder that exists.
+    """
+    group = KINDS[require_known("kind of package", kind, KINDS)]
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
+        raise InvalidValueError(f"{name!r} cannot be a module; give small letters, digits and _, such as my_{kind}.")
+    taken = {**registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.REGRESSORS}
+    if name in taken:
+        raise InvalidValueError(f"{name!r} is a name of imagine_bench already; give another name.")
+    folder = out.expanduser() / name
+    if folder.exists():
+        raise InvalidValueError(f"{folder} exists; give another name or --out. Nothing was written.")
+    template = (resources.files("imagine_bench.tools") / "templates" / f"{kind}.py.j2").read_text()
+    words = {"name": name, "camel": name.title().replace("_", ""), "title": name.replace("_", " ").capitalize()}
+    code = jinja2.Environment(autoescape=False, keep_trailing_newline=True).from_string(template).render(**words)
+    make_folder(folder)
+    write_bytes(folder / f"{name}.py", code.encode())
+    write_bytes(folder / "pyproject.toml", _PYPROJECT.format(name=name, group=group).encode())
+    return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name}"

@@ -1,0 +1,70 @@
+"""Packages that ``imagine-bench new`` writes pass the checks as they are."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import pytest
+from guest_packages import install
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.cli import main
+from imagine_bench.rules import facts
+from imagine_bench.tools.new import new_package
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    yield
+    registry.offers.cache_clear()
+    for env_id in ("my_own/MyOwn-v0", "my_world/MyWorld-v0"):
+        gymnasium.registry.pop(env_id, None)
+    for module in ("my_own", "my_world"):
+        sys.modules.pop(module, None)
+
+
+@pytest.mark.parametrize("kind", ["task", "agent"])
+def test_a_new_package_keeps_the_contract(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    assert main(["new", kind, "my_own", "--out", str(tmp_path)]) == 0
+    assert f"imagine-bench check --{kind} my_own" in capsys.readouterr().out
+    monkeypatch.syspath_prepend(install(tmp_path / "my_own"))
+    registry.offers.cache_clear()
+    assert main(["check", f"--{kind}", "my_own"]) == 0, capsys.readouterr().out
+
+
+def test_the_new_agent_learns_the_new_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, name in (("task", "my_world"), ("agent", "my_own")):
+        new_package(kind, name, tmp_path)
+        monkeypatch.syspath_prepend(install(tmp_path / name))
+    registry.offers.cache_clear()
+    few = {"budgets": (100,), "evaluation_episodes": 100, "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted, paths = plan("my_world", "smoke", agents=("my_own",), execution="kinematic", **few)
+    (run,) = bench(wanted, paths, root=tmp_path, launcher=Inline()).runs
+    chance = facts(registry.task("my_world").rules, 8).chance_level
+    assert run.checkpoints[-1].success_rate > 0.9 > 2 * chance
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["world", "mine"], "No kind of package 'world'."),
+        (["task", "My-Task"], "'My-Task' cannot be a module; give small letters, digits and _, such as my_task."),
+        (["task", "class"], "'class' cannot be a module"),
+        (["agent", "dqn"], "'dqn' is a name of imagine_bench already; give another name."),
+        (["agent", "there"], "there exists; give another name or --out. Nothing was written."),
+    ],
+)
+def test_wrong_words_write_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    (tmp_path / "there").mkdir()
+    assert main(["new", *words, "--out", str(tmp_path)]) == 2
+    assert sentence in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["there"] and not any((tmp_path / "there").iterdir())
