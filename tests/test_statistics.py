@@ -191,3 +191,10 @@ def test_a_success_that_is_lost_again_does_not_last() -> None:
     assert statistics.first_lasting(budgets, [0.2, 0.9, 0.1, 0.1], 0.9) is None
     assert statistics.first_lasting(budgets, [0.2, 0.9, 0.95, 0.9], 0.9) == 20
     assert statistics.first_lasting(budgets, [0.9] * 4, 0.9) == 10
+
+
+def test_a_ratio_that_every_run_has_is_certain() -> None:
+    """Rounding makes the variance of it less than 0 as often as more."""
+    for values in np.random.default_rng(0).uniform(0.5, 0.8, (20, 5)):
+        found = statistics.ratio(1.1 * values, values, paired=True)
+        assert found[:3] == pytest.approx((1.1, 1.1, 1.1), abs=1e-6)
