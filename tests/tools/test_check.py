@@ -17,13 +17,12 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.tools.check import agent_checks, report, task_checks
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_our_tasks_keep_the_contract(task: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report(task_checks(task)) == 0
+def test_a_task_of_ours_keeps_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(task_checks("arrow_puzzle")) == 0
     assert capsys.readouterr().out.count("ok  ") == 6
 
 
-@pytest.mark.parametrize("agent", ["random", "oracle", "dqn", "factored"])
+@pytest.mark.parametrize("agent", ["oracle", "dqn"])
 def test_our_agents_keep_the_contract(agent: str) -> None:
     assert report(agent_checks(agent)) == 0
 
@@ -68,19 +67,23 @@ def _failed(capsys: pytest.CaptureFixture[str]) -> Iterator[str]:
 def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     spec = registry.task("arrow_puzzle")
 
-    def check(**changes: Any) -> str:
+    def check(what: str, **changes: Any) -> str:
         monkeypatch.setattr(registry, "task", lambda name: dataclasses.replace(spec, **changes))
-        assert report(task_checks("arrow_puzzle")) > 0
-        return "\n".join(_failed(capsys))
+        chosen = {words: check for words, check in task_checks("arrow_puzzle").items() if what in words}
+        assert report(chosen) == len(chosen) == 1
+        return next(_failed(capsys))
 
-    assert "sum to 0.9, not 1" in check(rules=_Leaky(spec.rules.goal))  # type: ignore[attr-defined]
-    assert "macro-actions end as the rules say: action" in check(rules=_Generous(spec.rules.goal))  # type: ignore[attr-defined]
-    noise = np.random.default_rng(0)
-    assert "frames are int64 of shape" in check(render_macrostates=lambda states, *_: noise.integers(256, size=(2, 3)))
+    leaky, generous = (kind(spec.rules.goal) for kind in (_Leaky, _Generous))  # type: ignore[attr-defined]
+    assert "sum to 0.9, not 1" in check("distributions", rules=leaky)
+    assert "macro-actions end as the rules say: action" in check("as the rules say", rules=generous)
+    draw = np.random.default_rng(0)
+    assert "frames are int64 of shape" in check(
+        "64 x 64", render_macrostates=lambda *_: draw.integers(256, size=(2, 3))
+    )
     made = gymnasium.make
     monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _Forgetful(made(*given, **named)))
-    said = check()
-    assert "every start is begun in, and told: begun in" in said and "episodes of seed 0 differ" in said
+    assert "every start is begun in, and told: begun in" in check("every start")
+    assert "two episodes of seed 0 differ" in check("same seed")
 
 
 class _Moody:
