@@ -118,7 +118,7 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     """Evaluate a stationary policy, action probabilities (A, S), exactly; truncated after ``horizon`` >= 1 actions."""
     if horizon < 1:
         raise InvalidValueError(f"Horizon {horizon} is too short; give at least 1 action.")
-    alive = tables.alive.multiply(policy.reshape(-1, 1)).tocoo()
+    alive = tables.alive.multiply(policy.ravel()[:, None]).tocoo()
     n_states = policy.shape[1]
     alive = type(tables.alive)((alive.data, (alive.row % n_states, alive.col)), shape=(n_states, n_states))
     reward, success = (policy * tables.reward).sum(axis=0), (policy * tables.success).sum(axis=0)

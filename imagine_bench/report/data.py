@@ -270,7 +270,9 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
 
 def _paired(treated: tuple[RunResult, ...], base: tuple[RunResult, ...], index: int) -> statistics.PairedTests | None:
     one, other = (runs[0].checkpoints[index].solved for runs in (treated, base))
-    return None if len(treated) > 1 or one is None or other is None else statistics.mcnemar(one, other)
+    if len(treated) > 1 or one is None or other is None:
+        return None
+    return statistics.mcnemar(one, other)
 
 
 def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:

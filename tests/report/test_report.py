@@ -299,6 +299,11 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     tests = {run.agent: run.checkpoints[result.protocol.budgets.index(data.decisive_budget)].solved for run in runs}
     pairs = list(zip(tests["imagination"], tests["dqn"], strict=True))
     alone = f"it alone solves {pairs.count(('1', '0'))} and DQN alone {pairs.count(('0', '1'))} (p "
+    for of_dqn in (True, False):  # one that is not told leaves nothing to pair
+        untold = [
+            plain if (plain.agent == "dqn") == of_dqn else run for plain, run in zip(result.runs, runs, strict=True)
+        ]
+        assert "McNemar" not in " ".join(words.answers(collect(dataclasses.replace(result, runs=tuple(untold)))))
     assert alone in " ".join(words.answers(data)) and "McNemar's exact test" in " ".join(words.answers(data))
 
 

@@ -197,9 +197,13 @@ def test_a_reward_threshold_without_dropout_is_refused() -> None:
 def test_a_filter_with_a_single_weight_sample_is_refused(dropout: float, samples: int) -> None:
     model, imagination = WorldModelSettings(dropout=dropout), ImaginationSettings(weight_samples=samples)
     settings = Settings(model=model, imagination=imagination)
-    with pytest.raises(InvalidValueError, match=r"there is one\. Set model\.dropout above 0 and imagination\.weight"):
+    with pytest.raises(InvalidValueError, match=r"there is one\. Set model\.dropout above 0 and imagination\.w") as no:
         Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU)
+    assert str(no.value).startswith("The filter") and str(no.value).endswith("or choose the agent without the filter.")
     Imagination(2, 2, settings, filtered=False, seeds=SeedTree(0), device=CPU)
+    curious = dataclasses.replace(settings, imagination=dataclasses.replace(imagination, curiosity=0.5))
+    with pytest.raises(InvalidValueError, match=r"^imagination\.curiosity compares .*, or set it to 0\.$"):
+        Imagination(2, 2, curious, filtered=False, seeds=SeedTree(0), device=CPU)
 
 
 @pytest.mark.parametrize(("reduction", "accepted"), [("max", 12), ("mean", 30)])
