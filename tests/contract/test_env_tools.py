@@ -21,8 +21,9 @@ def make(task, **options):
     return gymnasium.make(registry.TASKS[task].env_id, **options)
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-@pytest.mark.parametrize("task", WORLDS)
+@pytest.mark.parametrize(
+    ("task", "context"), [*((task, "fork") for task in WORLDS), (WORLDS[0], "spawn")], ids=lambda each: each
+)
 def test_async_vector_envs_match_single_ones(task, context):
     """Also after this process has drawn: nothing of its OpenGL is used by the children."""
     single = make(task, **KINEMATIC)
@@ -56,7 +57,7 @@ def test_a_pickled_environment_goes_on_alike(task):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("task", WORLDS)
+@pytest.mark.parametrize("task", [WORLDS[0], *(pytest.param(task, marks=pytest.mark.slow) for task in WORLDS[1:])])
 def test_memory_stays_flat_over_resets(task):
     script = """
         import sys, gymnasium, imagine_bench

@@ -188,6 +188,7 @@ def test_who_reads_the_true_state_says_so(name: str) -> None:
     assert "true" not in own.title + own.description
 
 
+@pytest.mark.slow
 def test_planning_is_ahead_on_the_arrow_puzzle(tmp_path: Path) -> None:
     task = registry.task("arrow_puzzle")
     solved = {}
