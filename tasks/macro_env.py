@@ -41,8 +41,7 @@ def human_camera_view(camera: str, width: int, height: int) -> View:
 class EnvState:
     """A snapshot of an environment: scene, looks, randomness and the episode so far. It can be pickled."""
 
-    task: str
-    execution: str
+    kind: tuple[str, str, str, PhysicsSettings]  #: task, execution, appearance and physics: where it may be set
     world: WorldState
     generator: Mapping[str, Any]  #: state of the generator that everything random is drawn from
     macrostate: tuple[int, ...]
@@ -110,6 +109,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         settings = PhysicsSettings.of(physics)
         self.world = make_world(appearance_level(appearance))
         self.world.set_physics(settings)
+        self._kind = (spec.id, self._execution, appearance, settings)
         self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._agent_camera = agent_camera(self.world.model)
@@ -191,20 +191,20 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
     def get_state(self) -> EnvState:
         """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
         return EnvState(
-            task=self._id, execution=self._execution, world=self.world.get_state(),
-            generator=copy.deepcopy(self.np_random.bit_generator.state), macrostate=self._macrostate,
-            begun=self._begun, latest=self._latest, people=self._people,
+            kind=self._kind, world=self.world.get_state(), generator=copy.deepcopy(self.np_random.bit_generator.state),
+            macrostate=self._macrostate, begun=self._begun, latest=self._latest, people=self._people,
         )  # fmt: skip
 
     def set_state(self, state: EnvState) -> None:
         """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
 
         Raises:
-            InvalidValueError: A state of another task or execution, or none at all.
+            InvalidValueError: A state of another task, execution, appearance or physics, or none at all.
         """
-        kind = (self._id, self._execution)
-        if not isinstance(state, EnvState) or (state.task, state.execution) != kind:
-            raise InvalidValueError(f"{brief(state)} is no state of {kind[0]} in {kind[1]}; give one of get_state().")
+        if not isinstance(state, EnvState) or state.kind != self._kind:
+            given = state.kind if isinstance(state, EnvState) else state
+            words = "get_state() of an environment made alike"
+            raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self._macrostate, self._begun, self._latest, self._people = (
@@ -347,7 +347,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             "fault_reason": fault or "",
             "sim_time_s": np.float64(0.0 if latest is None else latest.sim_time_s),
             "ik_error_m": np.float64(0.0 if latest is None else latest.ik_error_m),
-            "action_mask": self.action_masks().astype(np.int8),
+            "action_mask": self.action_masks().view(np.int8),
         }
 
 

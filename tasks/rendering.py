@@ -3,7 +3,7 @@
 - A context is made at the first image, in the process that draws it; one inherited through a fork is dropped.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
 - Any thread may draw, one at a time. A context stays current in the thread that made it. Another thread makes a
-  context of its own; where the work changes threads again, contexts are released after each frame, which takes 17 us.
+  context of its own; where the work changes threads again, contexts are released after each frame.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
 """
 

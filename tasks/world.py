@@ -19,7 +19,7 @@ from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
-from .scenes.fragments import Photographer
+from .scenes.fragments import Photographer, Shot
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -44,6 +44,7 @@ class WorldState:
 
     physics: NDArray[np.float64]
     looks: tuple[NDArray[np.float64], ...]
+    shot: Shot | None  #: where frames are photographs, the latest
     sensing: Sensing
 
 
@@ -93,13 +94,16 @@ class World(abc.ABC):
         physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, physics, _STATE)
         looks = tuple(np.array(each) for each in self._looks())
-        return WorldState(physics=physics, looks=looks, sensing=replace(self.sensing))
+        shot = None if self._photographer is None else self._photographer.shot
+        return WorldState(physics=physics, looks=looks, shot=shot, sensing=replace(self.sensing))
 
     def set_state(self, state: WorldState) -> None:
         """Put the scene as it was, to the bit."""
         mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
         for mine, then in zip(self._looks(), state.looks, strict=True):
             mine[:] = then
+        if self._photographer is not None and state.shot is not None:
+            self._photographer.shot = state.shot
         for name in ("aside_m", "turned_rad"):
             setattr(self.sensing, name, getattr(state.sensing, name))
         self.update()
@@ -141,13 +145,13 @@ class World(abc.ABC):
 
     def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
         (objects, _), gesture = self._objects(), self._read_gesture()
-        hand, fragments = photographer.draw(objects, gesture, rng)
-        for index, (value, fragment) in enumerate(zip(objects, fragments, strict=True)):
+        shot = photographer.draw(objects, gesture, rng)
+        for index, (value, fragment) in enumerate(zip(objects, shot.objects, strict=True)):
             if move_objects:
                 x, y, _, yaw = fragment.offset
                 self._put(index, value, (x, y, yaw))
         if self._hands_vary():
-            *offset, yaw = hand.offset
+            *offset, yaw = shot.hand.offset
             offset_m = [self._level.hand_offset_m * each for each in offset]
             self._gesture(gesture, offset_m, self._level.hand_yaw_rad * yaw)
         self.update()

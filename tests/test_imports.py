@@ -27,7 +27,7 @@ ARROWS: dict[str, set[str]] = {
     "report": {*_DATA, "bench", "judge", "studies", "machine", "statistics", "reference"},
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
     "adapters": {"registry"},
-    "tools": {"registry", "machine", "store", "statistics"},
+    "tools": {"registry", "machine", "store", "statistics", "bench"},
     "cli": {*_DATA, "bench", "judge", "recording", "studies", "report", "tools"},
     "__init__": {"registry"},
     "__main__": {"cli"},

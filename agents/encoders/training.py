@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
 
 _CHUNK = 500  # frames rendered at once, to bound memory
-_PART = 250  # images whose gradients are added up: 2000 at once take twice as long, out of the processor's caches
+_PART = 250  # images whose gradients are added up: 2000 at once leave the processor's caches
 _CHECK_EVERY = 50  # steps between checks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
@@ -106,6 +107,11 @@ def train_vae(
         vae.load_state_dict(kept["vae"])
         optimiser.load_state_dict(kept["optimiser"])
         generator.set_state(kept["generator"])
+
+    def so_far(step: int, order: Tensor) -> dict[str, Any]:
+        made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
+        return {"step": step, "order": order, "cpu_s": time.process_time() - begun_s, **made}
+
     for step in range(first, recipe.steps):
         while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
@@ -122,8 +128,7 @@ def train_vae(
         if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not total.isfinite():
             raise DivergedError(f"The encoder's loss became {total.item()} at step {step} of {recipe.steps}.")
         if unfinished is not None:
-            made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
-            unfinished.save({"step": step + 1, "order": order, "cpu_s": time.process_time() - begun_s, **made})
+            unfinished.save(partial(so_far, step + 1, order))
         progress("training", (step + 1) / recipe.steps)
     return time.process_time() - begun_s
 

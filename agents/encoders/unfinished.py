@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +34,16 @@ class Unfinished:
             raise ArtefactError(f"{self._path} is of another training; remove it or choose another folder.")
         return dict(kept)
 
-    def save(self, kept: dict[str, Any]) -> None:
-        """Keep numbers and tensors, whole or not at all; nothing within a minute of the last time."""
+    def save(self, kept: Callable[[], dict[str, Any]]) -> None:
+        """Keep numbers and tensors, whole or not at all; nothing within a minute of the last time, nor asked for."""
         if time.monotonic() - self._saved_s < _SAVE_EVERY_S:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        partial = self._path.with_name(f"{self._path.name}.partial")
-        torch.save((self._what, kept), partial)
+        partial, content = self._path.with_name(f"{self._path.name}.partial"), io.BytesIO()
+        torch.save((self._what, kept()), content)  # to a full disk torch itself would end in an error of its own
+        with partial.open("wb") as stream:
+            stream.write(content.getbuffer())
+            stream.flush()
+            os.fsync(stream.fileno())
         os.replace(partial, self._path)
         self._saved_s = time.monotonic()

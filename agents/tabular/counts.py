@@ -27,6 +27,7 @@ class CountTable:
         self._index: dict[int, int] = {}
         self._rows: dict[Row, int] = {}
         self._branches: dict[tuple[int, int], list[Row]] = {}
+        self.largest_reward = 0.0  #: of those seen, at least 0
 
     @property
     def states(self) -> int:
@@ -38,11 +39,6 @@ class CountTable:
         """How many pairs of state and action were tried."""
         return len(self._branches)
 
-    @property
-    def largest_reward(self) -> float:
-        """The largest reward seen, at least 0."""
-        return max([0.0, *(row[3] for row in self._rows)])
-
     def add(self, state: int, action: int, following: int, reward: float, terminated: bool) -> bool:
         """Count one transition; whether that changed what the table predicts."""
         for each in (state, following):
@@ -50,6 +46,7 @@ class CountTable:
         row = (state, action, following, reward, terminated)
         seen = row in self._rows
         self._rows[row] = self._rows.get(row, 0) + 1
+        self.largest_reward = max(self.largest_reward, reward)
         if not seen:
             self._branches.setdefault((state, action), []).append(row)
         return not seen or len(self._branches[state, action]) > 1
@@ -100,7 +97,7 @@ class CountTable:
 
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""
-        self._index, self._rows, self._branches = {}, {}, {}
+        self._index, self._rows, self._branches, self.largest_reward = {}, {}, {}, 0.0
         for *row, count in zip(*(arrays[name].tolist() for name in self.arrays()), strict=True):
             self.add(*row)
             self._rows[tuple(row)] = count

@@ -155,8 +155,7 @@ def _verdict(data: ReportData, agent: str) -> str:
     if math.isnan(difference.low):
         return f"{head}; {_alone(comparisons[budget].paired)}one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
-    adjusted = comparisons[budget].p_adjusted
-    chance = "p < 0.001" if adjusted < 0.001 else f"p = {adjusted:.3f}"
+    chance = _chance(comparisons[budget].p_adjusted)
     verdict = {1: "it is ahead", -1: "it is behind", 0: "no difference is shown"}[comparisons[budget].shown]
     return f"{head} ({interval}; {chance}, corrected): at this budget {verdict}. {_over_budgets(comparisons)}"
 
@@ -164,11 +163,14 @@ def _verdict(data: ReportData, agent: str) -> str:
 def _alone(paired: PairedTests | None) -> str:
     if paired is None:
         return ""
-    chance = "p < 0.001" if paired.p < 0.001 else f"p = {paired.p:.3f}"
     return (
-        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({chance}, McNemar's exact "
-        "test of these two trained agents); "
+        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({_chance(paired.p)}, "
+        "McNemar's exact test of these two trained agents); "
     )
+
+
+def _chance(p: float) -> str:
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 
 def _over_budgets(comparisons: dict[int, Comparison]) -> str:

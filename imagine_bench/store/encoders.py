@@ -14,7 +14,7 @@ import platformdirs
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
-from imagine_bench.store.files import read_json, sha256
+from imagine_bench.store.files import lock, make_folder, read_json, sha256
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _SUFFIX = ".safetensors"
@@ -73,13 +73,18 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 
 
 def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
-    """The task's own encoder of a kind; that of another package's task is trained once. Raises as :func:`resolve`."""
+    """The task's own encoder of a kind; that of another package's task is trained once.
+
+    Raises as :func:`resolve`, and BusyError: another process trains it.
+    """
     if spec.id not in registry.TASKS and bundled_name(spec.encoder, appearance, kind) not in bundled():
         path = cached(spec, appearance, kind)
-        if not path.is_file():
-            print(f"{spec.id} has no encoder for {kind} at {appearance}; one is trained into {path.parent}, once.")
-            recipe = "codes" if kind == "codes" else "default"
-            registry.load(_TRAIN)(spec, recipe=recipe, appearance=appearance, seed=0, out=path.parent)
+        make_folder(path.parent)
+        with lock(path.parent / ".lock", f"The folder of encoders {path.parent}"):
+            if not path.is_file():
+                print(f"{spec.id} has no encoder for {kind} at {appearance}; one is trained into {path.parent}, once.")
+                recipe = "codes" if kind == "codes" else "default"
+                registry.load(_TRAIN)(spec, recipe=recipe, appearance=appearance, seed=0, out=path.parent)
         return path
     return resolve(spec, appearance, kind=kind)
 

@@ -85,27 +85,32 @@ _DEVIATIONS = (
 )
 
 
-_THESIS = "imagination"
-
-
 def _rung(name: str, settings: Mapping[str, Any]) -> Variant:
     """A reading of the thesis' imagination, without its filter."""
     settings = {"imagination.start_episode": 300, **settings}
-    return Variant(name=name, factor="reading", agent=_THESIS, against="dqn, two updates", settings=settings)
+    return Variant(name=name, factor="reading", agent="imagination", against="dqn, two updates", settings=settings)
 
 
-_LADDER = (
-    Variant(name=_DQN, factor=BASE, agent=_DQN),
-    Variant(
-        name="dqn, two updates", factor=BASE, agent=_DQN, against=_DQN, settings={"controller.updates_per_step": 2},
+_READINGS = Study(
+    name="ladder", question="At the thesis' settings, what is imagined badly: which reading of the draw helps?",
+    preset="thesis", budgets=(250, 500, 1000), seeds=(1000, 1001, 1002), evaluation_episodes=200, appearance="mild",
+    execution="kinematic",
+    variants=(
+        Variant(name=_DQN, factor=BASE, agent=_DQN),
+        Variant(
+            name="dqn, two updates", factor=BASE, agent=_DQN, against=_DQN, settings={"controller.updates_per_step": 2},
+        ),
+        _rung("average of 50 dropout samples", {"imagination.predicts_with": "average"}),
+        _rung("one dropout sample", {"imagination.predicts_with": "sample"}),
+        _rung("whole network", {"imagination.predicts_with": "network"}),
+        _rung(
+            "whole network, component's mean",
+            {"imagination.predicts_with": "network", "imagination.temperature": 0.0},
+        ),
+        _rung("no dropout", {"model.dropout": 0.0}),
+        _rung("no dropout, component's mean", {"model.dropout": 0.0, "imagination.temperature": 0.0}),
+        _rung("whole network, data of means", {"imagination.predicts_with": "network", "model.spread": 0.0}),
     ),
-    _rung("average of 50 dropout samples", {"imagination.predicts_with": "average"}),
-    _rung("one dropout sample", {"imagination.predicts_with": "sample"}),
-    _rung("whole network", {"imagination.predicts_with": "network"}),
-    _rung("whole network, component's mean", {"imagination.predicts_with": "network", "imagination.temperature": 0.0}),
-    _rung("no dropout", {"model.dropout": 0.0}),
-    _rung("no dropout, component's mean", {"model.dropout": 0.0, "imagination.temperature": 0.0}),
-    _rung("whole network, data of means", {"imagination.predicts_with": "network", "model.spread": 0.0}),
 )  # fmt: skip
 
 
@@ -149,17 +154,7 @@ STUDIES: dict[str, Study] = {
     for study in (
         _study("factors", "When does imagination help? One factor at a time", _FACTORS),
         _study("deviations", "What is a value of the thesis worth in place of that of quick?", _DEVIATIONS),
-        Study(
-            name="ladder",
-            question="At the thesis' settings, what is imagined badly: which reading of the draw helps?",
-            preset="thesis",
-            budgets=(250, 500, 1000),
-            seeds=(1000, 1001, 1002),
-            evaluation_episodes=200,
-            appearance="mild",
-            execution="kinematic",
-            variants=_LADDER,
-        ),
+        _READINGS,
         _CURIOSITY,
         _SMOKE,
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from typing import Any
 
 import gymnasium
@@ -14,8 +15,9 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from imagine_bench import registry
+from imagine_bench.bench.evaluation import play
 from imagine_bench.errors import InvalidValueError, plain
-from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec, Transition
+from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
 from imagine_bench.rules import facts
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -47,7 +49,7 @@ def task_checks(name: str) -> Checks:
     return {
         "its rules are distributions, reach an end and can be won": lambda: _rules(spec),
         "its frames are 64 x 64 RGB bytes and the same for the same generator": lambda: _frames(spec),
-        "Gymnasium's checker is content": lambda: check_env(_env(spec).unwrapped, skip_render_check=True),
+        "Gymnasium's checker is content": lambda: _gymnasium(spec),
         "every start is begun in, and told": lambda: _starts(spec),
         "macro-actions end as the rules say": lambda: _steps(spec),
         "the same seed gives the same episode": lambda: _repeats(spec),
@@ -95,30 +97,34 @@ def _frames(spec: TaskSpec) -> None:
     _require(np.array_equal(one, other), "two calls with equal generators differ")
 
 
+def _gymnasium(spec: TaskSpec) -> None:
+    with closing(_env(spec)) as env:
+        check_env(env.unwrapped, skip_render_check=True)
+
+
 def _starts(spec: TaskSpec) -> None:
-    env = _env(spec)
-    for start in spec.rules.start_states[:_MOST]:
-        _, info = env.reset(seed=0, options={"macrostate": start})
-        _require(info.keys() >= _KEYS, f"info lacks {sorted(_KEYS - info.keys())}")
-        told = tuple(np.asarray(info["macrostate"]).tolist())
-        _require(told == start, f"begun in {start}, it tells {told}")
-    env.close()
+    with closing(_env(spec)) as env:
+        for start in spec.rules.start_states[:_MOST]:
+            _, info = env.reset(seed=0, options={"macrostate": start})
+            _require(info.keys() >= _KEYS, f"info lacks {sorted(_KEYS - info.keys())}")
+            told = tuple(np.asarray(info["macrostate"]).tolist())
+            _require(told == start, f"begun in {start}, it tells {told}")
 
 
 def _steps(spec: TaskSpec) -> None:
-    env, rng = _env(spec), np.random.default_rng(0)
-    over, state = True, spec.rules.start_states[0]
-    for _ in range(_MOST):
-        if over:
-            state = tuple(np.asarray(env.reset(seed=int(rng.integers(1 << 30)))[1]["macrostate"]).tolist())
-        action = int(rng.integers(spec.n_actions))
-        _, reward, terminated, truncated, info = env.step(action)
-        found = (tuple(np.asarray(info["macrostate"]).tolist()), float(reward), terminated, bool(info["is_success"]))
-        allowed = [(o.macrostate, o.reward, o.terminated, o.success) for o in spec.rules.outcomes(state, action)]
-        words = f"action {action} in {state} gave {found}, the rules allow {allowed}"
-        _require(found in allowed or bool(info["fault"]), words)
-        state, over = found[0], terminated or truncated
-    env.close()
+    rng, over, state = np.random.default_rng(0), True, spec.rules.start_states[0]
+    with closing(_env(spec)) as env:
+        for _ in range(_MOST):
+            if over:
+                state = tuple(np.asarray(env.reset(seed=int(rng.integers(1 << 30)))[1]["macrostate"]).tolist())
+            action = int(rng.integers(spec.n_actions))
+            _, reward, terminated, truncated, info = env.step(action)
+            end = tuple(np.asarray(info["macrostate"]).tolist())
+            found = (end, float(reward), terminated, bool(info["is_success"]))
+            allowed = [(o.macrostate, o.reward, o.terminated, o.success) for o in spec.rules.outcomes(state, action)]
+            words = f"action {action} in {state} gave {found}, the rules allow {allowed}"
+            _require(found in allowed or bool(info["fault"]), words)
+            state, over = end, terminated or truncated
 
 
 def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[Any]:
@@ -133,35 +139,22 @@ def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[Any]:
 
 
 def _repeats(spec: TaskSpec) -> None:
-    one, other = _env(spec), _env(spec)
-    _episode(other, 1)
-    for seed in range(3):
-        pairs = zip(_episode(one, seed), _episode(other, seed), strict=True)
-        _require(all(np.array_equal(a, b) for a, b in pairs), f"two episodes of seed {seed} differ")
+    with closing(_env(spec)) as one, closing(_env(spec)) as other:
+        _episode(other, 1)
+        for seed in range(3):
+            pairs = zip(_episode(one, seed), _episode(other, seed), strict=True)
+            _require(all(np.array_equal(a, b) for a, b in pairs), f"two episodes of seed {seed} differ")
 
 
 def _play(spec: TaskSpec, agent: Agent, privileged: bool, episodes: range) -> list[int]:
     """Train for some episodes; returns the actions."""
-    env, actions = _env(spec), []
-
-    def seen(frame: Any, info: dict[str, Any]) -> Observation:
-        return Observation(frame=frame, macrostate=np.asarray(info["macrostate"]) if privileged else None)
-
-    for episode in episodes:
-        now, over = seen(*env.reset(seed=episode)), False
-        while not over:
-            action = agent.act(now, explore=True)
-            _require(0 <= action < spec.n_actions, f"it acts {action}, of {spec.n_actions} macro-actions")
-            frame, reward, terminated, truncated, info = env.step(action)
-            after = seen(frame, info)
-            transition = Transition(
-                observation=now, action=action, reward=float(reward), next_observation=after,
-                terminated=bool(terminated), truncated=bool(truncated),
-            )  # fmt: skip
-            agent.observe(transition, episode=episode)
-            actions.append(action)
-            now, over = after, terminated or truncated
-    env.close()
+    actions = []
+    with closing(_env(spec)) as env:
+        for episode in episodes:
+            for transition, _ in play(env, agent, seed=episode, explore=True, privileged=privileged):
+                _require(0 <= transition.action < spec.n_actions, f"it acts {transition.action} of {spec.n_actions}")
+                agent.observe(transition, episode=episode)
+                actions.append(transition.action)
     return actions
 
 

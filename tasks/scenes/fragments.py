@@ -47,40 +47,48 @@ def fragments(level: Appearance, subject: str, value: int) -> tuple[Fragment, ..
     return tuple(pool)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """All that makes one photograph of a rendered frame."""
+
+    hand: Fragment
+    objects: tuple[Fragment, ...]
+    gamma: float = 1.0
+    noise_seed: int = 0
+
+
 class Photographer:
-    """Draws the fragments of each frame, and makes a rendered frame a photograph of them."""
+    """Draws the fragments of each frame, and makes a rendered frame a photograph of them: its latest ``shot``."""
 
     def __init__(self, level: Appearance) -> None:
         self._level = level
-        self._hand, self._objects = fragments(level, "hand", 0)[0], (fragments(level, "object 0", 0)[0],)
-        self._gamma, self._noise_seed = 1.0, 0
+        self.shot = Shot(hand=fragments(level, "hand", 0)[0], objects=(fragments(level, "object 0", 0)[0],))
 
-    def draw(
-        self, objects: tuple[int, ...], gesture: int, rng: np.random.Generator
-    ) -> tuple[Fragment, tuple[Fragment, ...]]:
-        """New fragments of the hand and of each object, uniformly from their pools; gamma and noise with them."""
-        self._hand = fragments(self._level, "hand", gesture)[int(rng.integers(HAND_FRAGMENTS))]
+    def draw(self, objects: tuple[int, ...], gesture: int, rng: np.random.Generator) -> Shot:
+        """A new shot: fragments of the hand and of each object, uniformly from their pools, gamma and noise."""
+        hand = fragments(self._level, "hand", gesture)[int(rng.integers(HAND_FRAGMENTS))]
         chosen = rng.integers(OBJECT_FRAGMENTS, size=len(objects)).tolist()
-        self._objects = tuple(
-            fragments(self._level, f"object {index}", value)[which]
-            for index, (value, which) in enumerate(zip(objects, chosen, strict=True))
+        pools = [fragments(self._level, f"object {index}", value) for index, value in enumerate(objects)]
+        self.shot = Shot(
+            hand=hand,
+            objects=tuple(pool[which] for pool, which in zip(pools, chosen, strict=True)),
+            gamma=1.0 + self._level.gamma_half_width * rng.uniform(-1.0, 1.0),
+            noise_seed=int(rng.integers(1 << 63)),
         )
-        self._gamma = 1.0 + self._level.gamma_half_width * rng.uniform(-1.0, 1.0)
-        self._noise_seed = int(rng.integers(1 << 63))
-        return self._hand, self._objects
+        return self.shot
 
     def develop(self, frame: Frame) -> Frame:
         """The photograph of a rendered frame (H, W, 3): the same one until the next draw."""
-        height, width, channels = frame.shape
+        shot, (height, width, channels) = self.shot, frame.shape
         light = np.empty((height, width, channels))
-        top, seams = round(height * HAND_SHARE), np.linspace(0, width, len(self._objects) + 1).round().astype(int)
-        light[:top] = _spread(self._hand.light, top, width)
-        for left, right, fragment in zip(seams[:-1], seams[1:], self._objects, strict=True):
+        top, seams = round(height * HAND_SHARE), np.linspace(0, width, len(shot.objects) + 1).round().astype(int)
+        light[:top] = _spread(shot.hand.light, top, width)
+        for left, right, fragment in zip(seams[:-1], seams[1:], shot.objects, strict=True):
             light[top:, left:right] = _spread(fragment.light, height - top, right - left)
-        generator = np.random.default_rng(self._noise_seed)
+        generator = np.random.default_rng(shot.noise_seed)
         noise = generator.standard_normal(frame.shape)
         seen = np.clip(frame / _WHITE * light + self._level.noise_std * noise, 0.0, 1.0)
-        return np.rint(_WHITE * seen**self._gamma).astype(np.uint8)
+        return np.rint(_WHITE * seen**shot.gamma).astype(np.uint8)
 
 
 def _spread(corners: NDArray[np.float64], height: int, width: int) -> NDArray[np.float64]:

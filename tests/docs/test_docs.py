@@ -14,7 +14,8 @@ import gymnasium
 import pytest
 import thesis_elements
 import tyro
-from doc_tables import PAGES, ROOT
+from doc_cells import ROOT
+from doc_tables import PAGES
 
 from imagine_bench.cli import Bench, Command
 from imagine_bench.registry import REGRESSIONS, TASKS

@@ -8,7 +8,8 @@ import runpy
 from pathlib import Path
 
 import pytest
-from doc_tables import PAGES, RESULTS, ROOT, iqm, rewritten, tables, unmarked
+from doc_cells import RESULTS, ROOT, iqm
+from doc_tables import PAGES, rewritten, tables, unmarked
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS

@@ -1,7 +1,7 @@
 """The page docs/thesis.md, made from docs/thesis.csv: every element of the thesis, where it is and what came of it.
 
 ``python tests/docs/thesis_elements.py`` writes it anew. In a cell, ``{iqm(500,arrow_puzzle-quick/dqn)}`` is what
-:mod:`doc_tables` recomputes from the kept results.
+:mod:`doc_cells` computes from the kept results.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import itertools
 import re
 from collections import Counter
 
-from doc_tables import CELLS, ROOT, Compared
+from doc_cells import CELLS, ROOT, Compared
 
 ELEMENTS, PAGE = ROOT / "docs" / "thesis.csv", ROOT / "docs" / "thesis.md"
 VERDICTS = {

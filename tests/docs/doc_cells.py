@@ -1,0 +1,405 @@
+"""Cells of the pages' tables, each computed from docs/results: a function is a word of :mod:`doc_tables`' comments."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench import reference, registry, rules, statistics
+from imagine_bench.store import encoders
+from imagine_bench.store.bench_folder import read_protocol
+from imagine_bench.studies.catalogue import STUDIES
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
+
+Runs = dict[int, list[dict[str, str]]]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A cell that compares two sets of runs: bold where the table's tests, taken together, show a difference."""
+
+    text: str
+    p: float
+    detectable: Callable[..., float]  # of the number of tests
+    bold: bool = True  # false where a difference to that side is no finding
+
+
+# Benches of agents -----------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def runs(where: str) -> Runs:
+    """Rows of one agent in a folder, ``FOLDER/AGENT``, by budget, each in the order of seeds."""
+    folder, _, agent = where.rpartition("/")
+    found: Runs = {}
+    with (RESULTS / folder / "results.csv").open() as file:
+        for row in csv.DictReader(file):
+            if row["agent"] == agent:
+                found.setdefault(int(row["episodes"]), []).append(row)
+    if not found:
+        raise ValueError(f"{where}: no such runs")
+    return {budget: sorted(rows, key=lambda row: int(row["seed"])) for budget, rows in found.items()}
+
+
+def scores(budget: str, where: str, column: str = "success_rate") -> np.ndarray:
+    """One number a seed. Shape (seeds,)."""
+    rows = runs(where)[int(budget)]
+    if column == "success_rate":
+        return np.array([int(row["successes"]) / int(row["test_episodes"]) for row in rows])
+    return np.array([float(row[column]) for row in rows])
+
+
+def trials(budget: str, where: str) -> int:
+    """Test episodes of every seed."""
+    return int(runs(where)[int(budget)][0]["test_episodes"])
+
+
+def _compared(
+    text: str, treated: np.ndarray, base: np.ndarray, tests: int | None, *, only_ahead: bool = False
+) -> Compared:
+    found = statistics.difference(treated, base, trials=tests)
+    size = functools.partial(statistics.detectable, treated, base, trials=tests)
+    return Compared(text, found.p, size, bold=found.value > 0 or not only_ahead)
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def points(share: float) -> str:
+    """With its sign, a real minus."""
+    return f"{100 * share + 0.0:+.1f}".replace("-", "−").replace("+0.0", "0.0").replace("−0.0", "0.0")
+
+
+def iqm(budget: str, where: str) -> str:
+    """Interquartile mean of the success rate, % [95 % interval over seeds]."""
+    values = scores(budget, where)
+    return interval(statistics.iqm(values), *statistics.interval(values, trials=trials(budget, where)))
+
+
+def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
+    """The same; bold where it is ahead of the base. The base itself, and who does not learn, are not tested."""
+    if treated == base or not registry.agent_entry(treated.rpartition("/")[2]).learns:
+        return iqm(budget, treated)
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(iqm(budget, treated), *pair, tests, only_ahead=True)]
+
+
+def interval(value: float, low: float, high: float) -> str:
+    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
+
+
+def signed(estimate: statistics.Estimate) -> str:
+    if np.isnan(estimate.low):
+        return points(estimate.value)
+    return f"{points(estimate.value)} [{points(estimate.low)}, {points(estimate.high)}]"
+
+
+def mean_std(budget: str, where: str) -> str:
+    """Mean (standard deviation), %."""
+    values = scores(budget, where)
+    return f"{percent(values.mean())} ({percent(values.std(ddof=1))})"
+
+
+def average(budget: str, where: str) -> str:
+    """Mean over seeds, %."""
+    return percent(scores(budget, where).mean())
+
+
+def worst_best(budget: str, where: str) -> str:
+    """Mean [worst, best seed], %."""
+    values = scores(budget, where)
+    return f"{percent(values.mean())} [{100 * values.min():.0f}, {100 * values.max():.0f}]"
+
+
+def seeds(budget: str, where: str) -> str:
+    """Every seed, %."""
+    return ", ".join(percent(value) for value in scores(budget, where))
+
+
+def difference(budget: str, treated: str, base: str) -> list[Compared]:
+    """Difference of interquartile means, points [95 %]."""
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests)]
+
+
+def gain(budget: str, treated: str, base: str) -> list[Compared]:
+    """Gain of the means relative to the base, % [95 %]; tested as the difference."""
+    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
+    return [_compared(signed(statistics.gain(*pair, trials=tests)), *pair, tests)]
+
+
+def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
+    """Mean success over all episodes to a budget, %: interquartile mean [95 %]."""
+    budgets = sorted(runs(where))
+    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    means = statistics.running_means(budgets, table, _facts(task).chance_level)[:, budgets.index(int(budget))]
+    return interval(statistics.iqm(means), *statistics.interval(means, trials=trials(budget, where)))
+
+
+def reached(where: str, level: str) -> np.ndarray:
+    """First test of every seed from which on all reach a level; NaN where there is none. Shape (seeds,)."""
+    budgets = sorted(runs(where))
+    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
+    return np.array([np.nan if each is None else each for each in found])
+
+
+def price(budget: str, where: str, what: str) -> str:
+    """What one run has had until a budget, mean over seeds: a column, or frames its encoder saw before."""
+    folder, _, agent = where.rpartition("/")
+    if what == "frames":
+        entry, protocol = registry.agent_entry(agent), read_protocol(RESULTS / folder)
+        card = encoders.card(protocol.encoder_of(entry.encoder_kind)) if entry.needs_encoder else None
+        return "0" if not entry.needs_encoder else "–" if card is None else f"{card['recipe']['frames']:,}"
+    values = [row.get(what) or "nan" for row in runs(where)[int(budget)]]
+    mean = np.mean([float(value) for value in values])
+    return "–" if np.isnan(mean) else f"{mean:,.0f}"
+
+
+def price_to(where: str, level: str, what: str) -> str:
+    """The same until the test from which on all reach a level, mean over seeds."""
+    if what == "frames":
+        return price("0", where, what)
+    budgets = reached(where, level)
+    if np.isnan(budgets).any():
+        return "–"
+    rows = [runs(where)[int(budget)][index] for index, budget in enumerate(budgets)]
+    return f"{np.mean([float(row[what]) for row in rows]):,.0f}"
+
+
+def coverage(seeds_and_stuck: str, what: str) -> str:
+    """A rate of the simulation of intervals and tests, %."""
+    count, stuck = seeds_and_stuck.split("/")
+    (row,) = (
+        row for row in _json("coverage/coverage.json")["rows"]
+        if (row["seeds"], row["stuck"]) == (int(count), float(stuck))
+    )  # fmt: skip
+    return percent(row[what])
+
+
+def episodes_to(where: str, level: str) -> str:
+    """Real episodes to a level, by seed."""
+    return ", ".join("never" if np.isnan(each) else f"{each:.0f}" for each in reached(where, level))
+
+
+def mean_episodes_to(where: str, level: str) -> str:
+    """Their mean."""
+    mean = reached(where, level).mean()
+    return "–" if np.isnan(mean) else f"{mean:.0f}"
+
+
+def first_of(name: str, *arguments: str) -> str:
+    """A cell of all arguments but the last: of a row that names two things, the first."""
+    return CELLS[name](*arguments[:-1])
+
+
+def last_of(name: str, *arguments: str) -> str:
+    """A cell of all arguments but the last but one: of a row that names two things, the second."""
+    return CELLS[name](*arguments[:-2], arguments[-1])
+
+
+@functools.cache
+def _facts(task: str) -> Any:
+    return rules.facts(registry.task(task).rules, registry.task(task).horizon)
+
+
+def thesis(budget: str, task: str, agent: str) -> str:
+    """The thesis' mean (standard deviation), %."""
+    mean, std = reference.success(task, agent)[int(budget)]
+    return f"*{percent(mean)}*" if np.isnan(std) else f"*{percent(mean)} ({percent(std)})*"
+
+
+def thesis_mean(budget: str, task: str, agent: str) -> str:
+    return f"*{percent(reference.success(task, agent)[int(budget)][0])}*"
+
+
+def thesis_gain(budget: str, task: str, agent: str) -> str:
+    return f"*{points(reference.gain(task, agent)[int(budget)])}*"
+
+
+# Studies, models, policies, plans --------------------------------------------------------------------------------
+
+
+@functools.cache
+def _study(folder: str) -> dict[tuple[str, int], list[dict[str, str]]]:
+    found: dict[tuple[str, int], list[dict[str, str]]] = {}
+    with (RESULTS / folder / "results.csv").open() as file:
+        for row in csv.DictReader(file):
+            found.setdefault((row["variant"], int(row["episodes"])), []).append(row)
+    return found
+
+
+def study(budget: str, folder: str, *variants: str) -> str:
+    """Success of variants of a study, %: interquartile means."""
+    return "; ".join(percent(statistics.iqm(_success(folder, variant, budget))) for variant in variants)
+
+
+def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]:
+    """Against what each is compared with, points [95 %]."""
+    found, tests = [], STUDIES["factors"].evaluation_episodes
+    for variant in variants:
+        against = _study(folder)[variant, int(budget)][0]["against"]
+        pair = np.array(_success(folder, variant, budget)), np.array(_success(folder, against, budget))
+        found.append(_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests))
+    return found
+
+
+def _success(folder: str, variant: str, budget: str) -> list[float]:
+    return [float(row["success"]) for row in _study(folder)[variant, int(budget)]]
+
+
+@functools.cache
+def _json(path: str) -> Any:
+    return json.loads((RESULTS / path).read_text())
+
+
+def _answers(folder: str, agent: str, path: str) -> np.ndarray:
+    values: list[Any] = [run for run in _json(f"{folder}/generalisation.json")["runs"] if run["agent"] == agent]
+    for name in path.split("/"):
+        values = [value[name] for value in values]
+    return np.array(values, dtype=float)
+
+
+def answers(folder: str, agent: str, path: str) -> str:
+    """What the models of a bench answered, %: mean [95 % over seeds]."""
+    values = _answers(folder, agent, path)
+    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
+
+
+def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
+    """One of two answers of which a row speaks."""
+    return answers(folder, agent, paths[int(which)])
+
+
+def policy(agent: str, episodes: str, length: str) -> str:
+    """Starts so many turns from a goal that a greedy policy solves, %: mean over seeds and starts."""
+    with (RESULTS / "arrow_puzzle_hard-policy" / "by_length.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["agent"], row["episodes"]) == (agent, episodes)]
+    return percent(float(np.mean([float(row["success"]) for row in rows if row["optimal_length"] == length])))
+
+
+def policy_failure(agent: str, episodes: str) -> str:
+    """Starts from which it breaks a rule, %: mean [95 % over seeds]."""
+    groups = _json("arrow_puzzle_hard-policy/policy.json")
+    chosen = [run for group in groups for run in group["runs"]]
+    values = np.array([run["failure"] for run in chosen if (run["agent"], str(run["episodes"])) == (agent, episodes)])
+    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
+
+
+def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
+    """A count over the plans of an agent; ``solved`` with Wilson's interval where they are of one run."""
+    found = [each for each in _json(f"{folder}/plans.json") if each["agent"] == agent]
+    found = [each for each in found if episodes in ("", str(each["episodes"]))]
+    if key == "as_imagined":
+        return f"{sum(each['steps_as_imagined'] for each in found):,} of {sum(each['steps'] for each in found):,}"
+    total = sum(each[key] for each in found)
+    if key != "solved":
+        return f"{total}"
+    attempted = sum(each["attempted"] for each in found)
+    if len(found) > 1:
+        return f"{total} of {attempted}"
+    low, high = statistics.wilson(total, attempted)
+    return f"{total} of {attempted} [{percent(low)}, {percent(high)}]"
+
+
+def thesis_plans(key: str) -> str:
+    """The same of the thesis; an en dash for what it does not say."""
+    found = reference.load("arrow_puzzle")["plans"]
+    if key == "solved":
+        return f"*{found['solved']} of {found['attempted']}*"
+    return f"*{found['optimal_among_solved']}*" if key == "optimal" else "–"
+
+
+def futures(folder: str, agent: str, measure: str, depth: str) -> str:
+    """Imagined against exact distributions at a depth, mean over runs."""
+    with (RESULTS / folder / "futures.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["agent"], row["depth"]) == (agent, depth)]
+    value = float(np.mean([float(row[measure]) for row in rows]))
+    return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
+
+
+# Regression, speed, rules ----------------------------------------------------------------------------------------
+
+
+def choice(folder: str, network: str, measure: str, criterion: str) -> str:
+    """A cell of choices.csv: mean (standard deviation), or ratio [95 %]."""
+    with (RESULTS / folder / "choices.csv").open() as file:
+        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["measure"]) == (network, measure)]
+    return row[criterion]
+
+
+def thesis_error(criterion: str, samples: str) -> str:
+    mean, std = reference.load("robot_ik")["cumulative_error"]["criteria"][criterion][samples]
+    return f"*{mean:.2f} ({std:.2f})*"
+
+
+def claim(folder: str, network: str, text: str, column: str) -> str:
+    """A cell of claims.csv."""
+    with (RESULTS / folder / "claims.csv").open() as file:
+        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["claim"]) == (network, text)]
+    return row[column]
+
+
+def decomposed(folder: str, network: str, where: str, column: str) -> str:
+    """A cell of the table of equation 4.8."""
+    with (RESULTS / folder / f"decomposition_{network}.csv").open() as file:
+        rows = {next(iter(row.values())): row for row in csv.DictReader(file)}
+    return rows[where][column]
+
+
+def speed(machine: str, what: str) -> str:
+    """A measured figure of ``make speed``; an en dash where that machine has none."""
+    found = [each for each in _json(f"speed/{machine}.json")["figures"] if each["what"].removeprefix(_TASK) == what]
+    return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
+
+
+def margin(task: str, setting: str, value: str) -> str:
+    """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
+    points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
+    point = points[value]
+    return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
+
+
+def walked(task: str, sense: str) -> str:
+    """Macro-actions as ruled without a reset; furthest drift of an object; every length where a fault ended a walk."""
+    (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
+    text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
+    return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
+
+
+_TASK = "arrow_puzzle: "
+
+
+def goals_and_starts(task: str) -> str:
+    spec = registry.task(task)
+    goals = [state for state in spec.rules.states if spec.rules.is_terminal(state) and spec.rules.is_legal(state)]
+    return f"{len(goals)} / {len(spec.rules.start_states)}"
+
+
+def chance_exact(task: str) -> str:
+    return f"{100 * _facts(task).chance_level:.3f}"
+
+
+def shortest(task: str) -> str:
+    return f"{_facts(task).mean_plan_length:.3f}"
+
+
+CELLS: dict[str, Callable[..., str | list[Compared]]] = {
+    function.__name__: function
+    for function in (
+        iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
+        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
+        last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
+        claim, decomposed, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
+    )
+}  # fmt: skip
