@@ -61,12 +61,23 @@ class Controller(nn.Module):
         return self.network(z)
 
     def loss(self, batch: Batch) -> Tensor:
-        """Mean squared Bellman error; no gradient flows through the targets."""
+        """Mean squared Bellman error, weighted where the batch has weights; no gradient flows through the targets."""
+        q, target = self._sides(batch)
+        if batch.weight is None:
+            return functional.mse_loss(q, target)
+        return (batch.weight * (q - target).square()).mean()
+
+    @torch.no_grad()
+    def errors(self, batch: Batch) -> Tensor:
+        """Bellman errors ``Q(z, a)`` less target. Shape (B,)."""
+        q, target = self._sides(batch)
+        return q - target
+
+    def _sides(self, batch: Batch) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
             q_next = self.target(batch.next_z)
             target = td_target(batch.reward, batch.terminated, q_next, self.settings.discount)
-        q = self.network(batch.z).gather(1, batch.action.unsqueeze(1)).squeeze(1)  # [B]
-        return functional.mse_loss(q, target)
+        return self.network(batch.z).gather(1, batch.action.unsqueeze(1)).squeeze(1), target
 
     def update(self, batch: Batch) -> float:
         """One step of Adam; the loss before it. DivergedError, and weights as they were, if that is not finite."""
@@ -97,7 +108,8 @@ class DQN:
         self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
         self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
-        self.real = RealMemory(settings.memory.real, perception.latent_size, device)
+        prioritised = settings.memory.priority > 0.0
+        self.real = RealMemory(settings.memory.real, perception.latent_size, device, prioritised=prioritised)
         self.meters = Meters()
         self.steps = self.updates = 0
 
@@ -139,11 +151,17 @@ class DQN:
             for _ in range(updates if len(memory) else 0):
                 batch = self.draw_batch(memory)
                 self.meters.add("loss/bellman", self.controller.update(batch))
+                if batch.rows is not None:
+                    self.real.prioritise(batch.rows, self.controller.errors(batch))
                 self.updates += 1
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """Transitions of a memory, with the rewards that the controller is to learn from."""
-        return memory.sample(self.settings.controller.batch_size, self._replay)
+        count, settings = self.settings.controller.batch_size, self.settings.memory
+        if settings.priority > 0.0 and isinstance(memory, RealMemory):
+            exponent, correction = settings.priority, settings.priority_correction
+            return memory.sample_prioritised(count, self._replay, exponent=exponent, correction=correction)
+        return memory.sample(count, self._replay)
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""

@@ -59,6 +59,11 @@ class ReplaySettings:
     """How many real transitions are kept; the oldest go first (thesis 5.2.2)."""
 
     real: int = setting(50_000, ROWS)
+    #: The controller replays real transitions in proportion to |Bellman error| to this power (prioritised replay,
+    #: Schaul et al. 2016); 0, the thesis: all alike.
+    priority: float = setting(0.0, NOT_NEGATIVE)
+    #: How far weights of the loss correct for that, in [0, 1].
+    priority_correction: float = setting(0.4, PROBABILITY)
 
 
 @dataclass(frozen=True, kw_only=True)

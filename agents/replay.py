@@ -7,7 +7,7 @@ A row is one transition with both its ends, so no batch ever pairs states of two
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,7 +24,8 @@ Posterior = tuple[Tensor, Tensor]
 class Batch:
     """B transitions between latents ``z`` and ``next_z`` (B, Z) by ``action`` (B,), int64, with ``reward`` (B,).
 
-    ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0.
+    ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0. Of prioritised draws,
+    ``rows`` (B,), int64, are where the memory holds them and ``weight`` (B,) is what their errors count, at most 1.
     """
 
     z: Tensor
@@ -32,6 +33,8 @@ class Batch:
     reward: Tensor
     next_z: Tensor
     terminated: Tensor
+    rows: Tensor | None = None
+    weight: Tensor | None = None
 
     def split(self, size: int) -> list[Batch]:
         """Batches of ``size`` transitions each, one behind another."""
@@ -72,7 +75,7 @@ class _Ring:
             index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
         else:
             index = torch.multinomial(weights, count, replacement=True, generator=generator)
-        return {name: column.index_select(0, index) for name, column in self._columns.items()}
+        return {"rows": index, **{name: column.index_select(0, index) for name, column in self._columns.items()}}
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Copies of the filled rows, by column."""
@@ -86,9 +89,14 @@ class _Ring:
 
 
 class RealMemory(_Ring):
-    """Transitions that happened, as posteriors of their latents."""
+    """Transitions that happened, as posteriors of their latents; with ``prioritised``, each with its latest error."""
 
     _latents = ("mu", "sigma", "next_mu", "next_sigma")
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device, *, prioritised: bool = False) -> None:
+        super().__init__(capacity, latent_size, device)
+        if prioritised:
+            self._columns["error"] = torch.zeros(capacity, device=device)
 
     def add(
         self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool
@@ -98,6 +106,8 @@ class RealMemory(_Ring):
         columns["mu"][row], columns["sigma"][row] = posterior
         columns["next_mu"][row], columns["next_sigma"][row] = next_posterior
         columns["action"][row], columns["reward"][row], columns["terminated"][row] = action, reward, float(terminated)
+        if "error" in columns:  # what was never replayed comes first
+            columns["error"][row] = columns["error"][: len(self)].max() if len(self) else 1.0
         self.added += 1
 
     def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
@@ -106,7 +116,26 @@ class RealMemory(_Ring):
         A transition's probability is proportional to n ** -balance, with n the number of those of the same reward and
         end: 0 makes all transitions equally likely, 1 all outcomes.
         """
-        rows = self._draw(count, generator, self._weights(balance) if balance else None)
+        return self._batch(self._draw(count, generator, self._weights(balance) if balance else None), generator, spread)
+
+    def sample_prioritised(
+        self, count: int, generator: torch.Generator, *, exponent: float, correction: float
+    ) -> Batch:
+        """Draw transitions in proportion to error ** exponent, with the weights that correct for it.
+
+        Proportional prioritised replay (Schaul et al. 2016): weight = (N P) ** -correction, over the largest drawn.
+        """
+        shares = self._columns["error"][: len(self)] ** exponent
+        rows = self._draw(count, generator, shares)
+        weight = shares[rows["rows"]] ** -correction
+        return replace(self._batch(rows, generator, 1.0), rows=rows["rows"], weight=weight / weight.max())
+
+    def prioritise(self, rows: Tensor, errors: Tensor) -> None:
+        """Keep the latest Bellman errors (B,) of some rows (B,), at least a millionth so that all can be drawn."""
+        self._columns["error"][rows] = errors.abs().clamp(min=1e-6)
+
+    @staticmethod
+    def _batch(rows: dict[str, Tensor], generator: torch.Generator, spread: float) -> Batch:
         noise = torch.empty(2, *rows["mu"].shape, device=generator.device).normal_(generator=generator) * spread
         z = torch.addcmul(rows["mu"], rows["sigma"], noise[0])
         next_z = torch.addcmul(rows["next_mu"], rows["next_sigma"], noise[1])
@@ -156,7 +185,8 @@ class ImaginedMemory(_Ring):
 
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """Draw transitions with replacement."""
-        return Batch(**self._draw(count, generator))
+        drawn = self._draw(count, generator)
+        return Batch(**{name: drawn[name] for name in self._columns})
 
 
 Transitions = RealMemory | ImaginedMemory

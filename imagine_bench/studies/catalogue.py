@@ -114,6 +114,25 @@ _READINGS = Study(
 )  # fmt: skip
 
 
+_CONTROLLER = Study(
+    name="controller", question="What do the thesis' remarks on its DQN come to here?", preset="thesis",
+    budgets=(500, 1000, 2000), seeds=(1000, 1001, 1002, 1003, 1004), evaluation_episodes=300, appearance="mild",
+    execution="kinematic",
+    variants=(
+        Variant(name=_DQN, factor=BASE, agent=_DQN),
+        *(
+            Variant(name=name, factor=factor, agent=_DQN, against=_DQN, settings=settings)
+            for factor, name, settings in (
+                ("updates a step", "two", {"controller.updates_per_step": 2}),
+                ("updates a step", "four", {"controller.updates_per_step": 4}),
+                ("targets", "target network", {"controller.target_rate": 0.02}),
+                ("replay", "prioritised", {"memory.priority": 0.6}),
+            )
+        ),
+    ),
+)  # fmt: skip
+
+
 def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
     """At low budgets, where agents differ most."""
     return Study(
@@ -155,6 +174,7 @@ STUDIES: dict[str, Study] = {
         _study("factors", "When does imagination help? One factor at a time", _FACTORS),
         _study("deviations", "What is a value of the thesis worth in place of that of quick?", _DEVIATIONS),
         _READINGS,
+        _CONTROLLER,
         _CURIOSITY,
         _SMOKE,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -51,6 +52,10 @@ def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
         bootstrap = 0.0 if rows.terminated[i] else 0.9 * following[i].max()
         errors.append((1.0 + bootstrap - values[i, rows.action[i]]) ** 2)
     torch.testing.assert_close(controller.loss(rows).detach(), torch.stack(errors).mean())
+    torch.testing.assert_close(controller.errors(rows).square(), torch.stack(errors))
+    weight = torch.tensor([1.0, 0.5, 0.0, 0.25, 1.0])
+    weighted = controller.loss(replace(rows, weight=weight)).detach()
+    torch.testing.assert_close(weighted, (weight * torch.stack(errors)).mean())
 
 
 def test_no_gradient_flows_through_the_target() -> None:

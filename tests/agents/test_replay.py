@@ -117,3 +117,32 @@ def test_one_reward_with_and_without_an_end_is_two_outcomes() -> None:
     for reward, terminated in ((1.0, 1.0), (1.0, 0.0), (2.0, 0.0)):
         share = ((drawn.reward == reward) & (drawn.terminated == terminated)).float().mean()
         assert float(share) == pytest.approx(1.0 / 3.0, abs=0.01)
+
+
+def test_prioritised_draws_are_in_proportion_to_errors() -> None:
+    memory, generator = RealMemory(4, 2, CPU, prioritised=True), torch.Generator().manual_seed(0)
+    fill(memory, 4)
+    errors = torch.tensor([1.0, -4.0, 9.0, 0.0])
+    memory.prioritise(torch.arange(4), errors)
+    batch = memory.sample_prioritised(40_000, generator, exponent=0.5, correction=1.0)
+    shares = torch.bincount(batch.rows, minlength=4) / 40_000
+    torch.testing.assert_close(shares, torch.tensor([1.0, 2.0, 3.0, 0.001]) / 6.001, atol=0.01, rtol=0.0)
+    assert torch.equal(batch.z[:, 0].long(), batch.rows) and float(batch.weight.max()) == 1.0
+    seen = batch.rows < 3  # corrected in full, each of them counts alike in the mean
+    counted = [float(batch.weight[batch.rows == row].sum()) for row in range(3)]
+    assert max(counted) < 1.05 * min(counted) and seen.sum() > 39_900
+
+
+def test_what_was_never_replayed_is_drawn_first() -> None:
+    memory, generator = RealMemory(4, 2, CPU, prioritised=True), torch.Generator().manual_seed(0)
+    fill(memory, 3)
+    memory.prioritise(torch.arange(3), torch.tensor([0.0, 100.0, 0.0]))
+    fill(memory, 1)
+    rows = memory.sample_prioritised(2_000, generator, exponent=1.0, correction=0.0).rows
+    assert set(rows.tolist()) == {1, 3}
+    kept, other = memory.arrays(), RealMemory(4, 2, CPU, prioritised=True)
+    other.load(kept, memory.added)
+    again = [
+        m.sample_prioritised(9, torch.Generator().manual_seed(1), exponent=1.0, correction=0.0) for m in (memory, other)
+    ]
+    assert torch.equal(again[0].rows, again[1].rows)

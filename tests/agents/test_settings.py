@@ -83,6 +83,7 @@ def test_the_defaults_are_the_published_numbers_of_chapter_5() -> None:
         "model.predict_change": False,
         "model.gradient_clip": None,
         "controller.target_rate": 1.0,
+        "memory.priority": 0.0,
         "imagination.end_episode": None,
         "imagination.start_states": "current",
         "imagination.exploration": 0.0,
