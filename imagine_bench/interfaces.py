@@ -293,6 +293,36 @@ class Motion:
     poses_in_world: NDArray[np.float64]  #: position (m) and quaternion (w, x, y, z). Shape (K, B, 7).
 
 
+@dataclass(frozen=True, kw_only=True)
+class ArmMotion:
+    """How the arm moved during one macro-action; joints from the base to the wrist, what is commanded holds from then.
+
+    Rows are the samples of :class:`Motion`: ``capture_motion_hz`` a second, and the last moment.
+    """
+
+    time_s: NDArray[np.float64]  #: seconds since the macro-action began, ascending. Shape (K,).
+    joint_rad: NDArray[np.float64]  #: Shape (K, 7).
+    joint_rad_s: NDArray[np.float64]  #: Shape (K, 7).
+    gripper_m: NDArray[np.float64]  #: each finger's distance from the grip's middle. Shape (K, 2).
+    joint_command_rad: NDArray[np.float64]  #: what the servos are told, feed-forward included. Shape (K, 7).
+    gripper_command_m: NDArray[np.float64]  #: the same of the fingers. Shape (K, 2).
+    #: the point between the fingers: position (m) and quaternion (w, x, y, z). Shape (K, 7).
+    tcp_in_world: NDArray[np.float64]
+
+
+@runtime_checkable
+class ArmReader(Protocol):
+    """An environment (``env.unwrapped``) with an arm whose motion can be read."""
+
+    capture_motion_hz: float  #: samples of the motion a second kept during :meth:`step`; 0 keeps none
+
+    def arm_motion(self) -> ArmMotion:
+        """The latest macro-action's as captured; where nothing was, one sample of the standing scene (K = 1)."""
+
+    def agent_film(self) -> Frame:
+        """What the agent's camera sees at each sample. Shape (K, 64, 64, 3)."""
+
+
 @runtime_checkable
 class SceneReader(Protocol):
     """An environment (``env.unwrapped``) whose scene can be drawn elsewhere, such as in Rerun."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
 from collections.abc import Mapping
@@ -11,7 +12,8 @@ from typing import Any
 
 import gymnasium
 
-from imagine_bench.errors import InvalidValueError, SetupError, brief, plain, require_known
+from imagine_bench.entrants import entrant
+from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, brief, plain, require_known
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
@@ -312,13 +314,17 @@ def register_env(entry: TaskEntry) -> None:
 
 
 def agent_entry(name: str) -> AgentEntry:
-    """The registry line of an agent, this suite's or an installed package's.
+    """The registry line of an agent, this suite's or an installed package's; an entrant's title says its settings.
 
     Raises:
         UnknownNameError: No such agent.
         SetupError: As :func:`task_entry`.
     """
-    return _entry("agent", name, AGENTS, AGENT_GROUP)
+    if not isinstance(name, str) or ":" not in name or name in offers(AGENT_GROUP):
+        return _entry("agent", name, AGENTS, AGENT_GROUP)
+    one = entrant(name)
+    entry: AgentEntry = _entry("agent", one.agent, AGENTS, AGENT_GROUP)
+    return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
 def setting_names(agent: str) -> frozenset[str]:
@@ -327,9 +333,17 @@ def setting_names(agent: str) -> frozenset[str]:
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a protocol's overrides that this agent has settings for; the others are another agent's."""
-    names = setting_names(agent) if overrides else frozenset()
-    return {name: value for name, value in overrides.items() if name in names}
+    """Those of a protocol's overrides that this agent has settings for, and above them those of an entrant's own.
+
+    Raises:
+        UnknownNameError: The agent has no setting that the entrant's name gives it.
+    """
+    own = entrant(agent).settings
+    names = setting_names(agent) if overrides or own else frozenset()
+    for name in own:
+        if name not in names:
+            raise UnknownNameError("setting", name, sorted(names))
+    return {**{name: value for name, value in overrides.items() if name in names}, **own}
 
 
 def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:

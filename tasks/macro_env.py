@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 
 from .motion.executor import MacroResult
 from .rendering import Renderer, View
-from .scene_reader import DRAWN_GROUPS, body_names, poses_of, shapes_of
+from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, shapes_of
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
@@ -27,6 +27,7 @@ from .world import World, WorldState
 
 FRAME_PX = 64
 MAX_IMAGE_PX = 4096
+MAX_MOTION_HZ = 1000
 _ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
@@ -77,10 +78,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render`, by name.
         physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
+        motion_hz: :attr:`capture_motion_hz`.
 
     Raises:
         UnknownNameError: An unknown execution, appearance, render mode, camera or physics setting.
-        InvalidValueError: An image size or a physics setting out of range.
+        InvalidValueError: An image size, a physics setting or a rate out of range.
 
     Version History: v0, the first.
     """
@@ -99,6 +101,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         height: int = 480,
         camera: str = HUMAN_CAMERA,
         physics: PhysicsSettings | Mapping[str, Any] = PhysicsSettings(),  # noqa: B008 - frozen
+        motion_hz: float = 0.0,
     ) -> None:
         modes = self.metadata["render_modes"]
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
@@ -115,7 +118,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._agent_camera = agent_camera(self.world.model)
         self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
-        self.capture_motion_hz = 0.0
+        self.capture_motion_hz = motion_hz
         self._begun, self._macrostate = False, self._starts[0]
         self._latest: MacroResult | None = None
         self._people = self._mocap()
@@ -213,6 +216,17 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
+    @property
+    def capture_motion_hz(self) -> float:
+        """Samples a simulated second that :meth:`step` keeps of a motion, 0 (none) to 1000; nothing else changes."""
+        return self._capture_motion_hz
+
+    @capture_motion_hz.setter
+    def capture_motion_hz(self, rate_hz: float) -> None:
+        if not isinstance(rate_hz, (int, float)) or not 0 <= rate_hz <= MAX_MOTION_HZ:
+            raise InvalidValueError(f"Motion cannot be captured at {brief(rate_hz)} Hz; give 0 to {MAX_MOTION_HZ}.")
+        self._capture_motion_hz = float(rate_hz)
+
     def shapes(self) -> tuple[Shape3D, ...]:
         """Every drawable part, arm included."""
         return shapes_of(self.world.model)
@@ -232,6 +246,13 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             poses = np.concatenate([poses, standing])
         return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
 
+    def arm_motion(self) -> ArmMotion:
+        """The arm during the latest macro-action as captured, else one sample of the standing scene."""
+        latest, model, data = self._latest, self.world.model, self.world.data
+        if latest is None or not len(latest.time_s):
+            return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
+        return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
+
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
         return self.world.develop(self._agent_camera.frame(self.world.data))
@@ -248,6 +269,10 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
     def film(self, width: int = 640, height: int = 480) -> Frame:
         """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
         return np.stack([self.human_view(width, height) for _ in self.replay()])
+
+    def agent_film(self) -> Frame:
+        """What the agent's camera sees at each sample that :meth:`arm_motion` gives. Shape (K, 64, 64, 3)."""
+        return np.stack([self.agent_view() for _ in self.replay()])
 
     # --- MuJoCo --------------------------------------------------------------------------------------------------
 
@@ -276,12 +301,12 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
             for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
                 world.data.qpos[:] = qpos
-                mujoco.mj_kinematics(world.model, world.data)
+                world.update()
                 yield time_s
         finally:
             world.data.qpos[:] = standing
             world.data.mocap_pos[:], world.data.mocap_quat[:] = people
-            mujoco.mj_kinematics(world.model, world.data)
+            world.update()
 
     # --- details -------------------------------------------------------------------------------------------------
 

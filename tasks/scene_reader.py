@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Shape3D
+from imagine_bench.interfaces import ArmMotion, Floats, Shape3D
 
+from .scenes.arm import ARM_JOINTS, FINGER_JOINTS, TCP_SITE
 from .scenes.constants import ARM_GROUP, SCENE_GROUP, SETTING_GROUP
 
 DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
@@ -78,3 +79,25 @@ def poses_of(
         mujoco.mj_kinematics(model, data)
         poses[row, :, :3], poses[row, :, 3:] = data.xpos, data.xquat
     return poses
+
+
+def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Floats, ctrl: Floats) -> ArmMotion:
+    """The arm's part of a scene's motion: times (K,), positions (K, nq), velocities (K, nv) and commands (K, nu)."""
+    data, tcp, poses = mujoco.MjData(model), model.site(TCP_SITE).id, np.empty((len(qpos), 7))
+    for positions, pose in zip(qpos, poses, strict=True):
+        data.qpos[:] = positions
+        mujoco.mj_kinematics(model, data)
+        pose[:3] = data.site_xpos[tcp]
+        mujoco.mju_mat2Quat(pose[3:], data.site_xmat[tcp])
+    (arm, fingers), (arm_dofs, _), (arm_servos, finger_servos) = (
+        [[int(number(name)) for name in names] for names in (ARM_JOINTS, FINGER_JOINTS)]
+        for number in (
+            lambda name: model.joint(name).qposadr[0],
+            lambda name: model.joint(name).dofadr[0],
+            lambda name: model.actuator(name.replace("_slide", "") + "_servo").id,
+        )
+    )
+    return ArmMotion(
+        time_s=time_s, joint_rad=qpos[:, arm], joint_rad_s=qvel[:, arm_dofs], gripper_m=qpos[:, fingers],
+        joint_command_rad=ctrl[:, arm_servos], gripper_command_m=ctrl[:, finger_servos], tcp_in_world=poses,
+    )  # fmt: skip

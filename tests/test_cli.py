@@ -14,7 +14,8 @@ import pytest
 
 from imagine_bench.bench.launchers import LAUNCHERS
 from imagine_bench.bench.local import LocalPool
-from imagine_bench.cli import main, parse_settings
+from imagine_bench.cli import main
+from imagine_bench.entrants import parse_settings
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.protocols.task_types import task_types

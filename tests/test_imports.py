@@ -12,14 +12,15 @@ import pytest
 _TOP = Path(__file__).parent.parent
 _VOCABULARY = {"errors", "seeding", "interfaces", "capabilities", "rules", "preprocessing", "regression.interfaces"}
 """What every room may import, and all that tasks and agents may take from imagine_bench."""
-_DATA = {"registry", "protocols", "store"}
+_DATA = {"entrants", "registry", "protocols", "store"}
 ARROWS: dict[str, set[str]] = {
     "statistics": set(),
     "reference": set(),
-    "registry": set(),
+    "entrants": set(),
+    "registry": {"entrants"},
     "machine": {"registry"},
-    "protocols": {"registry"},
-    "store": {"registry", "protocols", "statistics"},
+    "protocols": {"entrants", "registry"},
+    "store": {"entrants", "registry", "protocols", "statistics"},
     "bench": {*_DATA, "machine"},
     "judge": {*_DATA, "statistics"},
     "recording": {*_DATA, "judge"},

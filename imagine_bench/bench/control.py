@@ -9,6 +9,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.queries import require_able
+from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
@@ -43,7 +44,7 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
 
 def _rests_on_others(agent: str) -> bool:
     """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
-    return registry.agent_entry(agent).external_training_loop or agent not in registry.AGENTS
+    return registry.agent_entry(agent).external_training_loop or entrant(agent).agent not in registry.AGENTS
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:

@@ -32,8 +32,8 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False) -> Env:
     """The environment of a task as a protocol has it, for training or for tests."""
     return gymnasium.make(
         registry.task_entry(task).env_id,
-        execution=protocol.execution,
-        appearance=protocol.test_appearance if testing else protocol.appearance,
+        **protocol.world,
+        appearance=protocol.appearance_in_tests if testing else protocol.appearance,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
 
@@ -42,7 +42,7 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False) -> Env:
 def environments(protocol: Protocol) -> Iterator[tuple[Env, Env]]:
     """The environments of training and of tests; one and the same unless tests have looks of their own."""
     with closing(make_env(protocol, protocol.task)) as env:
-        if protocol.test_appearance == protocol.appearance:
+        if protocol.appearance_in_tests == protocol.appearance:
             yield env, env
             return
         with closing(make_env(protocol, protocol.task, testing=True)) as test_env:

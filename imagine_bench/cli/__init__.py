@@ -15,12 +15,10 @@ import tyro
 
 from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
-from imagine_bench.cli.benches import Bench, List, Report, Study, parse_settings
+from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.tools import Check, Coverage, Doctor, Encoder, Film, Margins, New, Speed, View
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, brief, plain
 from imagine_bench.store.files import reason
-
-__all__ = ["INTERRUPTED", "main", "parse_settings"]
 
 _LONGEST_WORD = 1000
 INTERRUPTED = 130

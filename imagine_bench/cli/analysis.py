@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from imagine_bench.cli.benches import parse_settings
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, shown
+from imagine_bench.entrants import parse_settings
 from imagine_bench.interfaces import EXECUTIONS
 
 

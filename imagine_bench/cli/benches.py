@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +12,8 @@ from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
-from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.entrants import parse_settings
+from imagine_bench.errors import require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Encoders, Result, task_type, task_types
@@ -36,7 +35,7 @@ class Bench:
     preset: str = "quick"
     """Size of the comparison; 'imagine-bench list' names them."""
     agents: Annotated[tuple[str, ...] | None, listed("STR")] = None
-    """Agents to compare."""
+    """Agents to compare; one with settings of its own is written 'dqn:controller.discount=0.99'."""
     seeds: Annotated[tuple[int, ...] | None, listed("INT")] = None
     """Seeds; each agent has one run a seed."""
     budgets: Annotated[tuple[int, ...] | None, listed("INT")] = None
@@ -47,6 +46,10 @@ class Bench:
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
     """How much light, colors and poses vary: clean, mild, strong, or photo (a finite pool)."""
+    test_appearance: Annotated[str | None, shown("STR", "(default: the training's)")] = None
+    """The appearance in tests."""
+    physics: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
+    """What decides whether a grasp holds, as name=value, such as pad_friction=0.5."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR")] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
     networks: Annotated[int | None, shown("INT")] = None
@@ -81,12 +84,14 @@ class Bench:
         for name in _LISTS:
             require_values(name, getattr(self, name))
         names = (
-            *_LISTS, "evaluation_episodes", "execution", "appearance", "networks", "encoder", "after_episodes",
-            "demonstrations", "queries", "feedback", "feedback_error",
+            *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
+            "after_episodes", "demonstrations", "queries", "feedback", "feedback_error",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None
         given = {name: value for name, value in options.items() if value is not None}
+        if self.physics:
+            given["physics"] = parse_settings(added_up("physics", self.physics), "--physics")
         overrides = parse_settings(added_up("set", self.set))
         return plan(self.task, self.preset, device=self.device, overrides=overrides, **given)
 
@@ -173,29 +178,6 @@ class List:
             print(f"{title:22}{', '.join(names)}")
         for error in registry.refused_offers().values():
             print(f"\n{error}")
-
-
-def parse_settings(pairs: Sequence[str]) -> tuple[tuple[str, Any], ...]:
-    """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
-
-    Raises InvalidValueError: a word without ``=``, or a name given twice.
-    """
-    settings: dict[str, Any] = {}
-    for pair in pairs:
-        name, equals, text = pair.partition("=")
-        if not equals or not name:
-            raise InvalidValueError(f"--set {pair!r} is not of the form name=value, such as controller.discount=0.9.")
-        if name in settings:
-            raise InvalidValueError(f"--set names {name!r} twice; give it once.")
-        settings[name] = _value(text)
-    return tuple(sorted(settings.items()))
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return text
 
 
 _REPORTS = {"control": "imagine_bench.report", "regression": "imagine_bench.regression.report"}

@@ -33,7 +33,7 @@ class OpenLoopObserver(RunObserver):
                 run.task,
                 starts=run.protocol.open_loop_starts,
                 depth=OPEN_LOOP_DEPTH,
-                appearance=run.protocol.test_appearance,
+                appearance=run.protocol.appearance_in_tests,
                 purpose=evaluation_split(run.spec.seed),
             )
         if not self._starts:
@@ -55,7 +55,7 @@ class FuturesObserver(RunObserver):
             run.agent,
             run.task,
             samples=protocol.sampled_futures,
-            appearance=protocol.test_appearance,
+            appearance=protocol.appearance_in_tests,
             seeds=SeedTree(run.spec.seed).child("futures", budget),
             purpose=evaluation_split(run.spec.seed),
         )
@@ -70,7 +70,7 @@ class ExamplesObserver(RunObserver):
         if not isinstance(run.agent, Imaginer):
             return {}
         run.tell("imagining", at_once=True)
-        agent, task, appearance, seeds = run.agent, run.task, run.protocol.test_appearance, SeedTree(run.spec.seed)
+        agent, task, appearance, seeds = run.agent, run.task, run.protocol.appearance_in_tests, SeedTree(run.spec.seed)
         purpose, several = evaluation_split(run.spec.seed), seeds.child("sampled_rollouts")
         return {
             "imagined": examples(agent, task, appearance=appearance, seeds=seeds.child("examples"), purpose=purpose),
@@ -96,8 +96,8 @@ class RecordingObserver(RunObserver):
             run.agent,
             name=run.spec.agent,
             seed=run.spec.seed,
-            execution=protocol.execution,
-            appearance=protocol.test_appearance,
+            world=protocol.world,
+            appearance=protocol.appearance_in_tests,
             episodes=protocol.recorded_episodes,
             path=run_folder.recording_path(run.folder),
         )

@@ -92,7 +92,7 @@ def make_plans(trained: Trained, *, count: int, execution: str, max_epistemic: f
 def make_env(trained: Trained, execution: str) -> gymnasium.Env[Any, Any]:
     """The environment that plans are carried out in, at the appearance the agent is tested at."""
     entry = registry.task_entry(trained.spec.protocol.task)
-    appearance = trained.spec.protocol.test_appearance
+    appearance = trained.spec.protocol.appearance_in_tests
     return gymnasium.make(entry.env_id, execution=execution, appearance=appearance, disable_env_checker=True)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+from dataclasses import dataclass, field
 from typing import Any
 
+from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, appearance_of_tests
-from imagine_bench.protocols.data import MOST, ProtocolData, require_ascending, require_different, require_seeds
+from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
+from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
@@ -29,7 +31,7 @@ class Protocol(ProtocolData):
     config_group: str = "chapter_5"  #: config group of the agents' settings, as the task names it
     #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
-    agents: tuple[str, ...] = _ALL_AGENTS
+    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entrants`)
     seeds: tuple[int, ...] = (0, 1, 2)
     #: Real training episodes at which the agent is evaluated, ascending.
     budgets: tuple[int, ...] = (100, 250, 500)
@@ -56,15 +58,23 @@ class Protocol(ProtocolData):
     queries: int = 0  #: Most oracle queries of a learner in a training episode
     #: Reward on top of the world's own for a macro-action of its own that an optimal agent could have chosen, and less
     #: for another: a teacher's feedback in training. Demonstrations and earlier tasks get none.
-    feedback: float = 0.0
-    feedback_error: float = 0.0  #: Probability with which the teacher says the opposite, at most 0.5
+    feedback: float = field(default=0.0, metadata=LATER)
+    #: Probability with which the teacher says the opposite, at most 0.5.
+    feedback_error: float = field(default=0.0, metadata=LATER)
+    #: Appearance of the tests where it is another one than the training's.
+    test_appearance: str | None = field(default=None, metadata=LATER)
+    #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
+    #: (name, value) pairs.
+    physics: tuple[tuple[str, Any], ...] = field(default=(), metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         task_entry(self.task)
+        object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
         for agent in self.agents:
             agent_entry(agent)
-        require_known("appearance", self.appearance, APPEARANCES)
+        for appearance in (self.appearance, self.test_appearance or self.appearance):
+            require_known("appearance", appearance, APPEARANCES)
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)
@@ -79,6 +89,7 @@ class Protocol(ProtocolData):
                 f"feedback is {brief(self.feedback)} and feedback_error {brief(self.feedback_error)}; give a reward of "
                 f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
             )
+        self._require_physics()
         require_same_world(self.task, self.after)
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(
@@ -91,10 +102,30 @@ class Protocol(ProtocolData):
         tests = self.evaluation_episodes
         return self.episodes_before + budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
 
+    def _require_physics(self) -> None:
+        """One way to write each setting; errors as of :class:`.PhysicsSettings`, and where nothing would feel them."""
+        settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
+        usual = dataclasses.asdict(PhysicsSettings())
+        changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
+        object.__setattr__(self, "physics", changed)
+        if changed and self.execution == "kinematic":
+            raise InvalidValueError("Physics settings change nothing in kinematic execution; give --execution physics.")
+
     @property
-    def test_appearance(self) -> str:
-        """The appearance that tests have."""
-        return appearance_of_tests(self.appearance)
+    def appearance_in_tests(self) -> str:
+        """The appearance that tests have; of finitely many looks, those kept for tests."""
+        return appearance_of_tests(self.test_appearance or self.appearance)
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the environments of this protocol are made with, but for their appearance."""
+        return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {})}
+
+    @property
+    def looks(self) -> str:
+        """The appearance in words: ``clean``, or ``clean, tested at strong``."""
+        other = self.test_appearance not in (None, self.appearance)
+        return f"{self.appearance}, tested at {self.test_appearance}" if other else self.appearance
 
     @property
     def episodes_before(self) -> int:
@@ -163,11 +194,11 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     """
     for other in earlier:
         task_entry(other)
-        for field in ("encoder", "preprocessing", "action_names"):
-            here, there = getattr(task(name), field), getattr(task(other), field)
+        for fact in ("encoder", "preprocessing", "action_names"):
+            here, there = getattr(task(name), fact), getattr(task(other), fact)
             if here != there:
                 raise InvalidValueError(
-                    f"{name} cannot come after {other}: what is known of one world is of no use in another ({field} is "
+                    f"{name} cannot come after {other}: what is known of one world is of no use in another ({fact} is "
                     f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
                     "arrow_puzzle_hard."
                 )

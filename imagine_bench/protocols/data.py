@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self, get_type_hints
 
@@ -15,6 +16,8 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 
+LATER: Mapping[str, Any] = {"later": True}
+"""Metadata of a field that protocols did not always have: at its default it changes no hash."""
 MOST = 10_000_000
 """Episodes, budgets and the like; a real robot lives to see a thousandth of it."""
 
@@ -54,8 +57,10 @@ class ProtocolData(ABC):
                 raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
 
     def as_dict(self) -> dict[str, Any]:
-        """A JSON-serialisable copy."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+        """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""
+        later = {field.name: field.default for field in dataclasses.fields(self) if field.metadata == LATER}
+        values = {n: value for n, value in dataclasses.asdict(self).items() if n not in later or value != later[n]}
+        return json.loads(json.dumps(values))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

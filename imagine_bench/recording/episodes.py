@@ -6,7 +6,7 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,20 @@ _KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0
 
 
 def record_run(
-    task: str, agent: Agent, *, name: str, seed: int, execution: str, appearance: str, episodes: int, path: Path
+    task: str,
+    agent: Agent,
+    *,
+    name: str,
+    seed: int,
+    world: Mapping[str, Any],
+    appearance: str,
+    episodes: int,
+    path: Path,
 ) -> Path:
     """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
 
-    Nothing changes in the agent, registered as ``name``. The episodes' seeds follow from the run's and are used for
+    ``world`` is what the task's environment is made with, as :attr:`.Protocol.world`; nothing changes in the agent,
+    registered as ``name``. The episodes' seeds follow from the run's and are used for
     nothing else. ``path``, which is returned, ends in ``.rrd``; until complete it is called ``<stem>.partial.rrd``.
 
     Raises:
@@ -49,7 +58,7 @@ def record_run(
     """
     spec, entry = registry.task(task), registry.agent_entry(name)
     make_folder(path.parent)
-    env = gymnasium.make(spec.env_id, execution=execution, appearance=appearance)
+    env = gymnasium.make(spec.env_id, **world, appearance=appearance)
     try:
         scene = env.unwrapped
         if isinstance(scene, SceneReader):

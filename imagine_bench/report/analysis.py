@@ -131,7 +131,7 @@ def analyse(
         require_known("setting", name, {name for agent in protocol.agents for name in registry.setting_names(agent)})
     where = bench / "-".join([analysis.name, *(f"{name}={value}" for name, value in overrides)]).replace("/", "_")
     with lock(bench / f".{where.name}.lock", f"The folder {where}"):
-        spec, appearance, folders = registry.task(protocol.task), protocol.test_appearance, learners(bench)
+        spec, appearance, folders = registry.task(protocol.task), protocol.appearance_in_tests, learners(bench)
         found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         runs = []
         for run in counted(folders, "runs", total=len(folders)):

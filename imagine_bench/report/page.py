@@ -36,7 +36,7 @@ def write_report(result: BenchResult) -> Path:
     protocol, agents = result.protocol, result.protocol.agents
     page = Page(
         title=f"{data.spec.title}: does imagination save real experience?",
-        subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.appearance}” · "
+        subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
         f"protocol {result.protocol_hash}",
         question=text.question(data),
         answers=text.answers(data),
@@ -105,7 +105,7 @@ def summary_table(result: BenchResult) -> str:
         rows.append(_thesis_row(data, beyond[0], f"thesis at {beyond[0]:,}"))
     title = (
         f"{data.spec.title}: test episodes solved, % [{_interval_words(data)}]; preset {protocol.preset}, "
-        f"{protocol.execution}, {protocol.appearance}, {len(protocol.seeds)} seed(s) x "
+        f"{protocol.execution}, {protocol.looks}, {len(protocol.seeds)} seed(s) x "
         f"{protocol.evaluation_episodes} test episodes"
     )
     return "\n".join([title, "", *aligned(rows), "", *text.answers(data)])

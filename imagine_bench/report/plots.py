@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
+from zlib import crc32
 
 import matplotlib as mpl
 import numpy as np
@@ -82,8 +83,10 @@ def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg:
 
 def color(agent: str) -> str:
     """The agent's color, the same in every plot."""
-    known = list(AGENTS)
-    return _COLORS[(known.index(agent) if agent in known else sum(agent.encode())) % len(_COLORS)]
+    known, base = list(AGENTS), agent.partition(":")[0]
+    place = known.index(base) if base in known else sum(base.encode())
+    other = 1 + crc32(agent.encode()) % (len(_COLORS) - 1) if agent != base else 0  # never that of the agent as it is
+    return _COLORS[(place + other) % len(_COLORS)]
 
 
 def success_figure(data: ReportData) -> Figure:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imagine_bench import registry, statistics
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate, PairedTests
@@ -25,9 +26,12 @@ class AgentWords(NamedTuple):
 
 def agent_words(agent: str) -> AgentWords:
     """Title and description of an agent from its registry line; of one that is not registered, its name alone."""
-    entry = registry.agents().get(agent)
     spoken = agent.replace("_", " ")
-    return AgentWords(spoken, "") if entry is None else AgentWords(entry.title or spoken, entry.description)
+    try:
+        entry = registry.agent_entry(agent)
+    except ImagineBenchError:
+        return AgentWords(spoken, "")
+    return AgentWords(entry.title or spoken, entry.description)
 
 
 def lasting(budgets: Sequence[int | None]) -> str:

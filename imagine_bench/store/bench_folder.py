@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, digest
@@ -61,7 +62,7 @@ class BenchStore:
 
     def run_folder(self, agent: str, seed: int) -> Path:
         """The folder of one run."""
-        return self.folder / agent / f"seed_{seed}"
+        return self.folder / file_name(agent) / f"seed_{seed}"
 
     def require_own(self, folders: Collection[Path]) -> None:
         """Raise ArtefactError for a run's folder among ``folders`` that says it is of another protocol."""

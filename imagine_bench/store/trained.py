@@ -10,6 +10,7 @@ from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
+from imagine_bench.entrants import entrant
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, AgentState, TaskSpec
 from imagine_bench.protocols.control import Protocol
@@ -67,8 +68,8 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     settings.update((name, value) for name, value in overrides if name in settings)
-    as_it_ran = dataclasses.replace(protocol, overrides=tuple(sorted(settings.items())))  # whatever presets say by now
-    agent = registry.make_agent(spec.agent, dataclasses.replace(spec, protocol=as_it_ran).context())
+    as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
+    agent = registry.make_agent(name, dataclasses.replace(spec.context(), overrides=as_it_ran))
     with reading(folder / "checkpoints", f"a checkpoint of {name!r}"):
         agent.restore(_with_settings(snapshot.agent, overrides))
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run

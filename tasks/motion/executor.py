@@ -62,6 +62,8 @@ class MacroResult:
     fault: str | None  #: why the action failed physically, in words, or None
     time_s: Floats  #: when the samples of the motion were taken, from 0. Shape (K,), K = 0 without capture.
     qpos: Floats  #: the samples, whole scene. Shape (K, nq).
+    qvel: Floats  #: velocities at the same times. Shape (K, nv).
+    ctrl: Floats  #: commands to the servos from then on, at the end the last ones. Shape (K, nu).
 
 
 class MacroExecutor:
@@ -125,18 +127,20 @@ class MacroExecutor:
             arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
         qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
-        time_s, samples = self.capture(qpos, capture_motion_hz)
+        time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)
         off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
         sim_time_s = (len(qpos) - 1) * timestep_s
-        result = MacroResult(sim_time_s=sim_time_s, ik_error_m=ik_error_m, fault=astray, time_s=time_s, qpos=samples)
+        result = MacroResult(
+            sim_time_s=sim_time_s, ik_error_m=ik_error_m, fault=astray,
+            time_s=time_s, qpos=samples, qvel=qvel, ctrl=ctrl,
+        )  # fmt: skip
         return result, qpos, trajectory
 
     def refused(self, reason: str) -> MacroResult:
         """The result of a macro-action for which the arm does not move."""
-        return MacroResult(
-            sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=np.empty(0), qpos=np.empty((0, self.model.nq))
-        )
+        time_s, qpos, qvel, ctrl = self.capture(0, 0.0)
+        return MacroResult(sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=time_s, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
     def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
@@ -173,19 +177,29 @@ class MacroExecutor:
         """Each finger's distance from the grip's middle in positions of the scene: (..., nq) to (..., 2)."""
         return qpos[..., self._finger_qpos]
 
-    def capture(self, qpos: Floats, motion_hz: float) -> tuple[Floats, Floats]:
-        """Pick samples of a run (N + 1, nq) for a recording, so many a second, at most one a timestep; 0 picks none.
+    def capture(self, steps: int, motion_hz: float) -> tuple[Floats, Floats, Floats, Floats]:
+        """Samples of the latest run, of so many steps, for a recording: so many a second; 0 takes none.
+
+        Up to one a timestep they are steps of the simulation. Above, what lies between two steps is interpolated
+        linearly, as the integrator moves positions; commands are held.
 
         Returns:
-            Times in s (K,) and positions (K, nq), with the first and the last row whenever ``motion_hz > 0``.
+            Times in s (K,), positions (K, nq), velocities (K, nv) and commands (K, nu), with the first and the last
+            step whenever ``motion_hz > 0``.
         """
-        timestep_s = self.model.opt.timestep
+        timestep_s, (nq, nv, nu) = self.model.opt.timestep, (self.model.nq, self.model.nv, self.model.nu)
         if motion_hz <= 0:
-            return np.empty(0), np.empty((0, self.model.nq))
-        last = len(qpos) - 1
-        stride = max(1.0, 1.0 / (motion_hz * timestep_s))
-        rows = np.unique(np.append(np.round(np.arange(0, last, stride)).astype(np.int64), last))
-        return rows * timestep_s, qpos[rows].copy()
+            return np.empty(0), np.empty((0, nq)), np.empty((0, nv)), np.empty((0, nu))
+        stride = 1.0 / (motion_hz * timestep_s)
+        at = np.append(np.arange(0, steps - 1e-9, stride), steps)  # in timesteps [K]
+        at = np.unique(np.round(at)) if stride >= 1.0 else at
+        before = np.minimum(at.astype(np.int64), steps - 1)
+        share = (at - before)[:, None]
+        moving = self._states[:, self._qpos_column : self._qpos_column + nq + nv]
+        samples = (1.0 - share) * moving[before] + share * moving[before + 1]
+        for row in np.flatnonzero(share % 1.0):
+            mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
+        return at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, :nu]
 
     def _check(self, data: mujoco.MjData, states: Floats, control: Floats) -> None:
         """Raise if the simulation blew up."""

@@ -34,8 +34,8 @@ BY_DEPTH = {
 VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 
 
-def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: str | int) -> Path:
-    settings = {"seed": 3, "execution": "kinematic", "appearance": "mild", "episodes": 2, **changes}
+def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: object) -> Path:
+    settings = {"seed": 3, "world": {"execution": "kinematic"}, "appearance": "mild", "episodes": 2, **changes}
     return record_run("arrow_puzzle", agent, name=name, path=path, **settings)  # type: ignore[arg-type]
 
 
@@ -113,7 +113,7 @@ class _HandsOver(FakeImaginer):
 
 
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
-    options = {"name": "imagination", "seed": 0, "execution": "kinematic", "appearance": "clean", "episodes": 1}
+    options = {"name": "imagination", "seed": 0, "world": {}, "appearance": "clean", "episodes": 1}
     path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
     assert "/imagined/sampled_rollouts" not in contents(imagined)
@@ -177,7 +177,7 @@ def test_only_privileged_agents_see_the_macrostate(tmp_path: Path) -> None:
 
 
 def test_physics_moves_the_arm_and_stays_small(tmp_path: Path) -> None:
-    path = record(FakeImaginer(), tmp_path / "physics.rrd", execution="physics")
+    path = record(FakeImaginer(), tmp_path / "physics.rrd", world={"execution": "physics"})
     assert path.stat().st_size < 6e6  # 5 episodes in 15 MB, with room
     poses = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/scene/right_l6")
     actions = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/real/reward")
@@ -210,7 +210,7 @@ def test_unknown_names_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"No agent 'dqm'\. Did you mean 'dqn'"):
         record(FakeAgent(), tmp_path / "a.rrd", name="dqm")
     with pytest.raises(UnknownNameError, match="physics"):
-        record(FakeAgent(), tmp_path / "a.rrd", execution="physical")
+        record(FakeAgent(), tmp_path / "a.rrd", world={"execution": "physical"})
     assert not list(tmp_path.iterdir())
 
 

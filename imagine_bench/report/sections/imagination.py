@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.entrants import file_name
 from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData
@@ -178,7 +179,7 @@ def _by_depth(
     """A row a measure, a column an imagined depth."""
     depth = len(getattr(found, rows[0][0]))
     return Table(
-        name=f"{name}_{agent}",
+        name=f"{name}_{file_name(agent)}",
         header=[f"{agent_words(agent).title}: depth", *(str(step + 1) for step in range(depth))],
         rows=[
             [words, *(_value(value, form, {"agent": agent, name: field}) for value in getattr(found, field))]
@@ -211,7 +212,7 @@ def _filmstrip(data: ReportData, agent: str, seed: int, index: int, compared: Co
     )
     return Image.of(
         png(filmstrip(compared, data.spec.action_names)),
-        name=f"rollout_{agent}_{index + 1}",
+        name=f"rollout_{file_name(agent)}_{index + 1}",
         alt=f"Real frames above, imagined frames below. {caption}",
         caption=caption,
     )
@@ -225,7 +226,7 @@ def _sampled_rollouts(data: ReportData) -> Iterator[Image]:
             caption = f"{_capital(agent)}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
             sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
             alt = f"Only the first image is real. {caption}"
-            yield Image.of(sheet, name=f"sampled_rollouts_{agent}", alt=alt, caption=caption)
+            yield Image.of(sheet, name=f"sampled_rollouts_{file_name(agent)}", alt=alt, caption=caption)
 
 
 def _capital(agent: str) -> str:

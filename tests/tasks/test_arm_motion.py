@@ -1,0 +1,158 @@
+"""What can be read of the arm's motion during a macro-action, and that reading it changes nothing."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.scenes.constants import TIMESTEP_S
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import ArmReader
+
+
+def make(task="arrow_puzzle", **options):
+    return gymnasium.make(registry.TASKS[task].env_id, disable_env_checker=True, **options)
+
+
+def turned(motion_hz):
+    env = make(motion_hz=motion_hz)
+    env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
+    info = env.step(2)[4]
+    return env, env.unwrapped.arm_motion(), info
+
+
+def test_velocities_and_poses_belong_to_the_angles():
+    env, motion, info = turned(1 / TIMESTEP_S)
+    assert isinstance(env.unwrapped, ArmReader)
+    np.testing.assert_allclose(motion.time_s, TIMESTEP_S * np.arange(len(motion.time_s)))
+    assert motion.time_s[-1] == pytest.approx(info["sim_time_s"])
+    np.testing.assert_allclose(np.diff(motion.joint_rad, axis=0) / TIMESTEP_S, motion.joint_rad_s[1:], atol=1e-9)
+    assert np.abs(motion.joint_rad_s).max() > 1.0
+    arm = ArmModel()
+    for joint_rad, pose in list(zip(motion.joint_rad, motion.tcp_in_world, strict=True))[::20]:
+        position_m, turn = arm.tcp_in_base(joint_rad)
+        np.testing.assert_allclose(pose[:3], position_m, atol=1e-9)
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, pose[3:])
+        np.testing.assert_allclose(matrix.reshape(3, 3), turn, atol=1e-9)
+    assert motion.gripper_m.min() < 0.03 < motion.gripper_m.max()  # closed on a cube of 55 mm, and open
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_the_commands_alone_repeat_the_motion(task):
+    env = make(task)
+    env.unwrapped.capture_motion_hz = 1 / env.unwrapped.model.opt.timestep
+    env.reset(seed=3)
+    model, data = env.unwrapped.model, mujoco.MjData(env.unwrapped.model)
+    data.qpos[:], data.mocap_pos[:] = env.unwrapped.data.qpos, env.unwrapped.data.mocap_pos
+    data.mocap_quat[:] = env.unwrapped.data.mocap_quat
+    env.step(1)
+    motion = env.unwrapped.arm_motion()
+    joints = [int(model.joint(f"right_j{index}").qposadr[0]) for index in range(7)]
+    fingers = [int(model.joint(f"finger_{side}_slide").qposadr[0]) for side in ("left", "right")]
+    servos = [model.actuator(f"right_j{index}_servo").id for index in range(7)]
+    pads = [model.actuator(f"finger_{side}_servo").id for side in ("left", "right")]
+    for row in range(len(motion.time_s) - 1):
+        np.testing.assert_allclose(data.qpos[joints], motion.joint_rad[row], atol=1e-9)
+        np.testing.assert_allclose(data.qpos[fingers], motion.gripper_m[row], atol=1e-9)
+        data.ctrl[servos], data.ctrl[pads] = motion.joint_command_rad[row], motion.gripper_command_m[row]
+        mujoco.mj_step(model, data)
+
+
+def test_rates_above_the_simulation_s_are_interpolated():
+    _, steps, _ = turned(1 / TIMESTEP_S)
+    env, motion, info = turned(200)
+    assert len(motion.time_s) == 1 + math.ceil(200 * info["sim_time_s"] - 1e-6)
+    np.testing.assert_allclose(np.diff(motion.time_s)[:-1], 0.005)
+    together, every = motion.time_s[:-1:8] / TIMESTEP_S, np.arange(0, len(steps.time_s), 5)  # each 40 ms
+    np.testing.assert_allclose(together, every[: len(together)], atol=1e-6)
+    for name in ("joint_rad", "joint_rad_s", "gripper_m", "tcp_in_world", "joint_command_rad"):
+        fine, coarse = getattr(motion, name), getattr(steps, name)
+        np.testing.assert_allclose(fine[:-1:8], coarse[every[: len(together)]], atol=1e-6)
+        np.testing.assert_allclose(fine[-1], coarse[-1], atol=1e-12)
+    # 5 ms is 5/8 of the first step, 10 ms a quarter of the second
+    np.testing.assert_allclose(
+        motion.joint_rad[41], steps.joint_rad[25] + 0.625 * np.diff(steps.joint_rad[25:27], axis=0)[0]
+    )
+    np.testing.assert_allclose(motion.joint_rad_s[42], steps.joint_rad_s[26] * 0.75 + steps.joint_rad_s[27] * 0.25)
+    np.testing.assert_array_equal(motion.joint_command_rad[41], steps.joint_command_rad[25])
+    quats = env.unwrapped._latest.qpos[:, env.unwrapped.world.object_qpos[:, 3:]]
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_recording_the_motion_changes_no_bit(task):
+    plain, recorded = make(task, appearance="mild"), make(task, appearance="mild", motion_hz=200)
+    walks = []
+    for env in (plain, recorded):
+        walk = [env.reset(seed=4)]
+        for action in (1, 0, 1):
+            walk.append(env.step(action))
+            if env is recorded:
+                env.unwrapped.arm_motion()
+        state = env.unwrapped.get_state()
+        walks.append(([each[0] for each in walk], [each[-1] for each in walk], state))
+    (frames, infos, state), (frames_too, infos_too, state_too) = walks
+    np.testing.assert_array_equal(frames, frames_too)
+    for info, info_too in zip(infos, infos_too, strict=True):
+        np.testing.assert_equal(info, info_too)
+    np.testing.assert_array_equal(state.world.physics, state_too.world.physics)
+    assert state.generator == state_too.generator
+    assert len(state.latest.time_s) == 0 < len(state_too.latest.time_s)
+
+
+def test_both_cameras_film_the_motion():
+    env = make(motion_hz=5)
+    before, _ = env.reset(seed=1)
+    after, *_ = env.step(0)
+    motion, agent, human = env.unwrapped.arm_motion(), env.unwrapped.agent_film(), env.unwrapped.film(80, 60)
+    count = len(motion.time_s)
+    assert agent.shape == (count, 64, 64, 3)
+    assert human.shape == (count, 60, 80, 3)
+    np.testing.assert_array_equal(agent[0], before)
+    assert len(np.unique(agent, axis=0)) == count  # the wrist moves
+    np.testing.assert_array_equal(env.unwrapped.agent_view(), after)
+    env.close()
+
+
+def test_a_standing_scene_is_one_sample_at_rest():
+    for options in ({"execution": "kinematic", "motion_hz": 100}, {}):
+        env = make(**options)
+        env.reset(seed=0)
+        env.step(0)
+        motion = env.unwrapped.arm_motion()
+        assert motion.time_s.tolist() == [0.0]
+        assert motion.joint_rad.shape == motion.joint_command_rad.shape == (1, 7)
+        np.testing.assert_array_equal(motion.joint_rad, motion.joint_command_rad)
+        assert not motion.joint_rad_s.any()
+
+
+def test_not_asking_costs_nothing():
+    env, _, _ = turned(0)
+    executor = env.unwrapped.world.executor.executor
+
+    def cheapest_s(call):
+        seconds = []
+        for _ in range(5):
+            began = time.process_time()
+            call()
+            seconds.append(time.process_time() - began)
+        return min(seconds)
+
+    assert cheapest_s(lambda: [executor.capture(200, 0.0) for _ in range(100)]) / 100 < 0.01 * cheapest_s(
+        lambda: env.step(2)
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [-1, math.nan, 1001, "fast"])
+def test_a_rate_out_of_range_is_refused(rate_hz):
+    with pytest.raises(InvalidValueError, match=r"Motion cannot be captured at .* Hz; give 0 to 1000\."):
+        make(motion_hz=rate_hz)
