@@ -24,11 +24,13 @@ from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, sha
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
+from .window import Window
 from .world import World, WorldState
 
 FRAME_PX = 64
 MAX_IMAGE_PX = 4096
 MAX_MOTION_HZ = 1000
+_WINDOW_HZ = 25.0  # images a second of a window
 _ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
@@ -75,7 +77,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
         appearance: A name in :data:`.scenes.appearance.LEVELS`.
-        render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
+        render_mode: None, ``"rgb_array"``, which :meth:`render` returns, or ``"human"``: a window that shows each
+            motion as long as it took.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render`, by name.
@@ -91,7 +94,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
     Version History: v0, the first.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  (Gymnasium's own declaration)
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 1}  # noqa: RUF012  (Gymnasium's own declaration)
 
     def __init__(
         self,
@@ -125,7 +128,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self.observation_space = self._observer.space
         self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
-        self.capture_motion_hz = motion_hz
+        self._window = Window(spec.title) if self.render_mode == "human" else None
+        self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
         self._begun, self._macrostate = False, self._starts[0]
         self._latest: MacroResult | None = None
         self._people = self._mocap()
@@ -151,6 +155,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         reading = self.world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
+        self._show()
         return self._observer.observe(self._macrostate), self._info(success=False, legal=legal, fault=reading.problem)
 
     def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -183,17 +188,19 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         legal = outcome.success or not outcome.terminated
         info = self._info(success=outcome.success, legal=legal, fault=fault)
+        self._show()
         return self._observer.observe(self._macrostate), float(outcome.reward), outcome.terminated, False, info
 
     def render(self) -> Frame | None:
-        """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self._render_camera.frame(self.world.data)
+        """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
+        return self._render_camera.frame(self.world.data) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free the OpenGL contexts; may be called again."""
-        self._observer.close()
-        for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
-            renderer.close()
+        """Free the OpenGL contexts and close the window; may be called again."""
+        renderers = self._agent_camera, self._render_camera, self._human_camera
+        open_ones: list[Any] = [each for each in (self._window, self._observer, *renderers) if each is not None]
+        for each in open_ones:
+            each.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
@@ -331,6 +338,14 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             world.update()
 
     # --- details -------------------------------------------------------------------------------------------------
+
+    def _show(self) -> None:
+        """In a window, if there is one: the latest motion, and how the scene stands."""
+        if self._window is None:
+            return
+        for _ in self.replay():
+            self._window.show(self._render_camera.frame(self.world.data), self._capture_motion_hz or _WINDOW_HZ)
+        self._window.show(self._render_camera.frame(self.world.data), _WINDOW_HZ)
 
     def _observing_camera(self, part: str, size: int) -> Renderer:
         """The camera of an image that is observed; the agent's own where that is the same."""

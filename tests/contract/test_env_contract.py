@@ -269,7 +269,7 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
             r"No execution 'kinematik'\. Did you mean 'kinematic'\? Known: physics, kinematic",
         ),
         ({"appearance": "wild"}, r"No appearance 'wild'\..*Known: clean, mild, strong"),
-        ({"render_mode": "human"}, r"No render mode 'human'\..*Known: rgb_array"),
+        ({"render_mode": "ansi"}, r"No render mode 'ansi'\..*Known: rgb_array, human"),
         ({"camera": "hunam"}, r"No camera 'hunam'\. Did you mean 'human'\? Known: .*human"),
         ({"width": 0}, r"Image width 0 must be an integer from 1 to 4096 pixels"),
         ({"height": 99999}, r"Image height 99999 must be an integer from 1 to 4096 pixels"),
