@@ -2,44 +2,49 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import sys
 from types import ModuleType
 from typing import Any
 
 from imagine_bench.errors import SetupError
 from imagine_bench.interfaces import Frame
 
-_NOWHERE = ("offscreen", "dummy")
-"""What SDL chooses by itself where there is no desktop."""
+HAS_PYGAME = importlib.util.find_spec("pygame") is not None
 
 
-def open_display() -> ModuleType:
-    """Pygame with its display open.
+def open_display(*, seen: bool) -> ModuleType:
+    """Open pygame's display; where there is no desktop, one that nobody sees, unless it must be ``seen``.
+
+    SDL's driver "offscreen", its own choice there, would end MuJoCo's OpenGL too when the window closes.
 
     Raises:
-        SetupError: There is no pygame or no desktop; ``SDL_VIDEODRIVER=dummy`` does without one.
+        SetupError: There is no pygame, or no desktop. ``SDL_VIDEODRIVER=dummy`` does without one, for tests.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame  # noqa: PLC0415  (an extra)
     except ImportError as error:
         raise SetupError("Windows need pygame: pip install 'imagine-bench[play]'.") from error
-    try:
+    if pygame.display.get_init() or "SDL_VIDEODRIVER" in os.environ or sys.platform != "linux":
         pygame.display.init()
-        driver = pygame.display.get_driver()
-    except pygame.error as error:
-        raise _no_desktop(str(error)) from error
-    if driver in _NOWHERE and "SDL_VIDEODRIVER" not in os.environ:
+        return pygame
+    for driver in ("x11", "wayland", "dummy"):
+        os.environ["SDL_VIDEODRIVER"] = driver
+        try:
+            pygame.display.init()
+            break
+        except pygame.error:
+            continue
+        finally:
+            del os.environ["SDL_VIDEODRIVER"]
+    if seen and pygame.display.get_driver() == "dummy":
         pygame.display.quit()
-        raise _no_desktop("DISPLAY and WAYLAND_DISPLAY name none")
+        raise SetupError(
+            "There is no desktop to open a window on; run this on one. SDL_VIDEODRIVER=dummy opens one unseen."
+        )
     return pygame
-
-
-def _no_desktop(reason: str) -> SetupError:
-    return SetupError(
-        f"No desktop to open a window on ({reason}). Use one, or render_mode='rgb_array'; SDL_VIDEODRIVER=dummy opens "
-        "windows that nobody sees."
-    )
 
 
 class Window:
@@ -57,7 +62,7 @@ class Window:
             SetupError: As :func:`open_display`.
         """
         if self._pygame is None:
-            self._pygame = open_display()
+            self._pygame = open_display(seen=False)
             self._clock = self._pygame.time.Clock()
         pygame, (height, width, _) = self._pygame, image.shape
         screen = pygame.display.get_surface()

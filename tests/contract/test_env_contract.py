@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
+from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
@@ -55,7 +56,7 @@ def test_gymnasium_s_checker_is_content(task, execution):
     env = make(task, execution=execution, render_mode="rgb_array", width=64, height=48)
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always")
-        check_env(env.unwrapped, skip_render_check=execution == "physics")
+        check_env(env.unwrapped, skip_render_check=execution == "physics" or task not in WORLDS)
     env.close()
     assert not complaints, [str(each.message) for each in complaints]
 
@@ -248,7 +249,7 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
     turn = env.world.executor.turn
 
     def clumsy(data, **arguments):
-        result = turn(data, **arguments)
+        result = yield from turn(data, **arguments)
         data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 

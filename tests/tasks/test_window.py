@@ -75,13 +75,16 @@ def test_outcomes_that_are_set_are_shown_too(shown):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is a desktop")
-def test_without_a_desktop_one_sentence_says_what_to_do():
+def test_who_must_be_seen_needs_a_desktop():
     words = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     quiet = {name: value for name, value in os.environ.items() if name not in words}
-    code = "from imagine_bench.tasks.window import open_display; open_display()"
+    code = (
+        "from imagine_bench.tasks.window import open_display; pygame = open_display(seen=False)\n"
+        "print(pygame.display.get_driver()); pygame.quit(); open_display(seen=True)"
+    )
     done = subprocess.run([sys.executable, "-c", code], env=quiet, capture_output=True, text=True, check=False)
-    assert "SetupError: No desktop to open a window on" in done.stderr
-    assert "SDL_VIDEODRIVER=dummy" in done.stderr
+    assert done.stdout == "dummy\n"
+    assert "SetupError: There is no desktop to open a window on" in done.stderr
 
 
 def test_without_pygame_the_extra_is_named(monkeypatch):
