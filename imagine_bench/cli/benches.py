@@ -81,7 +81,7 @@ class Bench:
             require_values(name, getattr(self, name))
         names = (
             *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
-            "after_episodes", "demonstrations", "queries",
+            "after_episodes", "demonstrations", "queries", "dataset",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None
