@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 
-from .motion.executor import MacroResult
+from .motion.executor import MacroResult, finish
+from .motion.executor import Motion as Acting
 from .observations import Observer
 from .rendering import Renderer, View
 from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, shapes_of
@@ -143,6 +144,11 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             UnknownNameError: An unknown option.
             InvalidValueError: Not a macrostate of this task.
         """
+        info = self.restart(seed=seed, options=options)
+        return self.observe(), info
+
+    def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+        """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
         self._begun, self._latest = True, None
@@ -151,7 +157,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         reading = self.world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
-        return self._observer.observe(self._macrostate), self._info(success=False, legal=legal, fault=reading.problem)
+        return self._info(success=False, legal=legal, fault=reading.problem)
 
     def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
@@ -159,6 +165,15 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         Raises:
             InvalidValueError: No such action, or no episode was begun.
             DivergedError: The simulation blew up; the episode is over.
+        """
+        reward, terminated, info = finish(self.acting(action))
+        return self.observe(), reward, terminated, False, info
+
+    def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
+        """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
+
+        Returns:
+            Reward, whether the episode has terminated, and info.
         """
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
@@ -170,7 +185,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()
-            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
+            self._latest = yield from self.world.acting(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
@@ -183,7 +198,16 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         legal = outcome.success or not outcome.terminated
         info = self._info(success=outcome.success, legal=legal, fault=fault)
-        return self._observer.observe(self._macrostate), float(outcome.reward), outcome.terminated, False, info
+        return float(outcome.reward), outcome.terminated, info
+
+    def observe(self) -> Any:
+        """What :meth:`reset` and :meth:`step` return of the scene as it stands."""
+        return self._observer.observe(self._macrostate)
+
+    def diverged(self, error: DivergedError) -> dict[str, Any]:
+        """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
+        self._begun, self._latest = False, None
+        return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
@@ -277,7 +301,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self.world.develop(self._agent_camera.frame(self.world.data))
+        return self.world.develop(self._agent_camera.frame(self.world.data, self.world.model))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""

@@ -79,7 +79,7 @@ class Observer:
 
     def _part(self, name: str, macrostate: tuple[int, ...]) -> NDArray[Any]:
         if name in self._cameras:
-            image = self._cameras[name].frame(self._world.data)
+            image = self._cameras[name].frame(self._world.data, self._world.model)
             return self._world.develop(image) if name == "frame" else image
         if name == "state":
             one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
