@@ -62,6 +62,8 @@ class Bench:
     """Real training episodes on each of them."""
     demonstrations: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """First training episodes that the oracle plays and learners watch; budgets count them."""
+    dataset: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    """Folder of a dataset whose episodes come first in training; budgets count them, and are them alone by default."""
     queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
     feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None

@@ -111,8 +111,8 @@ def read_apart(dataset: Dataset) -> dict[str, dict[str, NDArray[Any]]]:
     found = {}
     for name, digest in (dataset.card or {}).get("apart", {}).items():
         path = dataset.folder / f"{name}.npz"
-        with reading(path, "a part of a dataset"), np.load(path, allow_pickle=False) as file:
-            found[name] = {key: file[key] for key in file.files}
+        with reading(path, "a part of a dataset"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            found[name] = dict(arrays)
             if content_hash(found[name]) != digest:
                 raise InvalidValueError("it is not what the card says")
     return found

@@ -76,7 +76,10 @@ def read(path: Path) -> Episodes:
     with reading(path, "a Minari dataset of macro-actions"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = minari.MinariDataset(path.parent)
-        parts = [_part(episode) for episode in found.iterate_episodes()]
+        try:
+            parts = [_part(episode) for episode in found.iterate_episodes()]
+        except FileNotFoundError as error:
+            raise InvalidValueError(f"a file of it is missing ({error})") from error
         if len(parts) != found.total_episodes or sum(len(part["actions"]) for part in parts) != found.total_steps:
             raise InvalidValueError(f"{found.total_episodes} episodes are said to be in it and {len(parts)} are")
         return joined(parts)

@@ -20,5 +20,5 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
 
 def read(path: Path) -> Episodes:
     """Read an archive. Raises ArtefactError: it is damaged, or the arrays are not those of episodes."""
-    with reading(path, "an archive of episodes"), np.load(path, allow_pickle=False) as arrays:
+    with reading(path, "an archive of episodes"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return Episodes(**arrays)
