@@ -29,6 +29,7 @@ ARROWS: dict[str, set[str]] = {
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
     "adapters": {"registry"},
     "tools": {"registry", "machine", "store", "statistics", "bench"},
+    "testing": {"registry", "tools"},
     "cli": {*_DATA, "bench", "judge", "recording", "studies", "report", "tools"},
     "__init__": {"registry"},
     "__main__": {"cli"},
