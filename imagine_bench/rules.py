@@ -98,10 +98,15 @@ def optimal_values(tables: RuleTables) -> Floats:
     )
 
 
+def optimal_actions(tables: RuleTables) -> NDArray[np.bool_]:
+    """Which actions an optimal agent may choose in each macrostate. Shape (A, S)."""
+    action_values = optimal_values(tables)
+    return np.asarray(action_values >= action_values.max(axis=0) - _TIE_TOLERANCE)
+
+
 def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
-    action_values = optimal_values(tables)
-    return np.asarray((action_values >= action_values.max(axis=0) - _TIE_TOLERANCE).argmax(axis=0), dtype=np.int64)
+    return np.asarray(optimal_actions(tables).argmax(axis=0), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,8 +14,9 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError, require_known
 
 Purpose = Literal[
-    "training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning", "earlier_training"
-]
+    "training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning",
+    "earlier_training", "feedback",
+]  # fmt: skip
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
 _SEED_BITS, _EPISODE_BITS = 24, 32
 SEEDS = 1 << _SEED_BITS

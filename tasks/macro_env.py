@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium
@@ -14,10 +14,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 
-from .motion.executor import MacroResult
+from .motion.executor import MacroResult, finish
+from .motion.executor import Motion as Acting
+from .observations import Observer
 from .rendering import Renderer, View
 from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, shapes_of
 from .scenes.appearance import Appearance
@@ -51,12 +53,13 @@ class EnvState:
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
 
 
-class MacroEnv(gymnasium.Env[Frame, np.int64]):
+class MacroEnv(gymnasium.Env[Any, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
     Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
 
-    Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``, one upright RGB frame with the human at the top.
+    Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``, one upright RGB frame with the human at the top, unless
+    ``observation`` says otherwise.
 
     Rewards: those of the task's rules, for the macrostate that was read back from the scene.
 
@@ -79,9 +82,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         camera: Camera of :meth:`render`, by name.
         physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
         motion_hz: :attr:`capture_motion_hz`.
+        observation: What is observed, of one moment: ``"frame"``, or others and several, as :class:`.Observer` says.
+        size: Edge of observed images in pixels, 32 to 256.
 
     Raises:
-        UnknownNameError: An unknown execution, appearance, render mode, camera or physics setting.
+        UnknownNameError: An unknown execution, appearance, render mode, camera, physics setting or observation.
         InvalidValueError: An image size, a physics setting or a rate out of range.
 
     Version History: v0, the first.
@@ -102,6 +107,8 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         camera: str = HUMAN_CAMERA,
         physics: PhysicsSettings | Mapping[str, Any] = PhysicsSettings(),  # noqa: B008 - frozen
         motion_hz: float = 0.0,
+        observation: str = "frame",
+        size: int = FRAME_PX,
     ) -> None:
         modes = self.metadata["render_modes"]
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
@@ -110,12 +117,13 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         self._starts = spec.rules.start_states
         self._known = frozenset(spec.rules.states)
         settings = PhysicsSettings.of(physics)
-        self.world = make_world(appearance_level(appearance))
+        self._make_world, self.world = make_world, make_world(appearance_level(appearance))
         self.world.set_physics(settings)
         self._kind = (spec.id, self._execution, appearance, settings)
-        self.observation_space = gymnasium.spaces.Box(0, 255, (FRAME_PX, FRAME_PX, 3), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._agent_camera = agent_camera(self.world.model)
+        self._observer = Observer(observation, size, self.world, spec.macrostate_values, self._observing_camera)
+        self.observation_space = self._observer.space
         self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
         self.capture_motion_hz = motion_hz
@@ -125,7 +133,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frame, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -136,6 +144,11 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             UnknownNameError: An unknown option.
             InvalidValueError: Not a macrostate of this task.
         """
+        info = self.restart(seed=seed, options=options)
+        return self.observe(), info
+
+    def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+        """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
         self._begun, self._latest = True, None
@@ -144,14 +157,23 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         reading = self.world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
-        return self.agent_view(), self._info(success=False, legal=legal, fault=reading.problem)
+        return self._info(success=False, legal=legal, fault=reading.problem)
 
-    def step(self, action: np.int64 | int) -> tuple[Frame, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
 
         Raises:
             InvalidValueError: No such action, or no episode was begun.
             DivergedError: The simulation blew up; the episode is over.
+        """
+        reward, terminated, info = finish(self.acting(action))
+        return self.observe(), reward, terminated, False, info
+
+    def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
+        """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
+
+        Returns:
+            Reward, whether the episode has terminated, and info.
         """
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
@@ -163,7 +185,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()
-            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
+            self._latest = yield from self.world.acting(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
@@ -176,7 +198,16 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         legal = outcome.success or not outcome.terminated
         info = self._info(success=outcome.success, legal=legal, fault=fault)
-        return self.agent_view(), float(outcome.reward), outcome.terminated, False, info
+        return float(outcome.reward), outcome.terminated, info
+
+    def observe(self) -> Any:
+        """What :meth:`reset` and :meth:`step` return of the scene as it stands."""
+        return self._observer.observe(self._macrostate)
+
+    def diverged(self, error: DivergedError) -> dict[str, Any]:
+        """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
+        self._begun, self._latest = False, None
+        return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
@@ -184,6 +215,7 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""
+        self._observer.close()
         for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
             renderer.close()
 
@@ -253,9 +285,23 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
         return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
 
+    def frame_of(self, macrostate: Sequence[int], rng: np.random.Generator | None = None) -> Frame:
+        """The frame (64, 64, 3) that a macrostate would show, without going there: nothing changes here.
+
+        ``rng`` draws how it lies and is lit, as the appearance says; without one every call draws the same.
+
+        Raises:
+            InvalidValueError: Not a macrostate of this task.
+        """
+        from .frames import frames_of  # noqa: PLC0415  (a scene of its own, which itself needs this module)
+
+        there = np.array([self._start({"macrostate": macrostate})], dtype=np.int64)
+        rng = np.random.default_rng(0) if rng is None else rng
+        return frames_of(self._make_world, self._rules, there, self._kind[2], rng)[0]
+
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self.world.develop(self._agent_camera.frame(self.world.data))
+        return self.world.develop(self._agent_camera.frame(self.world.data, self.world.model))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""
@@ -309,6 +355,14 @@ class MacroEnv(gymnasium.Env[Frame, np.int64]):
             world.update()
 
     # --- details -------------------------------------------------------------------------------------------------
+
+    def _observing_camera(self, part: str, size: int) -> Renderer:
+        """The camera of an image that is observed; the agent's own where that is the same."""
+        if part == "human":
+            return Renderer(self.world.model, human_camera_view(HUMAN_CAMERA, size, size))
+        if size == FRAME_PX:
+            return self._agent_camera
+        return Renderer(self.world.model, replace(_AGENT_VIEW, width=size, height=size))
 
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""

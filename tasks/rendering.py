@@ -210,8 +210,10 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(view.camera).id
 
-    def frame(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+    def frame(self, data: mujoco.MjData, model: mujoco.MjModel | None = None) -> NDArray[np.uint8]:
         """Draw ``data``, whose derived positions are up to date: a new upright RGB array. Shape (height, width, 3).
+
+        ``model`` is a copy of this renderer's model whose colors, lights and cameras hold, or None.
 
         Raises:
             SetupError: The machine has no OpenGL.
@@ -219,7 +221,8 @@ class Renderer:
         with self._one_at_a_time():
             canvas = self._ready_canvas()
             canvas.make_current()
-            mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+            shown = (model or self._model, data, self._option, None, self._camera)
+            mujoco.mjv_updateScene(*shown, _ALL_OBJECTS, self._scene)
             mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
             mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
             if self._takeovers > 1:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -81,23 +83,47 @@ def poses_of(
     return poses
 
 
+@dataclass(frozen=True)
+class ArmColumns:
+    """Where arm and fingers are in the arrays of a model; each number is one joint's, from the base to the wrist."""
+
+    arm_qpos: list[int]
+    arm_qvel: list[int]
+    arm_ctrl: list[int]
+    finger_qpos: list[int]
+    finger_ctrl: list[int]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> ArmColumns:
+        """Those of a scene that holds the arm."""
+        arm, fingers = ([model.joint(name) for name in names] for names in (ARM_JOINTS, FINGER_JOINTS))
+        arm_ctrl, finger_ctrl = (
+            [int(model.actuator(name.replace("_slide", "") + "_servo").id) for name in names]
+            for names in (ARM_JOINTS, FINGER_JOINTS)
+        )
+        return cls(
+            arm_qpos=[int(joint.qposadr[0]) for joint in arm], arm_qvel=[int(joint.dofadr[0]) for joint in arm],
+            arm_ctrl=arm_ctrl, finger_qpos=[int(joint.qposadr[0]) for joint in fingers], finger_ctrl=finger_ctrl,
+        )  # fmt: skip
+
+
+def tcp_in_world(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
+    """Position (m) and quaternion (w, x, y, z) of the point between the fingers, kinematics up to date. Shape (7,)."""
+    pose, tcp = np.empty(7), model.site(TCP_SITE).id
+    pose[:3] = data.site_xpos[tcp]
+    mujoco.mju_mat2Quat(pose[3:], data.site_xmat[tcp])
+    return pose
+
+
 def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Floats, ctrl: Floats) -> ArmMotion:
     """The arm's part of a scene's motion: times (K,), positions (K, nq), velocities (K, nv) and commands (K, nu)."""
-    data, tcp, poses = mujoco.MjData(model), model.site(TCP_SITE).id, np.empty((len(qpos), 7))
-    for positions, pose in zip(qpos, poses, strict=True):
+    data, at, poses = mujoco.MjData(model), ArmColumns.of(model), np.empty((len(qpos), 7))
+    for row, positions in enumerate(qpos):
         data.qpos[:] = positions
         mujoco.mj_kinematics(model, data)
-        pose[:3] = data.site_xpos[tcp]
-        mujoco.mju_mat2Quat(pose[3:], data.site_xmat[tcp])
-    (arm, fingers), (arm_dofs, _), (arm_servos, finger_servos) = (
-        [[int(number(name)) for name in names] for names in (ARM_JOINTS, FINGER_JOINTS)]
-        for number in (
-            lambda name: model.joint(name).qposadr[0],
-            lambda name: model.joint(name).dofadr[0],
-            lambda name: model.actuator(name.replace("_slide", "") + "_servo").id,
-        )
-    )
+        poses[row] = tcp_in_world(model, data)
     return ArmMotion(
-        time_s=time_s, joint_rad=qpos[:, arm], joint_rad_s=qvel[:, arm_dofs], gripper_m=qpos[:, fingers],
-        joint_command_rad=ctrl[:, arm_servos], gripper_command_m=ctrl[:, finger_servos], tcp_in_world=poses,
+        time_s=time_s, joint_rad=qpos[:, at.arm_qpos], joint_rad_s=qvel[:, at.arm_qvel],
+        gripper_m=qpos[:, at.finger_qpos], joint_command_rad=ctrl[:, at.arm_ctrl],
+        gripper_command_m=ctrl[:, at.finger_ctrl], tcp_in_world=poses,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
 from .motion import orientation
-from .motion.executor import MacroResult, at_rest
+from .motion.executor import MacroResult, Motion, at_rest, finish
 from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
@@ -165,12 +165,16 @@ class World(abc.ABC):
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
 
     @abc.abstractmethod
+    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
+        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves."""
+
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
-        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves.
+        """Physical execution, here and now.
 
         Raises:
             DivergedError: The simulation blew up.
         """
+        return finish(self.acting(action, intended, capture_motion_hz))
 
     def read(self) -> Reading:
         """Read the macrostate back from where objects, gripper and hands are."""

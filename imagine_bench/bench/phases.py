@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 
-from imagine_bench.bench.evaluation import Env, TrainingStarts, play, play_test_episode
-from imagine_bench.bench.queries import LabelOracle, QueryBudget, as_seen, demonstrator
+from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, play, play_test_episode
+from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen, demonstrator
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
+from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store.counters import EvaluationCounts
 
@@ -51,15 +52,23 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
     counters, length, success = run.counters, 0, False
     seed = episode_seed("training", run.spec.seed, counters.episode)
     queries = None if demonstrated else _queries(run)
+    teacher = None if demonstrated else _teacher(run)
+    watching = [each for each in (queries, teacher) if each is not None]
+
+    def before_acting(observation: Observation, info: Info) -> None:
+        for watcher in watching:
+            watcher(observation, info)
+
     episode = play(
         run.env,
         demonstrator(run.spec) if demonstrated else run.agent,
         seed=seed,
         explore=True,
         privileged=demonstrated or run.entry.privileged,
-        before_acting=queries,
+        before_acting=before_acting,
     )
-    for transition, info in episode:
+    for lived, info in episode:
+        transition = lived if teacher is None else teacher.told(lived)
         run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=counters.episode)
         length, success = length + 1, bool(info["is_success"])
     counters.add_episode(success, length, queries=0 if queries is None else queries.asked)
@@ -70,6 +79,13 @@ def _queries(run: Run) -> QueryBudget | None:
     if not run.protocol.queries or not isinstance(run.agent, QueryingAgent):
         return None
     return QueryBudget(run.agent, LabelOracle(run.task.rules), run.protocol.queries)
+
+
+def _teacher(run: Run) -> Teacher | None:
+    """Who watches the agent's next episode, if anybody."""
+    if run.teacher is not None:
+        run.teacher.begin(episode_seed("feedback", run.spec.seed, run.counters.episode))
+    return run.teacher
 
 
 def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], None]) -> None:

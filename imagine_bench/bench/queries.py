@@ -1,6 +1,7 @@
-"""What a learner is given beside its own episodes: demonstrated ones, and an oracle's labels for what it asks.
+"""What a learner is given beside its own episodes: demonstrated ones, labels for what it asks, a teacher's feedback.
 
-Neither shows a macrostate: a demonstration is seen as frames, a label is a reward and whether the episode would end.
+None shows a macrostate: a demonstration is seen as frames, a label is a reward and whether the episode would end, and
+feedback is reward.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.rules import optimal_actions, tabulate
 
 
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
@@ -33,6 +35,11 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     if protocol.queries and not isinstance(agent, QueryingAgent):
         raise InvalidValueError(
             f"Agent {name!r} cannot query an oracle; leave --queries out, or give an agent that can, such as factored."
+        )
+
+    if protocol.feedback and isinstance(agent, ExternalTrainer):
+        raise InvalidValueError(
+            f"Agent {name!r} trains in a loop of its own and gets no feedback; leave --feedback out, or that agent."
         )
 
 
@@ -77,6 +84,34 @@ class LabelOracle:
             for outcome in self._rules.outcomes(state, planned[-1])
         }
         return labels.pop() if len(labels) == 1 else None
+
+
+class Teacher:
+    """Watches a learner, and tells after each macro-action whether it was optimal (thesis 6: teacher feedback).
+
+    The learner sees that as reward on top of the world's own: ``feedback`` where an optimal agent could have chosen the
+    action, else minus that. With probability ``error`` the teacher says the opposite.
+    """
+
+    def __init__(self, rules: Rules, feedback: float, error: float) -> None:
+        tables = tabulate(rules)
+        self._rows, self._optimal = tables.index, optimal_actions(tables)
+        self._feedback, self._error = feedback, error
+
+    def begin(self, seed: int) -> None:
+        """A new episode, of which ``seed`` decides the errors."""
+        self._rng = np.random.default_rng(seed)
+
+    def __call__(self, observation: Observation, info: Info) -> None:
+        """See where the learner is about to act."""
+        self._row = self._rows[tuple(int(value) for value in info["macrostate"])]
+
+    def told(self, transition: Transition) -> Transition:
+        """The transition that followed, with what the teacher says of it in its reward."""
+        right = bool(self._optimal[transition.action, self._row]) != bool(self._rng.random() < self._error)
+        return dataclasses.replace(
+            transition, reward=transition.reward + (self._feedback if right else -self._feedback)
+        )
 
 
 class QueryBudget:

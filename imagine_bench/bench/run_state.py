@@ -13,7 +13,7 @@ import gymnasium
 
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import Env
-from imagine_bench.bench.queries import require_able
+from imagine_bench.bench.queries import Teacher, require_able
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Agent
 from imagine_bench.protocols.control import Protocol
@@ -65,6 +65,8 @@ class Run:
         self.agent: Agent = registry.make_agent(spec.agent, spec.context())
         if self.entry.learns:
             require_able(self.agent, spec.agent, spec.protocol)
+        wanted = self.protocol
+        self.teacher = Teacher(self.task.rules, wanted.feedback, wanted.feedback_error) if wanted.feedback else None
         self.counters = Counters()
         self._on_progress = on_progress
         with writing(folder):

@@ -64,6 +64,10 @@ class Bench:
     """First training episodes that the oracle plays and learners watch; budgets count them."""
     queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
+    feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
+    """Reward that a teacher adds for an optimal macro-action, and takes off for another, in training."""
+    feedback_error: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
+    """Probability with which the teacher says the opposite."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
@@ -81,7 +85,7 @@ class Bench:
             require_values(name, getattr(self, name))
         names = (
             *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
-            "after_episodes", "demonstrations", "queries",
+            "after_episodes", "demonstrations", "queries", "feedback", "feedback_error",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None

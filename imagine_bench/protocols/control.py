@@ -56,6 +56,11 @@ class Protocol(ProtocolData):
     #: real episodes as any, and budgets count them.
     demonstrations: int = 0
     queries: int = 0  #: Most oracle queries of a learner in a training episode
+    #: Reward on top of the world's own for a macro-action of its own that an optimal agent could have chosen, and less
+    #: for another: a teacher's feedback in training. Demonstrations and earlier tasks get none.
+    feedback: float = field(default=0.0, metadata=LATER)
+    #: Probability with which the teacher says the opposite, at most 0.5.
+    feedback_error: float = field(default=0.0, metadata=LATER)
     #: Appearance of the tests where it is another one than the training's.
     test_appearance: str | None = field(default=None, metadata=LATER)
     #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
@@ -79,6 +84,11 @@ class Protocol(ProtocolData):
             if not least <= (value := getattr(self, name)) <= MOST:
                 allowed = f"at least {least}" if value < least else f"at most {MOST:,}"
                 raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
+        if not 0.0 <= self.feedback <= MOST or not 0.0 <= self.feedback_error <= (0.5 if self.feedback else 0.0):
+            raise InvalidValueError(
+                f"feedback is {brief(self.feedback)} and feedback_error {brief(self.feedback_error)}; give a reward of "
+                f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
+            )
         self._require_physics()
         require_same_world(self.task, self.after)
         if not self.after and self.after_episodes != _AFTER_EPISODES:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..motion import orientation
-from ..motion.executor import MacroResult
+from ..motion.executor import MacroResult, Motion
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.hand import fingertip_m
@@ -46,11 +46,11 @@ class ArrowWorld(World):
         self._put(cube, intended[cube])
         self.update()
 
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
         """Physical execution: the arm turns the cube in contact physics, then everything is at rest again."""
         del intended  # the human keeps pointing
         turn, before = TURNS[action], self.object_poses()
-        result = self.executor.turn(
+        result = yield from self.executor.turn(
             self.data, cube=turn.cube, clockwise=turn.clockwise, capture_motion_hz=capture_motion_hz
         )
         self.executor.executor.rest(self.data)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import mujoco
 import mujoco.rollout
@@ -51,6 +52,55 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
         qpos[model.joint(name).qposadr[0]] = value
         ctrl[model.actuator(name.replace("_slide", "") + "_servo").id] = value
     return qpos, ctrl
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Simulation:
+    """A planned motion that waits to be simulated; neither the thread nor the moment changes a bit of it."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData  #: at the canonical start, and at the end once it has run
+    states: Floats  #: row 0 is the start, :meth:`run` fills in what follows each step. Shape (N + 1, FULLPHYSICS).
+    control: Floats  #: controls, then mocap poses, of each step. Shape (N, C).
+
+    def run(self) -> None:
+        """Simulate; other threads go on meanwhile.
+
+        Raises:
+            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
+        """
+        states, control = self.states, self.control
+        mujoco.rollout.rollout(self.model, self.data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
+        warnings = (self.data.warning[int(kind)].number for kind in _BAD_STATE)
+        if not any(warnings) and np.isfinite(states[-1]).all() and np.abs(self.data.qvel).max() < _RUNAWAY_RAD_S:
+            return
+        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, start_state=states[0], control=control[:, : self.model.nu])
+        raise DivergedError(
+            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
+            f"its start state and controls were saved in {path}."
+        )
+
+
+_Value = TypeVar("_Value")
+Motion = Generator[Simulation, None, _Value]
+"""What carries a macro-action out: it yields each simulation that it needs, and goes on when that has run."""
+
+
+def finish(motion: Motion[_Value]) -> _Value:
+    """Carry a motion out here and now.
+
+    Raises:
+        DivergedError: As :meth:`Simulation.run`.
+    """
+    while True:
+        try:
+            simulation = next(motion)
+        except StopIteration as end:
+            value: _Value = end.value
+            return value
+        simulation.run()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,23 +160,20 @@ class MacroExecutor:
         ik_error_m: float,
         squeeze_m: float | None = None,
         capture_motion_hz: float = 0.0,
-    ) -> tuple[MacroResult, Floats, Trajectory]:
+    ) -> Motion[tuple[MacroResult, Floats, Trajectory]]:
         """Plan a motion through ``waypoints``, the last of which is the observation pose, and execute it.
 
         ``squeeze_m`` is as in :meth:`rest`, ``capture_motion_hz`` as in :meth:`capture`.
 
         Returns:
             The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
-
-        Raises:
-            DivergedError: As :meth:`run`.
         """
         timestep_s, start_rad = self.model.opt.timestep, np.array(OBSERVATION_QPOS_RAD)
         start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
             arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
-        qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
+        qpos = yield from self.run(data, trajectory, squeeze_m=squeeze_m)
         time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)
         off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
@@ -142,7 +189,7 @@ class MacroExecutor:
         time_s, qpos, qvel, ctrl = self.capture(0, 0.0)
         return MacroResult(sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=time_s, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
-    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
+    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Motion[Floats]:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
 
         The derived quantities of ``data`` (such as ``xpos``) are then those of the last step.
@@ -150,9 +197,6 @@ class MacroExecutor:
         Returns:
             Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
             Shape (N + 1, nq).
-
-        Raises:
-            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data, squeeze_m=squeeze_m)
         steps = len(trajectory.opening_m)
@@ -165,8 +209,7 @@ class MacroExecutor:
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
-        self._check(data, states, control)
+        yield Simulation(model=self.model, data=data, states=states, control=control)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
 
     def arm_qpos_rad(self, qpos: Floats) -> Floats:
@@ -200,16 +243,3 @@ class MacroExecutor:
         for row in np.flatnonzero(share % 1.0):
             mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
         return at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, :nu]
-
-    def _check(self, data: mujoco.MjData, states: Floats, control: Floats) -> None:
-        """Raise if the simulation blew up."""
-        broken = any(data.warning[int(kind)].number for kind in _BAD_STATE) or not np.isfinite(states[-1]).all()
-        if not broken and np.abs(data.qvel).max() < _RUNAWAY_RAD_S:
-            return
-        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=states[0], control=control[:, : self.model.nu])
-        raise DivergedError(
-            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
-            f"its start state and controls were saved in {path}."
-        )

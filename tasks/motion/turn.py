@@ -13,7 +13,7 @@ from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M, SLOTS_XY_M
 from .arm_model import ArmModel
-from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, Motion, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .sensing import Sensing
@@ -51,14 +51,15 @@ class TurnExecutor:
         self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(SLOTS_XY_M))]
         self._slots = [self._reach(np.array(slot), None) for slot in SLOTS_XY_M]
 
-    def turn(self, data: mujoco.MjData, *, cube: int, clockwise: bool, capture_motion_hz: float = 0.0) -> MacroResult:
+    def turn(
+        self, data: mujoco.MjData, *, cube: int, clockwise: bool, capture_motion_hz: float = 0.0
+    ) -> Motion[MacroResult]:
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
         The outcome is a pure function of the loose objects' positions and the arguments, bit for bit.
 
         Raises:
             InvalidValueError: No such cube.
-            DivergedError: The simulation blew up.
         """
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
@@ -79,7 +80,7 @@ class TurnExecutor:
             _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces),
             max(grip.error_m, slot.error_m),
         )
-        result, qpos, trajectory = self.executor.perform(
+        result, qpos, trajectory = yield from self.executor.perform(
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         turned = qpos[trajectory.last_step["turn"] + 1]

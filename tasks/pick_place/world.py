@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..motion import orientation
-from ..motion.executor import REST_OPENING_M, MacroResult
+from ..motion.executor import REST_OPENING_M, MacroResult, Motion
 from ..scenes.appearance import Appearance
 from ..scenes.arm import FINGER_JOINTS, TCP_SITE
 from ..scenes.constants import TABLE_HEIGHT_M
@@ -107,14 +107,14 @@ class PickWorld(World):
         self._gesture(intended[N_OBJECTS])
         self.update()
 
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
         else happened is not what they asked for, so they withdraw.
         """
         before, poses = self._objects()[0], self.object_poses()
-        result = self._act(action, before, capture_motion_hz)
+        result = yield from self._act(action, before, capture_motion_hz)
         self.update()
         self.executor.rest(self.data, held_object(self._objects()[0]))
         self.update()
@@ -126,7 +126,7 @@ class PickWorld(World):
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
-    def _act(self, action: int, objects: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def _act(self, action: int, objects: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
         """What the robot does, possible or not: what it cannot do it reaches out for in vain."""
         held, executor = held_object(objects), self.executor
         if action == HAND_OVER:

@@ -56,12 +56,14 @@ def test_any_change_changes_the_hash():
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
-        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1,
+        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0,
         "settings_digest": "0123456789ab", "test_appearance": "strong", "physics": (("pad_friction", 0.5),),
     }  # fmt: skip
-    assert {*changes, "after_episodes"} >= {field.name for field in dataclasses.fields(Protocol)}
+    assert {*changes, "after_episodes", "feedback_error"} >= {field.name for field in dataclasses.fields(Protocol)}
     after = dataclasses.replace(base, after=("arrow_puzzle",))
     assert dataclasses.replace(after, after_episodes=7).hash != after.hash
+    taught = dataclasses.replace(base, feedback=1.0)
+    assert dataclasses.replace(taught, feedback_error=0.1).hash != taught.hash
     hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
     assert len(hashes | {base.hash}) == len(changes) + 1
 

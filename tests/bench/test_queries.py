@@ -14,12 +14,14 @@ from small_runs import final_arrays, measured, small
 from imagine_bench import registry
 from imagine_bench.bench import phases, run_state
 from imagine_bench.bench.control import run_observed
-from imagine_bench.bench.queries import LabelOracle
+from imagine_bench.bench.queries import LabelOracle, Teacher
 from imagine_bench.capabilities import Label, QueryingAgent, TransferLearner
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.codec import read_arrays
 from imagine_bench.store.results import RunResult
@@ -126,6 +128,59 @@ def test_queries_change_no_start_and_no_test(tmp_path: Path) -> None:
     assert final_arrays(tmp_path / "with")["table"].tobytes() == final_arrays(tmp_path / "without")["table"].tobytes()
 
 
+# --- feedback ----------------------------------------------------------------------------------------------------
+
+
+def test_feedback_is_reward_for_optimal_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By counting plans: an action is optimal where it leads to a goal by as few actions as any."""
+    lived, real = [], phases.play
+
+    def watching(env: Any, agent: Any, **options: Any) -> Any:
+        state = None
+
+        def before_acting(observation: Any, info: Any) -> None:
+            nonlocal state
+            state = tuple(info["macrostate"].tolist())
+            options["before_acting"](observation, info)
+
+        for transition, info in real(env, agent, **{**options, "before_acting": before_acting}):
+            lived.append((state, transition.reward, transition.terminated, info))
+            yield transition, info
+
+    monkeypatch.setattr(phases, "play", watching)
+    do(tmp_path / "run", feedback=3.0, budgets=(30,))
+    (pupil,) = Pupil.made
+    rules, right = registry.task("arrow_puzzle").rules, []
+    for (state, reward, terminated, info), (_, seen) in zip(lived, pupil.shown, strict=True):
+        success, after = bool(info["is_success"]), tuple(info["macrostate"].tolist())
+        steps = 1 if success else 999 if terminated else 1 + fewest_actions(rules, after)
+        right.append(steps == fewest_actions(rules, state))
+        assert seen.reward == reward + (3.0 if right[-1] else -3.0) and seen.observation.macrostate is None
+    assert 5 < sum(right) < len(right) - 5
+
+
+def test_a_noisy_teacher_errs_as_often_as_said(tmp_path: Path) -> None:
+    teacher, rules = Teacher(registry.task("arrow_puzzle").rules, 1.0, 0.2), registry.task("arrow_puzzle").rules
+    info = {"macrostate": np.array((3, 1, 2, 0))}
+    frame = np.zeros((64, 64, 3), np.uint8)
+    optimal = rules.optimal_action((3, 1, 2, 0))
+    seen = Observation(frame=frame)
+    lived = Transition(
+        observation=seen, action=optimal, reward=-1.0, next_observation=seen, terminated=False, truncated=False
+    )
+    rewards = []
+    for episode in range(2):
+        teacher.begin(episode)
+        teacher(seen, info)
+        rewards.append([teacher.told(lived).reward for _ in range(4_000)])
+    assert set(rewards[0]) == {0.0, -2.0} and rewards[0] != rewards[1]
+    wrong = np.mean(np.array(rewards) == -2.0)
+    assert abs(wrong - 0.2) < 4 * np.sqrt(0.2 * 0.8 / 8_000)
+    teacher.begin(0)
+    teacher(seen, info)
+    assert [teacher.told(lived).reward for _ in range(4_000)] == rewards[0]
+
+
 # --- earlier tasks -----------------------------------------------------------------------------------------------
 
 
@@ -173,6 +228,8 @@ def test_who_can_carry_over_or_ask_is_known() -> None:
         (["--after-episodes", "50"], "after_episodes is 50, but no task comes before; give it in after."),
         (["--demonstrations", "-1"], "demonstrations is -1; give at least 0."),
         (["--queries", "-1"], "queries is -1; give at least 0"),
+        (["--feedback-error", "0.1"], "feedback is 0.0 and feedback_error 0.1; give a reward of at least 0"),
+        (["--feedback", "1", "--feedback-error", "0.6"], "feedback is 1.0 and feedback_error 0.6; give a reward of"),
     ],
 )
 def test_wrong_words_get_one_line_and_exit_code_2(
@@ -196,7 +253,16 @@ class _KilledError(Exception):
     ("agent", "changes"),
     [
         ("factored", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "queries": 2}),
-        ("imagination", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2}),
+        (
+            "imagination",
+            {
+                "after": ("arrow_puzzle_hard",),
+                "after_episodes": 4,
+                "demonstrations": 2,
+                "feedback": 1.0,
+                "feedback_error": 0.3,
+            },
+        ),
     ],
 )
 def test_a_killed_and_taught_learner_ends_in_the_same_bits(

@@ -248,7 +248,7 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
     turn = env.world.executor.turn
 
     def clumsy(data, **arguments):
-        result = turn(data, **arguments)
+        result = yield from turn(data, **arguments)
         data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 

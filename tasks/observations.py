@@ -1,0 +1,91 @@
+"""What an environment shows of one moment: the agent's frame, the human's view, the macrostate, the arm's own sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError, brief, require_known
+
+from .rendering import Renderer
+from .scene_reader import ArmColumns, tcp_in_world
+from .world import World
+
+PARTS = ("frame", "human", "state", "proprio")
+SIZES_PX = (32, 256)
+"""Smallest and largest edge of an observed image."""
+_LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
+"""Of ``proprio``: joints (rad), fingers (m), and the tool's position (m) and quaternion. The arm reaches 1.3 m."""
+
+
+class Observer:
+    """Observations of a world: one part as it is, several, separated by commas, as a dict.
+
+    ``frame`` is the agent's camera and ``human`` the whole scene, uint8 (size, size, 3). ``state`` is the macrostate, a
+    one-hot vector for each coordinate, float32. ``proprio`` is float32 (16,): seven joints (rad), each finger's
+    distance from the grip's middle (m), and the point between them: position (m) and quaternion (w, x, y, z).
+
+    Args:
+        choice: Names in :data:`PARTS`.
+        size: Edge of images in pixels.
+        world: What is observed.
+        values: Names of the values of each coordinate of a macrostate.
+        camera: The renderer of an image, by its name and size.
+
+    Raises:
+        UnknownNameError: Another part.
+        InvalidValueError: A part twice, or another size.
+    """
+
+    def __init__(
+        self,
+        choice: str,
+        size: int,
+        world: World,
+        values: Sequence[Sequence[str]],
+        camera: Callable[[str, int], Renderer],
+    ) -> None:
+        names = choice.split(",") if isinstance(choice, str) else [choice]
+        self._names = tuple(require_known("observation", name, PARTS) for name in names)
+        if len(set(names)) < len(names):
+            raise InvalidValueError(f"Observation {choice!r} names a part twice; give each of {', '.join(PARTS)} once.")
+        low, high = SIZES_PX
+        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
+            raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
+        self._world, self._columns = world, ArmColumns.of(world.model) if "proprio" in names else None
+        self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
+        self._cameras = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
+        image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
+        one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
+        arm = gymnasium.spaces.Box(_LOW, -_LOW)
+        spaces: dict[str, gymnasium.Space[Any]] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
+        chosen = {name: spaces[name] for name in self._names}
+        self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
+
+    def observe(self, macrostate: tuple[int, ...]) -> Any:
+        """The world as it stands, which was read as ``macrostate``."""
+        parts = {name: self._part(name, macrostate) for name in self._names}
+        return parts if len(parts) > 1 else parts[self._names[0]]
+
+    def close(self) -> None:
+        """Free the OpenGL contexts; may be called again."""
+        for camera in self._cameras.values():
+            camera.close()
+
+    def _part(self, name: str, macrostate: tuple[int, ...]) -> NDArray[Any]:
+        if name in self._cameras:
+            image = self._cameras[name].frame(self._world.data, self._world.model)
+            return self._world.develop(image) if name == "frame" else image
+        if name == "state":
+            one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
+            one_hot[self._offsets[:-1] + macrostate] = 1.0
+            return one_hot
+        assert self._columns is not None
+        qpos = self._world.data.qpos
+        pose = tcp_in_world(self._world.model, self._world.data)
+        return np.concatenate([qpos[self._columns.arm_qpos], qpos[self._columns.finger_qpos], pose], dtype=np.float32)

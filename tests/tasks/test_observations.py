@@ -1,0 +1,149 @@
+"""What an environment can be asked to show: parts of one moment, of any size, and macrostates that nobody visits."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from worlds import WORLDS
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.interfaces import EXECUTIONS
+
+KINEMATIC = {"execution": "kinematic"}
+ALL = "frame,human,state,proprio"
+
+
+def make(task="arrow_puzzle", **options):
+    return gymnasium.make(registry.TASKS[task].env_id, disable_env_checker=True, **options)
+
+
+def decoded(one_hot, task):
+    """The macrostate that one one-hot vector a coordinate says; each must have exactly one 1."""
+    cuts = np.cumsum([len(values) for values in registry.task(task).macrostate_values])[:-1]
+    vectors = np.split(one_hot, cuts)
+    assert all(sorted(vector.tolist()) == [0.0] * (len(vector) - 1) + [1.0] for vector in vectors)
+    return [int(vector.argmax()) for vector in vectors]
+
+
+@pytest.mark.parametrize(("task", "execution"), list(zip(WORLDS, EXECUTIONS, strict=True)))
+def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
+    plain, whole = (make(task, execution=execution, appearance="mild", **more) for more in ({}, {"observation": ALL}))
+    assert plain.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+    (frame, info), (parts, info_too) = plain.reset(seed=2), whole.reset(seed=2)
+    seen = [(frame, info, parts, info_too)]
+    for action in (1, 0):
+        (frame, *_, info), (parts, *_, info_too) = plain.step(action), whole.step(action)
+        seen.append((frame, info, parts, info_too))
+        motion, scene = whole.unwrapped.arm_motion(), whole.unwrapped
+        sense = [*motion.joint_rad[-1], *motion.gripper_m[-1], *motion.tcp_in_world[-1]]
+        np.testing.assert_array_equal(parts["proprio"], np.array(sense, dtype=np.float32))
+        np.testing.assert_array_equal(parts["human"], scene.human_view(64, 64))
+    for frame, info, parts, info_too in seen:
+        assert parts in whole.observation_space
+        np.testing.assert_array_equal(frame, parts["frame"])
+        np.testing.assert_equal(info, info_too)
+        assert decoded(parts["state"], task) == info["macrostate"].tolist()
+    assert len({parts["state"].tobytes() for _, _, parts, _ in seen}) > 1
+    plain.close()
+    whole.close()
+
+
+@pytest.mark.parametrize("choice", ["frame", "proprio", "human,state"])
+def test_gymnasium_s_checker_is_content(choice):
+    env = make(observation=choice, size=32, **KINEMATIC)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
+    assert isinstance(env.observation_space, gymnasium.spaces.Dict) == ("," in choice)
+    env.close()
+
+
+def test_a_gripper_that_holds_is_felt():
+    env = make("pick_place", observation="proprio")
+    empty, _ = env.reset(seed=0, options={"macrostate": (0, 0, 0, 2)})
+    held, *_, info = env.step(2)
+    assert info["legal"] and np.flatnonzero(np.abs(held - empty) > 1e-6).tolist() == [7, 8]
+    assert (held[7:9] < empty[7:9] - 0.002).all()
+
+
+def test_every_size_shows_the_same_view():
+    images = []
+    for size in (32, 64, 256):
+        env = make(size=size, appearance="photo", **KINEMATIC)
+        image, _ = env.reset(seed=3)
+        rendered = env.unwrapped._observer._cameras["frame"].frame(env.unwrapped.data)
+        assert np.abs(image.astype(int) - rendered).mean() > 3  # it is a photograph
+        env.close()
+        assert image.shape == env.observation_space.shape == (size, size, 3)
+        block = size // 32
+        images.append(image.reshape(32, block, 32, block, 3).mean(axis=(1, 3)))
+    contrast = np.abs(images[2] - images[2].mean(axis=(0, 1))).mean()
+    for image in images[:2]:
+        assert np.abs(image - images[2]).mean() < 0.4 * contrast  # sensor noise is each pixel's own
+
+
+def test_vectors_and_pickles_of_dicts_work():
+    vector = gymnasium.make_vec(
+        registry.TASKS["arrow_puzzle"].env_id, num_envs=2, vectorization_mode="sync", observation=ALL, **KINEMATIC
+    )
+    parts, _ = vector.reset(seed=1)
+    assert {name: part.shape for name, part in parts.items()} == {
+        "frame": (2, 64, 64, 3), "human": (2, 64, 64, 3), "state": (2, 15), "proprio": (2, 16),
+    }  # fmt: skip
+    vector.close()
+    env = make(observation="frame,state", size=48, **KINEMATIC)
+    env.reset(seed=1)
+    twin = pickle.loads(pickle.dumps(env))
+    np.testing.assert_equal(env.step(1)[0], twin.step(1)[0])
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"observation": "pixels"}, UnknownNameError, "frame, human, state, proprio"),
+        ({"observation": "frame, state"}, UnknownNameError, "Did you mean 'state'"),
+        ({"observation": None}, UnknownNameError, "frame, human, state, proprio"),
+        ({"observation": "state,frame,state"}, InvalidValueError, "names a part twice"),
+        ({"size": 31}, InvalidValueError, "Observation size 31 must be an integer from 32 to 256 pixels"),
+        ({"size": 257}, InvalidValueError, "257"),
+        ({"size": 64.0}, InvalidValueError, "64.0"),
+    ],
+)
+def test_what_cannot_be_observed_is_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        make(**options)
+
+
+@pytest.mark.parametrize(("task", "execution"), list(zip(WORLDS, EXECUTIONS, strict=True)))
+def test_frame_of_shows_a_macrostate_and_changes_nothing(task, execution):
+    env, twin = (make(task, execution=execution, appearance="strong") for _ in range(2))
+    other = registry.task(task).rules.start_states[-1]
+    seen, _ = twin.reset(seed=7, options={"macrostate": other})
+    for each in (env, twin):
+        each.reset(seed=1)
+        each.step(1)
+    before = env.unwrapped.get_state()
+    frame = env.unwrapped.frame_of(other, np.random.default_rng(7))
+    np.testing.assert_array_equal(frame, seen)
+    np.testing.assert_array_equal(env.unwrapped.frame_of(other), env.unwrapped.frame_of(other))
+    after = env.unwrapped.get_state()
+    np.testing.assert_array_equal(before.world.physics, after.world.physics)
+    for look, look_too in zip(before.world.looks, after.world.looks, strict=True):
+        np.testing.assert_array_equal(look, look_too)
+    assert (before.generator, before.macrostate) == (after.generator, after.macrostate)
+    for action in (0, 1):
+        (image, *result), (image_too, *result_too) = env.step(action), twin.step(action)
+        np.testing.assert_array_equal(image, image_too)
+        np.testing.assert_equal(result, result_too)
+    with pytest.raises(InvalidValueError, match="No macrostate"):
+        env.unwrapped.frame_of((9, 9, 9, 9))
+    env.close()
+    twin.close()
