@@ -48,6 +48,7 @@ _HEAVY = {
     "mink": "tasks",
     "daqp": "tasks",
     "OpenGL": "tasks",
+    "pygame": "tasks",
     "rerun": "imagine_bench/recording",
 }
 _SOURCES = sorted(path for room in ("imagine_bench", "tasks", "agents") for path in (_TOP / room).rglob("*.py"))
