@@ -18,11 +18,12 @@ def _variant(factor: str, name: str, settings: Mapping[str, Any], agent: str = _
 
 def _pair(factor: str, value: str, settings: Mapping[str, Any], appearance: str | None = None) -> tuple[Variant, ...]:
     """A factor that concerns DQN too: both agents have it."""
+    world = {} if appearance is None else {"appearance": appearance}
     return (
-        Variant(name=f"dqn, {value}", factor=factor, agent=_DQN, settings=settings, appearance=appearance),
+        Variant(name=f"dqn, {value}", factor=factor, agent=_DQN, settings=settings, world=world),
         Variant(
             name=f"imagination, {value}", factor=factor, agent=_FILTERED, against=f"dqn, {value}",
-            settings=settings, appearance=appearance,
+            settings=settings, world=world,
         ),
     )  # fmt: skip
 

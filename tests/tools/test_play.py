@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import sys
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from fake_agents import FakeAgent, FakeImaginer
+from worlds import draw_quickly
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -20,6 +22,11 @@ from imagine_bench.tools.play import KEYS, KeyboardGame, play
 pygame = pytest.importorskip("pygame")  # of the extra play
 WAIT = 6
 START = (1, 2, 0, 1)
+
+
+@pytest.fixture(autouse=True)
+def without_shadows(monkeypatch):
+    draw_quickly(monkeypatch)
 
 
 def game_of(imaginer=None, seed=0, **options):
@@ -108,15 +115,16 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
     class Imaginer(FakeImaginer):
         def imagine(self, frame, *, actions, depth, rng):
             asked.append((frame, actions.tolist(), depth, rng.random()))
-            return super().imagine(frame, actions=actions, depth=depth, rng=rng)
+            rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+            right = registry.task("arrow_puzzle").rules.outcomes(START, 4)[0].macrostate
+            return dataclasses.replace(rollout, macrostates=np.array([right] * depth))  # of the first, not the second
 
     monkeypatch.setattr(module, "_HOLD", 1)
     game = game_of(Imaginer(), execution="kinematic")
     blank = game.reset(options={"macrostate": START}) and game.render()
-    frame, macrostates = game._start, []
+    frame = game._start
     for action in (4, 4):
         seen, _ = until_done(game, action)
-        macrostates.append(seen[-1][4]["macrostate"].tolist())
     assert [each[1:3] for each in asked] == [([4], 1), ([4, 4], 2)]
     assert all(np.array_equal(each[0], frame) for each in asked)
     assert asked[0][3] == asked[1][3]  # the same draws: the imagined past stays
@@ -137,8 +145,7 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
     shown = right[36 : 36 + 192 : 3, 8 : 8 + 192 : 3]
     np.testing.assert_array_equal(shown, image)
     np.testing.assert_array_equal(left[36 : 36 + 192 : 3, -276 : -276 + 192 : 3], seen[-1][0])
-    assert game.imagined == 2 and game.foreseen == sum(each == [0, 0, 0, 0] for each in macrostates)
-    assert game.summary().endswith(f"\nThe model foresaw {game.foreseen} of 2 macrostates.")
+    assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
     game.close()
 
 
@@ -146,21 +153,22 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
 def keyboard(monkeypatch):
     """Keys pressed one after another, each held for three images, then the window is closed; what it showed last."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    importlib.import_module("matplotlib.pyplot")  # so that a change of its backend would be seen
+    monkeypatch.setattr(module, "_HOLD", 1)
+    importlib.import_module("matplotlib.pyplot").switch_backend("svg")
     last = {}
 
     def press(keys):
         flip, script = pygame.display.flip, []
         for key in keys:
-            script += [None, (pygame.KEYDOWN, key), None, None, (pygame.KEYUP, key), *[None] * 60]
+            script += [None, (pygame.KEYDOWN, key), None, None, (pygame.KEYUP, key), *[None] * 6]
         script.append((pygame.QUIT, None))
         events = iter(script)
 
         def flipped():
             flip()
-            last["image"] = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
             if (event := next(events, None)) is not None:
                 kind, key = event
+                last["image"] = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
                 pygame.event.post(pygame.event.Event(kind, {"key": ord(key)} if key else {}))
 
         monkeypatch.setattr(pygame.display, "flip", flipped)
