@@ -307,10 +307,19 @@ def task_entry(name: str) -> TaskEntry:
 
 
 def register_env(entry: TaskEntry) -> None:
-    """Register a task's environment with Gymnasium, unless its id is known already."""
+    """Register a task's environment with Gymnasium, unless its id is known already, and its vector environment."""
     if entry.env_id not in gymnasium.registry:
-        options = dict(entry.options)
-        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=options)
+        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
+        gymnasium.register(
+            vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
+            max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
+        )  # fmt: skip
+
+
+def vector_id(env_id: str) -> str:
+    """The id of an environment's own vector environment; that of the single one keeps Gymnasium's default, sync."""
+    name, _, version = env_id.rpartition("-v")
+    return f"{name}-vector-v{version}"
 
 
 def agent_entry(name: str) -> AgentEntry:

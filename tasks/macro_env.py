@@ -177,7 +177,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
-        chosen = self._checked(action)
+        chosen = self.checked(action)
         self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
@@ -200,6 +200,16 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         info = self._info(success=outcome.success, legal=legal, fault=fault)
         return float(outcome.reward), outcome.terminated, info
 
+    @property
+    def execution(self) -> str:
+        """``"physics"`` or ``"kinematic"``."""
+        return self._execution
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is an episode to go on with."""
+        return self._begun
+
     def observe(self) -> Any:
         """What :meth:`reset` and :meth:`step` return of the scene as it stands."""
         return self._observer.observe(self._macrostate)
@@ -211,7 +221,12 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self._render_camera.frame(self.world.data)
+        return None if self.render_mode is None else self._render_camera.frame(self.world.data, self.world.model)
+
+    def draw_with(self, cameras: MacroEnv, *, shown_by: MacroEnv) -> None:
+        """From now on draw observations with the cameras of one like this, and what people see with another's."""
+        self._agent_camera, self._render_camera = cameras._agent_camera, shown_by._render_camera
+        self._observer.draw_with(cameras._observer)
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""
@@ -395,7 +410,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             return f"{len(top)} integers from 0 to at most {top}"
         return f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
 
-    def _checked(self, action: np.int64 | int) -> int:
+    def checked(self, action: np.int64 | int) -> int:
+        """A macro-action as a number. Raises InvalidValueError: no such action."""
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         try:
             chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1

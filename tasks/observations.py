@@ -72,6 +72,10 @@ class Observer:
         parts = {name: self._part(name, macrostate) for name in self._names}
         return parts if len(parts) > 1 else parts[self._names[0]]
 
+    def draw_with(self, other: Observer) -> None:
+        """Use the cameras of one like this."""
+        self._cameras = other._cameras
+
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""
         for camera in self._cameras.values():
