@@ -145,7 +145,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             InvalidValueError: Not a macrostate of this task.
         """
         info = self.restart(seed=seed, options=options)
-        return self.observe(), info
+        return self.observe([self])[0], info
 
     def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
         """As :meth:`reset`, without an observation."""
@@ -167,7 +167,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             DivergedError: The simulation blew up; the episode is over.
         """
         reward, terminated, info = finish(self.acting(action))
-        return self.observe(), reward, terminated, False, info
+        return self.observe([self])[0], reward, terminated, False, info
 
     def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
         """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
@@ -210,9 +210,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """Whether there is an episode to go on with."""
         return self._begun
 
-    def observe(self) -> Any:
-        """What :meth:`reset` and :meth:`step` return of the scene as it stands."""
-        return self._observer.observe(self._macrostate)
+    def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
+        """What :meth:`reset` and :meth:`step` return of environments like this as they stand, by its cameras."""
+        return self._observer.observe([(env._observer, env._macrostate) for env in envs])
 
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
@@ -221,12 +221,11 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self._render_camera.frame(self.world.data, self.world.model)
+        return None if self.render_mode is None else self.show([self])[0]
 
-    def draw_with(self, cameras: MacroEnv, *, shown_by: MacroEnv) -> None:
-        """From now on draw observations with the cameras of one like this, and what people see with another's."""
-        self._agent_camera, self._render_camera = cameras._agent_camera, shown_by._render_camera
-        self._observer.draw_with(cameras._observer)
+    def show(self, envs: Sequence[MacroEnv]) -> list[Frame]:
+        """What :meth:`render` returns of environments like this, drawn by its camera."""
+        return self._render_camera.frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""

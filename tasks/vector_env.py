@@ -24,8 +24,6 @@ from .macro_env import MacroEnv
 from .motion.executor import Motion
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
-_MAX_DRAWERS = 4
-"""Each thread that draws needs an OpenGL context: 6 MB and a tenth of a second."""
 _Step = tuple[float, bool, dict[str, Any]]
 Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
@@ -59,7 +57,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
     info and the observation before; the others go on.
 
     Args:
-        lanes: The environments, made alike; ``envs`` holds them. They are drawn with the first ones' cameras.
+        lanes: The environments, made alike; ``envs`` holds them. The first one's cameras draw all.
         max_episode_steps: Macro-actions before truncation, or None.
         autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
             ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
@@ -92,11 +90,6 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._threads = ThreadPoolExecutor(threads, "simulation")
-        # Drawing is most of a kinematic macro-action and a thirtieth of a real one.
-        n_drawers = min(threads, self.num_envs, _MAX_DRAWERS) if lanes[0].execution == "kinematic" else 1
-        self._drawers = [ThreadPoolExecutor(1, "drawing") for _ in range(n_drawers - 1)]
-        for index, lane in enumerate(lanes):
-            lane.draw_with(lanes[index % n_drawers], shown_by=lanes[0])
         self._seen: list[Any] = [None] * self.num_envs
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
@@ -125,10 +118,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             acting = self._acting.pop(lane, None)
             if acting is not None and acting.simulated is not None:
                 acting.simulated.exception()  # its data is in use until then
-        infos: dict[str, Any] = {}
-        for lane, info in self._restart(chosen, seeds, options).items():
-            infos = self._add_info(infos, info, lane)
-        return self._stacked(range(self.num_envs)), infos
+        infos = self._restart(chosen, seeds, options)
+        return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
 
     def step(self, actions: NDArray[np.int64]) -> Batch:
         """One macro-action in every lane.
@@ -141,16 +132,14 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
     def render(self) -> tuple[Any, ...] | None:
         """An image of each lane, or None without a render mode."""
-        return None if self.render_mode is None else tuple(lane.render() for lane in self.envs)
+        return None if self.render_mode is None else tuple(self.envs[0].show(self.envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free threads and OpenGL contexts, each where it was made."""
+        """Free threads and OpenGL contexts."""
         del kwargs
         self._threads.shutdown()
-        for drawer, lane in zip(self._drawers, self.envs[1:], strict=False):
-            drawer.submit(lane.close).result()
-            drawer.shutdown()
-        self.envs[0].close()
+        for lane in self.envs:
+            lane.close()
 
     # --- at its own pace -----------------------------------------------------------------------------------------
 
@@ -173,7 +162,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
                 raise InvalidValueError(f"Lane {lane} is acting; receive it first.")
             if self._seen[lane] is None or (self._over[lane] and self.autoreset_mode == AutoresetMode.DISABLED):
                 raise InvalidValueError(f"Lane {lane} has no episode to go on with; reset it first.")
-        chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, actions, strict=True)]
+        given = actions.tolist() if isinstance(actions, np.ndarray) else actions
+        chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, given, strict=True)]
         for lane, action in zip(lanes, chosen, strict=True):
             motion = None if self._over[lane] else self.envs[lane].acting(action)
             self._acting[lane] = acting = _Acting(motion=motion, due_s=self._clock_s)
@@ -220,12 +210,10 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         again = [lane for lane in lanes if lane not in infos]
         if mode == AutoresetMode.SAME_STEP:
             again = [lane for lane in lanes if self._over[lane]]
-            for lane in again:
-                final = {"final_obs": self._seen[lane], "final_info": infos[lane]}
-                collected = self._add_info(collected, final, lane)
+            final = {lane: {"final_obs": self._seen[lane], "final_info": infos[lane]} for lane in again}
+            collected = _columns(final, self.num_envs)
         infos.update(self._restart(again, [None] * self.num_envs, {}))
-        for lane in lanes:
-            collected = self._add_info(collected, infos[lane], lane)
+        collected.update(_columns(infos, self.num_envs))
         if mode == AutoresetMode.SAME_STEP:
             self._over[lanes] = False
         return self._stacked(lanes), rewards, ends[0], ends[1], collected
@@ -253,18 +241,11 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         return infos
 
     def _look(self, lanes: Sequence[int]) -> None:
-        """Draw lanes anew, each in the thread of its cameras."""
-        shares: list[list[int]] = [[] for _ in range(1 + len(self._drawers))]
-        for lane in lanes:
-            shares[lane % len(shares)].append(lane)
-        drawn = [drawer.submit(self._see, share) for drawer, share in zip(self._drawers, shares[1:], strict=True)]
-        self._see(shares[0])
-        for each in drawn:
-            each.result()
-
-    def _see(self, lanes: list[int]) -> None:
-        for lane in lanes:
-            self._seen[lane] = self.envs[lane].observe()
+        """Observe lanes anew, all by the cameras of the first."""
+        if lanes:
+            seen = self.envs[0].observe([self.envs[lane] for lane in lanes])
+            for lane, observation in zip(lanes, seen, strict=True):
+                self._seen[lane] = observation
 
     def _stacked(self, lanes: Sequence[int]) -> Any:
         """The latest observations of these lanes, copied."""
@@ -297,6 +278,27 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         if len(seed) != self.num_envs:
             raise InvalidValueError(f"{len(seed)} seeds are given for {self.num_envs} lanes; give one for each.")
         return list(seed)
+
+
+def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
+    """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
+    lanes = list(infos)
+    columns: dict[str, Any] = {}
+    mask = np.zeros(n, dtype=np.bool_)
+    mask[lanes] = True
+    for key, example in next(iter(infos.values()), {}).items():
+        values = [info[key] for info in infos.values()]
+        if isinstance(example, dict):
+            columns[key] = _columns(dict(zip(lanes, values, strict=True)), n)
+        elif key != "final_obs" and isinstance(example, np.ndarray | np.number | float | int):
+            columns[key] = np.zeros((n, *np.shape(example)), dtype=np.asarray(example).dtype)
+            columns[key][lanes] = values
+        else:
+            columns[key] = np.full(n, None, dtype=object)
+            for lane, value in zip(lanes, values, strict=True):
+                columns[key][lane] = value
+        columns[f"_{key}"] = mask.copy()
+    return columns
 
 
 def _rows(infos: dict[str, Any], lanes: list[int]) -> dict[str, Any]:
