@@ -249,6 +249,17 @@ class AgentState:
     values: dict[str, Any]  #: JSON-serialisable values
 
 
+class FrameEncoder(Protocol):
+    """A representation of frames that another package offers, such as the features of a frozen network.
+
+    It may also have ``decode``, from latents (N, Z) to pictures (N, H, W, 3) or (N, H, W) in [0, 1]; and
+    ``code_sizes``, the numbers of values of factors whose one-hot codes, one behind the other, its latents are.
+    """
+
+    def encode(self, frames: Frame) -> NDArray[np.floating[Any]]:
+        """Latents (N, Z), finite, of frames (N, 64, 64, 3); equal frames have equal latents, and Z never changes."""
+
+
 class Agent(Protocol):
     """A learner, or a fixed policy, seen by the runner. One agent lives through one run."""
 

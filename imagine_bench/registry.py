@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 
@@ -170,10 +170,6 @@ AGENTS: dict[str, AgentEntry] = {
     ),
 }  # fmt: skip
 
-TASK_GROUP, AGENT_GROUP = "imagine_bench.tasks", "imagine_bench.agents"
-"""Entry points in which installed packages offer tasks and agents of their own, each the ``"module:attr"`` of a
-TaskEntry or an AgentEntry."""
-
 DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 
@@ -185,6 +181,14 @@ class RegressorEntry:
     make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
     title: str  #: For headings, legends and tables
     description: str  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderEntry:
+    """An encoder that an installed package offers, for any task."""
+
+    make: str  #: ``"module:attr"`` of a function without arguments to a :class:`.interfaces.FrameEncoder`
+    description: str = "An encoder."  #: One sentence for a reader who knows none of this
 
 
 REGRESSIONS = {
@@ -204,6 +208,32 @@ REGRESSORS: dict[str, RegressorEntry] = {
     ),
 }  # fmt: skip
 
+TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
+REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP = (
+    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies")
+)
+"""Entry points in which installed packages offer what is theirs: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
+EncoderEntry, RegressionSpec, RegressorEntry or Study."""
+
+
+class _Group(NamedTuple):
+    """A group of entry points."""
+
+    what: str  #: one of it, in words
+    kind: str  #: ``"module:attr"`` of the class of its objects
+    own: Callable[[], Iterable[str]]  #: gives the names that are this suite's
+
+
+_GROUPS = {
+    TASK_GROUP: _Group("task", f"{__name__}:TaskEntry", lambda: (*TASKS, *REGRESSIONS)),
+    AGENT_GROUP: _Group("agent", f"{__name__}:AgentEntry", lambda: (*AGENTS, *REGRESSORS)),
+    ENCODER_GROUP: _Group("encoder", f"{__name__}:EncoderEntry", tuple),
+    REGRESSION_GROUP: _Group("regression task", f"{__name__}:RegressionSpec", lambda: (*TASKS, *REGRESSIONS)),
+    REGRESSOR_GROUP: _Group("regressor", f"{__name__}:RegressorEntry", lambda: (*AGENTS, *REGRESSORS)),
+    STUDY_GROUP: _Group(
+        "study", "imagine_bench.studies.study:Study", lambda: load("imagine_bench.studies.catalogue:STUDIES")
+    ),
+}
 TASK_TYPES = {
     "control": "imagine_bench.bench.control:CONTROL",
     "regression": "imagine_bench.regression.task_type:REGRESSION",
@@ -227,36 +257,47 @@ def load(target: str) -> Any:
 
 def tasks() -> dict[str, TaskEntry]:
     """All control tasks by name, also those of installed packages, without those that cannot be loaded."""
-    return {**TASKS, **_usable(TASK_GROUP)}
+    return {**TASKS, **usable(TASK_GROUP)}
 
 
 def agents() -> dict[str, AgentEntry]:
     """All agents by name, also those of installed packages, without those that cannot be loaded."""
-    return {**AGENTS, **_usable(AGENT_GROUP)}
+    return {**AGENTS, **usable(AGENT_GROUP)}
 
 
-def _usable(group: str) -> dict[str, Any]:
+def regressions() -> dict[str, Any]:
+    """All regression tasks by name, likewise."""
+    return {**REGRESSIONS, **usable(REGRESSION_GROUP)}
+
+
+def regressors() -> dict[str, RegressorEntry]:
+    """All regressors by name, likewise."""
+    return {**REGRESSORS, **usable(REGRESSOR_GROUP)}
+
+
+def usable(group: str) -> dict[str, Any]:
+    """What installed packages offer in a group of entry points and can be used, by name."""
     return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
 
 
 def refused_offers() -> dict[str, SetupError]:
-    """What installed packages offer and is no task or agent that can be used, by name: why."""
-    both = {**offers(AGENT_GROUP), **offers(TASK_GROUP)}
-    return {name: entry for name, entry in both.items() if isinstance(entry, SetupError)}
+    """What installed packages offer and cannot be used, by name: why."""
+    everything = {name: entry for group in _GROUPS for name, entry in offers(group).items()}
+    return {name: entry for name, entry in everything.items() if isinstance(entry, SetupError)}
 
 
 @functools.cache
 def offers(group: str) -> Mapping[str, Any]:
-    """What installed packages offer in a group of entry points, by name: an entry, or the error why it is none.
+    """What installed packages offer in a group of entry points, by name: an object, or the error why it is none.
 
     A name of this suite's own stays this suite's.
     """
-    kind, own = (TaskEntry, {*TASKS, *REGRESSIONS}) if group == TASK_GROUP else (AgentEntry, {*AGENTS, *REGRESSORS})
     found: dict[str, Any] = {}
     for point in entry_points(group=group):
+        what, kind = _GROUPS[group].what, load(_GROUPS[group].kind)
         package = point.dist.name if point.dist else point.module
-        offer = f"The package {package} offers {point.value} as {group.rpartition('.')[2][:-1]} {point.name}"
-        if point.name in found or point.name in own:
+        offer = f"The package {package} offers {point.value} as {what} {point.name}"
+        if point.name in found or point.name in _GROUPS[group].own():
             found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
             continue
         try:
@@ -272,23 +313,25 @@ def offers(group: str) -> Mapping[str, Any]:
     return found
 
 
-def _entry(kind: str, name: str, own: Mapping[str, Any], group: str) -> Any:
+def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
+    """What has a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
     if isinstance(name, str) and name in own:
         return own[name]
     there = offers(group)
-    entry = there[require_known(kind, name, {**own, **there})]
+    entry = there[require_known(_GROUPS[group].what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
     return entry
 
 
 def guest_packages() -> dict[str, frozenset[str]]:
-    """The installed packages that offer tasks or agents, by name, and where their entries lie: names of top modules.
+    """The installed packages that offer anything, by name, and where their entries lie: names of top modules.
 
     None of them is imported.
     """
     found: dict[str, frozenset[str]] = {}
-    for point in (*entry_points(group=TASK_GROUP), *entry_points(group=AGENT_GROUP)):
+    everything = entry_points()
+    for point in (point for group in _GROUPS for point in everything.select(group=group)):
         if point.dist:
             found[point.dist.name] = found.get(point.dist.name, frozenset()) | {point.module.partition(".")[0]}
     return dict(sorted(found.items()))
@@ -301,7 +344,7 @@ def task_entry(name: str) -> TaskEntry:
         UnknownNameError: No such task.
         SetupError: Its package offers something else under this name, or nothing that can be loaded.
     """
-    entry: TaskEntry = _entry("task", name, TASKS, TASK_GROUP)
+    entry: TaskEntry = offered(name, TASKS, TASK_GROUP)
     register_env(entry)
     return entry
 
@@ -330,9 +373,9 @@ def agent_entry(name: str) -> AgentEntry:
         SetupError: As :func:`task_entry`.
     """
     if not isinstance(name, str) or ":" not in name or name in offers(AGENT_GROUP):
-        return _entry("agent", name, AGENTS, AGENT_GROUP)
+        return offered(name, AGENTS, AGENT_GROUP)
     one = entrant(name)
-    entry: AgentEntry = _entry("agent", one.agent, AGENTS, AGENT_GROUP)
+    entry: AgentEntry = offered(one.agent, AGENTS, AGENT_GROUP)
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
@@ -398,13 +441,16 @@ def make_agent(name: str, context: AgentContext) -> Agent:
 
 
 def regression(name: str) -> RegressionSpec:
-    """The RegressionSpec of a registered regression task. Raises UnknownNameError: no such task."""
-    return load(REGRESSIONS[require_known("regression task", name, REGRESSIONS)])
+    """The RegressionSpec of a registered regression task. Raises as :func:`task_entry`."""
+    found = offered(name, REGRESSIONS, REGRESSION_GROUP)
+    spec: RegressionSpec = load(found) if isinstance(found, str) else found
+    return spec
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor. Raises UnknownNameError: no such regressor."""
-    return REGRESSORS[require_known("regressor", name, REGRESSORS)]
+    """The registry line of a regressor. Raises as :func:`task_entry`."""
+    entry: RegressorEntry = offered(name, REGRESSORS, REGRESSOR_GROUP)
+    return entry
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:

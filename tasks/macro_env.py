@@ -25,11 +25,13 @@ from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, sha
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
+from .window import HAS_PYGAME, Window
 from .world import World, WorldState
 
 FRAME_PX = 64
 MAX_IMAGE_PX = 4096
 MAX_MOTION_HZ = 1000
+_WINDOW_HZ = 25.0  # images a second of a window
 _ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
 _AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
 
@@ -76,7 +78,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
         appearance: A name in :data:`.scenes.appearance.LEVELS`.
-        render_mode: None or ``"rgb_array"``: what :meth:`render` returns, apart from the observation.
+        render_mode: None, ``"rgb_array"``, which :meth:`render` returns, or ``"human"``: a window that shows each
+            motion as long as it took.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render`, by name.
@@ -92,7 +95,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
     Version History: v0, the first.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  (Gymnasium's own declaration)
+    # Gymnasium's own declaration, whose checker opens a window for "human".
+    metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": 1}  # noqa: RUF012
 
     def __init__(
         self,
@@ -110,7 +114,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         observation: str = "frame",
         size: int = FRAME_PX,
     ) -> None:
-        modes = self.metadata["render_modes"]
+        modes = ("rgb_array", "human")
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
@@ -126,7 +130,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self.observation_space = self._observer.space
         self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
         self._human_camera: Renderer | None = None
-        self.capture_motion_hz = motion_hz
+        self._window = Window(spec.title) if self.render_mode == "human" else None
+        self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
         self._begun, self._macrostate = False, self._starts[0]
         self._latest: MacroResult | None = None
         self._people = self._mocap()
@@ -145,6 +150,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             InvalidValueError: Not a macrostate of this task.
         """
         info = self.restart(seed=seed, options=options)
+        self._show()
         return self.observe([self])[0], info
 
     def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -167,6 +173,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             DivergedError: The simulation blew up; the episode is over.
         """
         reward, terminated, info = finish(self.acting(action))
+        self._show()
         return self.observe([self])[0], reward, terminated, False, info
 
     def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
@@ -220,18 +227,19 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:
-        """The scene as ``camera`` sees it, or None without a render mode. Shape (height, width, 3)."""
-        return None if self.render_mode is None else self.show([self])[0]
+        """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
+        return self.rendered([self])[0] if self.render_mode == "rgb_array" else None
 
-    def show(self, envs: Sequence[MacroEnv]) -> list[Frame]:
+    def rendered(self, envs: Sequence[MacroEnv]) -> list[Frame]:
         """What :meth:`render` returns of environments like this, drawn by its camera."""
         return self._render_camera.frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
-        """Free the OpenGL contexts; may be called again."""
-        self._observer.close()
-        for renderer in filter(None, (self._agent_camera, self._render_camera, self._human_camera)):
-            renderer.close()
+        """Free the OpenGL contexts and close the window; may be called again."""
+        renderers = self._agent_camera, self._render_camera, self._human_camera
+        open_ones: list[Any] = [each for each in (self._window, self._observer, *renderers) if each is not None]
+        for each in open_ones:
+            each.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
@@ -369,6 +377,14 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             world.update()
 
     # --- details -------------------------------------------------------------------------------------------------
+
+    def _show(self) -> None:
+        """In a window, if there is one: the latest motion, and how the scene stands."""
+        if self._window is None:
+            return
+        for _ in self.replay():
+            self._window.show(self._render_camera.frame(self.world.data), self._capture_motion_hz or _WINDOW_HZ)
+        self._window.show(self._render_camera.frame(self.world.data), _WINDOW_HZ)
 
     def _observing_camera(self, part: str, size: int) -> Renderer:
         """The camera of an image that is observed; the agent's own where that is the same."""

@@ -84,8 +84,9 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             if not isinstance(value, int) or value < 1:
                 raise InvalidValueError(f"{what} is {brief(value)}; give an integer from 1 on.")
         self.envs, self.num_envs, self._horizon = tuple(lanes), len(lanes), max_episode_steps
-        self.metadata = {**lanes[0].metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = lanes[0].render_mode
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
+        mode = lanes[0].render_mode
+        self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
         self.single_observation_space, self.single_action_space = lanes[0].observation_space, lanes[0].action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -132,7 +133,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
     def render(self) -> tuple[Any, ...] | None:
         """An image of each lane, or None without a render mode."""
-        return None if self.render_mode is None else tuple(self.envs[0].show(self.envs))
+        return None if self.render_mode is None else tuple(self.envs[0].rendered(self.envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free threads and OpenGL contexts."""

@@ -56,6 +56,7 @@ class EncoderCard:
     probe: dict[str, float]
     #: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     code_sizes: tuple[int, ...] = ()
+    offer: str = ""  #: ``"module:attr"`` of what another package offers, in place of a network of this suite
 
     def to_json(self) -> str:
         """The card as indented JSON."""
@@ -179,6 +180,10 @@ class Encoder:
         except Exception as error:  # a file that is no encoder can be wrong in any way
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
+        if card.offer:
+            from ..offered_encoder import OfferedEncoder  # noqa: PLC0415 - it is made of this
+
+            return OfferedEncoder(network, probe, card, device)
         return cls(network, probe, card, device)
 
 
@@ -214,6 +219,10 @@ def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]
 
 
 def _empty_network(card: EncoderCard) -> EncoderNetwork:
+    if card.offer:
+        from ..offered_encoder import OfferedNetwork  # noqa: PLC0415 - it is made of this
+
+        return OfferedNetwork(card.offer, card.latent_size)
     if card.recipe.kind == "latents":
         return empty_vae(card.recipe, card.preprocessing)
     with torch.device("meta"):

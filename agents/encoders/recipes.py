@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from imagine_bench.errors import InvalidValueError, require_known
 
-ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors")
-"""Of networks; ``"factors"`` gives codes."""
+ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors", "offered")
+"""Of networks; ``"factors"`` gives codes, ``"offered"`` is another package's."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
 from imagine_bench.entrants import parse_settings
-from imagine_bench.errors import require_known
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Encoders, Result, task_type, task_types
@@ -62,6 +62,8 @@ class Bench:
     """Real training episodes on each of them."""
     demonstrations: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """First training episodes that the oracle plays and learners watch; budgets count them."""
+    dataset: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    """Folder of a dataset whose episodes come first in training; budgets count them, and are them alone by default."""
     queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
     feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
@@ -85,7 +87,7 @@ class Bench:
             require_values(name, getattr(self, name))
         names = (
             *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
-            "after_episodes", "demonstrations", "queries", "feedback", "feedback_error",
+            "after_episodes", "demonstrations", "queries", "dataset", "feedback", "feedback_error",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None
@@ -130,8 +132,10 @@ class Study:
 
     task: str
     """Task to study on; 'imagine-bench list' names them."""
-    name: str = "factors"
+    name: Annotated[str | None, shown("STR", "(default: factors)")] = None
     """Which study; 'imagine-bench list' names them."""
+    file: Annotated[Path | None, shown("FILE", "(default: none)")] = None
+    """A study of your own, as .toml or .json."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: all)")] = ()
     """Only these variants and what they are compared with."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
@@ -145,9 +149,14 @@ class Study:
         """Run, compare, write."""
         from imagine_bench.report.study import study_table, write_study  # noqa: PLC0415 - matplotlib loads slowly
         from imagine_bench.studies.catalogue import STUDIES  # noqa: PLC0415 - as above
-        from imagine_bench.studies.study import run_study  # noqa: PLC0415 - as above
+        from imagine_bench.studies.study import load_study, run_study  # noqa: PLC0415 - as above
 
-        study = STUDIES[require_known("study", self.name, STUDIES)].only(added_up("variants", self.variants))
+        if self.file is not None and self.name is not None:
+            raise InvalidValueError(
+                f"Both --file {self.file} and --name {self.name} were given; leave one of them out."
+            )
+        found = registry.offered(self.name or "factors", STUDIES, registry.STUDY_GROUP)
+        study = (found if self.file is None else load_study(self.file)).only(added_up("variants", self.variants))
         where = launcher(self.launcher, self.workers)
         lines = run_study(study, self.task, root=self.out, launcher=where)
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
@@ -169,11 +178,11 @@ class List:
             **{f"{name} tasks": kind.tasks() for name, kind in task_types().items()},
             **{f"{name} learners": kind.learners() for name, kind in task_types().items()},
             **{f"{name} presets": kind.presets for name, kind in task_types().items()},
-            "studies": STUDIES,
+            "studies": {**STUDIES, **registry.usable(registry.STUDY_GROUP)},
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
             "appearances": APPEARANCES,
-            "encoders": bundled(),
+            "encoders": {**bundled(), **registry.usable(registry.ENCODER_GROUP)},
         }.items():
             print(f"{title:22}{', '.join(names)}")
         for error in registry.refused_offers().values():

@@ -46,15 +46,7 @@ class ProtocolData(ABC):
 
     def __post_init__(self) -> None:
         """Lists become tuples. Raises InvalidValueError: a value of another type than its field's."""
-        for name, hint in get_type_hints(type(self)).items():
-            if isinstance(value := getattr(self, name), list):
-                value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
-                object.__setattr__(self, name, value)
-            try:
-                check_type(value, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
-            except TypeCheckError:
-                wanted = next(field.type for field in dataclasses.fields(self) if field.name == name)
-                raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
+        require_types(self)
 
     def as_dict(self) -> dict[str, Any]:
         """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""
@@ -83,6 +75,19 @@ class ProtocolData(ABC):
     @abstractmethod
     def work(self, agent: str, until: int | None = None) -> int:
         """Parts of work of a run of this agent as far as the budget ``until``, of whatever the protocol counts."""
+
+
+def require_types(one: Any) -> None:
+    """Make lists in the fields of a dataclass tuples, or raise InvalidValueError for a value of another type."""
+    for name, hint in get_type_hints(type(one)).items():
+        if isinstance(value := getattr(one, name), list):
+            value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
+            object.__setattr__(one, name, value)
+        try:
+            check_type(value, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
+        except TypeCheckError:
+            wanted = next(field.type for field in dataclasses.fields(one) if field.name == name)
+            raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
 
 
 def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:

@@ -21,7 +21,7 @@ from imagine_bench.protocols.runs import OnProgress, RunSpec
 
 P = TypeVar("P", bound=ProtocolData)
 Encoders = Mapping[str, Path]
-"""The encoder artefacts of a bench, by kind; none where nothing needs one."""
+"""The encoder artefacts of a bench, by kind, none where nothing needs one, and its ``"dataset"``, a folder."""
 
 
 class FinishedRun(Interface):
@@ -72,8 +72,9 @@ def task_type(task: str) -> TaskType[ProtocolData]:
     for kind in task_types().values():
         if task in kind.tasks():
             return kind
-    if isinstance(error := registry.offers(registry.TASK_GROUP).get(task), SetupError):
-        raise error
+    for group in (registry.TASK_GROUP, registry.REGRESSION_GROUP):
+        if isinstance(error := registry.offers(group).get(task), SetupError):
+            raise error
     raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks()])
 
 

@@ -10,8 +10,8 @@ from imagine_bench.regression.runner import run
 from imagine_bench.store.bench_folder import load_bench
 
 REGRESSION = TaskType(
-    tasks=lambda: registry.REGRESSIONS,
-    learners=lambda: registry.REGRESSORS,
+    tasks=registry.regressions,
+    learners=registry.regressors,
     draws=False,
     protocol=RegressionProtocol,
     presets=PRESETS,

@@ -389,7 +389,7 @@ def _frames_before(result: BenchResult, agent: str) -> int | None:
     if not entry.needs_encoder:
         return 0
     card = encoders.card(result.protocol.encoder_of(entry.encoder_kind))
-    return None if card is None else int(card["recipe"]["frames"])
+    return None if card is None or card.get("offer") else int(card["recipe"]["frames"])
 
 
 def _learner_cpu_s(run: RunResult) -> float:

@@ -59,7 +59,13 @@ def _origin(line: Line) -> dict[str, Any]:
     """Where a line's numbers come from."""
     facts = {name: line.environment.get(name) for name in ("command", "commit", "versions", "machine")}
     variant = line.variant
-    return {"variant": variant.name, "settings": dict(variant.settings), "bench": line.folder.name, **facts}
+    return {
+        "variant": variant.name,
+        "settings": dict(variant.settings),
+        "world": dict(variant.world),
+        "bench": line.folder.name,
+        **facts,
+    }
 
 
 def _seeds(study: Study, lines: Sequence[Line]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,12 @@ import numpy as np
 import platformdirs
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
+_FIT = "imagine_bench.agents.offered_encoder:fit_offered"
 _SUFFIX = ".safetensors"
 
 
@@ -39,6 +41,35 @@ def cached(spec: TaskSpec, appearance: str, kind: str) -> Path:
     return cache_folder() / "encoders" / looks / f"{bundled_name(spec.encoder, appearance, kind)}{_SUFFIX}"
 
 
+def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
+    """The artefact of an encoder that an installed package offers, made once for the looks of a task.
+
+    Raises:
+        InvalidValueError: What is offered gives no latents for frames.
+        SetupError: As :func:`.registry.task_entry`.
+        BusyError: Another process makes it.
+    """
+    entry = registry.offered(name, {}, registry.ENCODER_GROUP)
+    frames = spec.render_macrostates(np.array(spec.rules.states[:8]), appearance, np.random.default_rng(0))
+    try:
+        features = np.asarray(registry.load(entry.make)().encode(frames), dtype=np.float64)
+        shape_is_right = features.ndim == 2 and len(features) == len(frames) and np.isfinite(features).all()
+    except Exception as error:  # whatever a package does wrong is one sentence
+        raise InvalidValueError(
+            f"The encoder {name} ({entry.make}) failed: {type(error).__name__}: {error}."
+        ) from error
+    if not shape_is_right:
+        raise InvalidValueError(
+            f"Encoder {name} ({entry.make}) gave latents of shape {features.shape} for {len(frames)} frames; it must "
+            f"give finite numbers of shape ({len(frames)}, Z)."
+        )
+    known = hashlib.sha256(f"{entry.make}/{spec.preprocessing}/".encode() + np.round(features, 3).tobytes()).hexdigest()
+    path = cache_folder() / "encoders" / known[:12] / f"{name}-{spec.id}-{appearance}{_SUFFIX}"
+    what = f"The scale and the probe of {name} for {spec.id} at {appearance} are made"
+    _once(path, what, lambda: registry.load(_FIT)(spec, name=name, offer=entry.make, appearance=appearance, path=path))
+    return path
+
+
 def find(used: str) -> Path | None:
     """The bundled or trained encoder of an identity; None where there is none."""
     name = used.partition("@")[0]
@@ -54,7 +85,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
         UnknownNameError: ``given`` is neither.
         ArtefactError: The task has no bundled encoder at this appearance level.
     """
-    known = bundled()
+    known = {**bundled(), **registry.offers(registry.ENCODER_GROUP)}
     if given is None:
         name = bundled_name(spec.encoder, appearance, kind)
         if name not in known:
@@ -65,7 +96,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
             )
         return known[name]
     if given in known:
-        return known[given]
+        return bundled()[given] if given in bundled() else offered(spec, appearance, given)
     path = Path(given).expanduser()
     if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
         return path.resolve()
@@ -78,15 +109,21 @@ def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
     Raises as :func:`resolve`, and BusyError: another process trains it.
     """
     if spec.id not in registry.TASKS and bundled_name(spec.encoder, appearance, kind) not in bundled():
-        path = cached(spec, appearance, kind)
-        make_folder(path.parent)
-        with lock(path.parent / ".lock", f"The folder of encoders {path.parent}"):
-            if not path.is_file():
-                print(f"{spec.id} has no encoder for {kind} at {appearance}; one is trained into {path.parent}, once.")
-                recipe = "codes" if kind == "codes" else "default"
-                registry.load(_TRAIN)(spec, recipe=recipe, appearance=appearance, seed=0, out=path.parent)
+        path, recipe = cached(spec, appearance, kind), "codes" if kind == "codes" else "default"
+        settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
+        what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"
+        _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))
         return path
     return resolve(spec, appearance, kind=kind)
+
+
+def _once(path: Path, what: str, make: Callable[[], object]) -> None:
+    """Make an artefact unless it is there; two processes do not make it at once."""
+    make_folder(path.parent)
+    with lock(path.parent / ".lock", f"The folder of encoders {path.parent}"):
+        if not path.is_file():
+            print(f"{what} into {path.parent}, once.")
+            make()
 
 
 def kind(path: Path) -> str:

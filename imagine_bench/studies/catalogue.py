@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from imagine_bench import registry
 from imagine_bench.studies.study import BASE, Study, Variant
 
 _DQN, _FILTERED = "dqn", "imagination_uncertainty"
@@ -17,11 +18,12 @@ def _variant(factor: str, name: str, settings: Mapping[str, Any], agent: str = _
 
 def _pair(factor: str, value: str, settings: Mapping[str, Any], appearance: str | None = None) -> tuple[Variant, ...]:
     """A factor that concerns DQN too: both agents have it."""
+    world = {} if appearance is None else {"appearance": appearance}
     return (
-        Variant(name=f"dqn, {value}", factor=factor, agent=_DQN, settings=settings, appearance=appearance),
+        Variant(name=f"dqn, {value}", factor=factor, agent=_DQN, settings=settings, world=world),
         Variant(
             name=f"imagination, {value}", factor=factor, agent=_FILTERED, against=f"dqn, {value}",
-            settings=settings, appearance=appearance,
+            settings=settings, world=world,
         ),
     )  # fmt: skip
 
@@ -85,32 +87,48 @@ _DEVIATIONS = (
 )
 
 
-def _rung(name: str, settings: Mapping[str, Any]) -> Variant:
-    """A reading of the thesis' imagination, without its filter."""
-    settings = {"imagination.start_episode": 300, **settings}
-    return Variant(name=name, factor="reading", agent="imagination", against="dqn, two updates", settings=settings)
+def _of_quick(*names: str) -> dict[str, Any]:
+    """What `quick` changes of the settings whose names begin so."""
+    changes = (
+        registry.load("imagine_bench.agents.imagination.settings:HYPERPARAMETERS").groups["chapter_5"].sets["fast"]
+    )
+    return {name: change.value for name, change in changes.items() if name.startswith(names)}
 
 
-_READINGS = Study(
-    name="ladder", question="At the thesis' settings, what is imagined badly: which reading of the draw helps?",
-    preset="thesis", budgets=(250, 500, 1000), seeds=(1000, 1001, 1002), evaluation_episodes=200, appearance="mild",
-    execution="kinematic",
-    variants=(
-        Variant(name=_DQN, factor=BASE, agent=_DQN),
-        Variant(
-            name="dqn, two updates", factor=BASE, agent=_DQN, against=_DQN, settings={"controller.updates_per_step": 2},
+def _ladder() -> Iterator[Variant]:
+    """From the thesis' settings to those of `quick`, one factor a rung, each on top of those before; no filter."""
+    yield Variant(name=_DQN, factor=BASE, agent=_DQN)
+    two: dict[str, Any] = {"controller.updates_per_step": 2}
+    below = "dqn, two updates"
+    yield Variant(name=below, factor="updates", agent=_DQN, against=_DQN, settings=two)
+    longer = _of_quick("controller.")
+    yield Variant(
+        name=f"{below}, explores longer", factor="exploration", agent=_DQN, against=below, settings={**two, **longer}
+    )
+    settings: dict[str, Any] = {}
+    for name, more in (
+        ("imagines from 300: average of 50 samples", {"imagination.start_episode": 300}),
+        ("whole network", {"imagination.predicts_with": "network"}),
+        ("component's mean", {"imagination.temperature": 0.0}),
+        ("explores longer", longer),
+        ("model of quick", _of_quick("model.")),
+        (
+            "rollouts of quick",
+            _of_quick(
+                "imagination.start_states", "imagination.breadth", "imagination.depth", "imagination.exploration"
+            ),
         ),
-        _rung("average of 50 dropout samples", {"imagination.predicts_with": "average"}),
-        _rung("one dropout sample", {"imagination.predicts_with": "sample"}),
-        _rung("whole network", {"imagination.predicts_with": "network"}),
-        _rung(
-            "whole network, component's mean",
-            {"imagination.predicts_with": "network", "imagination.temperature": 0.0},
-        ),
-        _rung("no dropout", {"model.dropout": 0.0}),
-        _rung("no dropout, component's mean", {"model.dropout": 0.0, "imagination.temperature": 0.0}),
-        _rung("whole network, data of means", {"imagination.predicts_with": "network", "model.spread": 0.0}),
-    ),
+        ("updates of quick", _of_quick("imagination.updates_per_step")),
+    ):
+        settings = {**settings, **more}
+        yield Variant(name=name, factor="ladder", agent="imagination", against=below, settings=settings)
+        below = name
+
+
+_LADDER = Study(
+    name="ladder", question="From the thesis' settings to those of quick, which step makes imagination help?",
+    preset="thesis", budgets=(500, 1000), seeds=(1000, 1001, 1002), evaluation_episodes=300, appearance="mild",
+    execution="kinematic", variants=tuple(_ladder()),
 )  # fmt: skip
 
 
@@ -173,7 +191,7 @@ STUDIES: dict[str, Study] = {
     for study in (
         _study("factors", "When does imagination help? One factor at a time", _FACTORS),
         _study("deviations", "What is a value of the thesis worth in place of that of quick?", _DEVIATIONS),
-        _READINGS,
+        _LADDER,
         _CONTROLLER,
         _CURIOSITY,
         _SMOKE,

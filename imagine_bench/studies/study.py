@@ -6,6 +6,10 @@ confirmed by an ordinary bench on seeds that no study may use. The protocol hold
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,8 +20,9 @@ from numpy.typing import NDArray
 
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers import Launcher
-from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.protocols.data import ProtocolData
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import ProtocolData, require_types
 from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import tasks
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
@@ -26,6 +31,18 @@ from imagine_bench.store.results import BenchResult
 
 BASE = "base"
 """Name of the factor of what the other variants are compared with."""
+_FIXED = {
+    "task",
+    "preset",
+    "agents",
+    "seeds",
+    "budgets",
+    "evaluation_episodes",
+    "overrides",
+    "settings_digest",
+    "codes",
+}
+_VARIED = sorted({field.name for field in dataclasses.fields(Protocol)} - _FIXED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +54,13 @@ class Variant:
     agent: str  #: Registered agent
     against: str | None = None  #: Name of the variant whose success its own is compared with, or None
     settings: Mapping[str, Any] = field(default_factory=dict)  #: Agent settings, by dotted name
-    appearance: str | None = None  #: Appearance level, or None for the study's
+    #: What it changes of the study's protocol, by field: appearance, test_appearance, execution, physics, queries, ...
+    world: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        for name in self.world:
+            require_known("field that a variant may change", name, _VARIED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,14 +70,17 @@ class Study:
     name: str  #: Its name on the command line
     question: str  #: One sentence for the reader of its page
     budgets: tuple[int, ...]  #: Real training episodes, ascending
-    seeds: tuple[int, ...]  #: Tuning seeds
-    evaluation_episodes: int  #: Test episodes at each budget
-    appearance: str  #: Appearance level
-    execution: str  #: ``"physics"`` or ``"kinematic"``
+    seeds: tuple[int, ...] = (1000, 1001, 1002)  #: Tuning seeds
+    evaluation_episodes: int = 300  #: Test episodes at each budget
+    appearance: str = "clean"  #: Appearance level
+    execution: str = "kinematic"  #: ``"physics"`` or ``"kinematic"``
     variants: tuple[Variant, ...]  #: What is compared
     preset: str = "quick"  #: Preset whose settings the variants change
 
     def __post_init__(self) -> None:
+        require_types(self)
+        if not re.fullmatch(r"[\w.-]{1,60}", self.name):
+            raise InvalidValueError(f"Study {brief(self.name)}: a name is 1 to 60 letters, digits, '_', '-' or '.'.")
         names = [variant.name for variant in self.variants]
         if not names or len(set(names)) != len(names):
             raise InvalidValueError(f"Study {self.name!r} has the variants {names}; give at least one, each name once.")
@@ -95,6 +121,42 @@ class Line:
     environment: Mapping[str, Any]  #: Command, commit, versions and machine of its first session; JSON-like
 
 
+def load_study(path: Path) -> Study:
+    """A study from a TOML or JSON file, whose keys are the fields of :class:`Study` and :class:`Variant`.
+
+    It is called as its file, and a variant's factor is :data:`BASE`, where the file does not say otherwise. Nested
+    settings have dotted names.
+
+    Raises:
+        InvalidValueError: It cannot be read, or a field is missing, unknown or of another type.
+    """
+    try:
+        text = path.read_text()
+        data = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        variants = tuple(Variant(**{"factor": BASE, **each, "settings": _dotted(each)}) for each in data["variants"])
+        return Study(**{"name": path.stem, **data, "variants": variants})
+    except ImagineBenchError as error:
+        raise InvalidValueError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidValueError(
+            f"{path} is not a study: {type(error).__name__}: {error}. Give {', '.join(Study.__annotations__)} and "
+            f"[[variants]] with {', '.join(Variant.__annotations__)}, as TOML or JSON."
+        ) from error
+
+
+def _dotted(variant: Mapping[str, Any]) -> dict[str, Any]:
+    """A variant's settings, nested or not, by dotted name."""
+    found: dict[str, Any] = {}
+    left = list(variant.get("settings", {}).items())
+    while left:
+        name, value = left.pop()
+        if isinstance(value, Mapping):
+            left += [(f"{name}.{inner}", each) for inner, each in value.items()]
+        else:
+            found[name] = value
+    return found
+
+
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
     if task not in tasks():
@@ -121,11 +183,12 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
 
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
+    world = {"execution": study.execution, "appearance": study.appearance, **variant.world}
+    world |= {name: tuple(sorted(value.items())) for name, value in world.items() if isinstance(value, Mapping)}
     return plan(
         task, study.preset, agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,
-        evaluation_episodes=study.evaluation_episodes, execution=study.execution,
-        appearance=variant.appearance or study.appearance, overrides=tuple(sorted(variant.settings.items())),
-        open_loop_starts=0, recorded_episodes=0,
+        evaluation_episodes=study.evaluation_episodes, overrides=tuple(sorted(variant.settings.items())),
+        **{"open_loop_starts": 0, "recorded_episodes": 0, **world},
     )  # fmt: skip
 
 

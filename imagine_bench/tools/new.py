@@ -29,10 +29,14 @@ dependencies = ["imagine-bench"]
 [tool.setuptools]
 py-modules = ["{name}"]
 """
+_TESTS = """from imagine_bench.testing import {kind}_tests
+
+test_contract = {kind}_tests("{name}")
+"""
 
 
 def new_package(kind: str, name: str, out: Path) -> str:
-    """Write ``out/<name>/`` with ``pyproject.toml`` and ``<name>.py``: a small task or agent that passes its checks.
+    """Write ``out/<name>/``: ``pyproject.toml``, ``<name>.py``, a small task or agent, and a test file that it passes.
 
     Returns what to do next.
 
@@ -55,4 +59,5 @@ def new_package(kind: str, name: str, out: Path) -> str:
     make_folder(folder)
     write_bytes(folder / f"{name}.py", code.encode())
     write_bytes(folder / "pyproject.toml", _PYPROJECT.format(name=name, group=group).encode())
-    return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name}"
+    write_bytes(folder / f"test_{name}.py", _TESTS.format(kind=kind, name=name).encode())
+    return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name} (or pytest {folder})"

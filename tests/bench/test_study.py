@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
 from imagine_bench.studies.catalogue import STUDIES
-from imagine_bench.studies.study import BASE, Line, Study, Variant, run_study
+from imagine_bench.studies.study import BASE, Line, Study, Variant, load_study, run_study
 
 STUDY = Study(
     name="fakes",
@@ -36,7 +37,7 @@ STUDY = Study(
     execution="kinematic",
     variants=(
         Variant(name="table", factor=BASE, agent="table"),
-        Variant(name="mild", factor="appearance", agent="table", against="table", appearance="mild"),
+        Variant(name="mild", factor="appearance", agent="table", against="table", world={"appearance": "mild"}),
         Variant(name="imaginer", factor="agent", agent="imaginer", against="mild"),
     ),
 )
@@ -122,6 +123,83 @@ def test_tuning_runs_never_meet_starts_of_reported_runs(tmp_path: Path) -> None:
 def test_a_study_that_would_deceive_is_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
         dataclasses.replace(STUDY, **changes)  # type: ignore[arg-type]
+
+
+_FILE = """
+question = "Does a world that looks or feels otherwise matter?"
+preset = "smoke"
+budgets = [2]
+seeds = [1000]
+evaluation_episodes = 2
+
+[[variants]]
+name = "table"
+agent = "table"
+
+[[variants]]
+name = "other looks"
+factor = "appearance"
+agent = "table"
+against = "table"
+world = { test_appearance = "strong", sampled_futures = 0 }
+
+[[variants]]
+name = "slippery"
+factor = "physics"
+agent = "table"
+against = "table"
+world.execution = "physics"
+world.physics = { pad_friction = 0.1 }
+"""
+
+
+def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
+    path, launcher = tmp_path / "mine.toml", Here()
+    path.write_text(_FILE)
+    study = load_study(path)
+    assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
+    lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.done]
+    assert worlds == [
+        ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),
+        ("clean", {"execution": "physics", "physics": {"pad_friction": 0.1}}),
+    ]  # fmt: skip
+    assert [line.difference is None for line in lines] == [True, False, False]
+    text = json.dumps(tomllib.loads(_FILE))
+    (tmp_path / "mine.json").write_text(text)
+    assert load_study(tmp_path / "mine.json") == study
+
+
+def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(_FILE + '[[variants]]\nname = "slow"\nagent = "dqn"\n'
+                    'settings = { controller.discount = 0.9, "controller.hidden" = [8, 8] }\n')  # fmt: skip
+    assert load_study(path).variants[-1].settings == {"controller.discount": 0.9, "controller.hidden": [8, 8]}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
+        ("budgets = [2]", "", "missing 1 required keyword-only argument: 'budgets'. Give name, question, budgets, "),
+        ("question", "questions", "unexpected keyword argument 'questions'"),
+        ("budgets = [2]", "budgets = [", "is not a study: TOMLDecodeError"),
+        ("test_appearance", "looks", "No field that a variant may change 'looks'"),
+        ("[1000]", "[0]", "chooses settings on seeds"),
+        ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),
+        ('agent = "table"', 'agent = 5', "agent was given 5; it takes str"),
+        ('[[variants]]', '[[variant]]', "KeyError: 'variants'"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_study_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, sentence: str
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(_FILE.replace(old, new))
+    assert main(["study", "--task", "arrow_puzzle", "--file", str(path)]) == 2
+    assert sentence in (said := " ".join(capsys.readouterr().err.split())) and str(path) in said
+    assert main(["study", "--task", "arrow_puzzle", "--file", str(path), "--name", "smoke"]) == 2
+    assert "leave one of them out" in capsys.readouterr().err
 
 
 def test_chosen_variants_bring_what_they_are_compared_with() -> None:

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrow_puzzle.rules import ArrowPuzzleRules
+from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -19,7 +20,7 @@ from imagine_bench.tools.check import agent_checks, report, task_checks
 
 def test_a_task_of_ours_keeps_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
     assert report(task_checks("arrow_puzzle")) == 0
-    assert capsys.readouterr().out.count("ok  ") == 6
+    assert capsys.readouterr().out.count("ok  ") == 7
 
 
 @pytest.mark.parametrize("agent", ["oracle", "dqn"])
@@ -80,9 +81,11 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert "frames are int64 of shape" in check(
         "64 x 64", render_macrostates=lambda *_: draw.integers(256, size=(2, 3))
     )
+    monkeypatch.setattr(MacroEnv, "set_state", lambda self, state: None)
+    assert "put back in the same environment, it goes on otherwise" in check("middle of an episode")
     made = gymnasium.make
     monkeypatch.setattr(gymnasium, "make", lambda *given, **named: _Forgetful(made(*given, **named)))
-    assert "every start is begun in, and told: begun in" in check("every start")
+    assert "every macrostate is begun in, and told: begun in" in check("is begun in")
     assert "two episodes of seed 0 differ" in check("same seed")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,6 +39,17 @@ def test_a_new_package_keeps_the_contract(
     monkeypatch.syspath_prepend(install(tmp_path / "my_own"))
     registry.offers.cache_clear()
     assert main(["check", f"--{kind}", "my_own"]) == 0, capsys.readouterr().out
+
+
+def test_the_new_packages_own_tests_find_a_fault(tmp_path: Path) -> None:
+    new_package("task", "my_own", tmp_path)
+    site = install(tmp_path / "my_own")
+    module = site / "my_own.py"
+    module.write_text(module.read_text().replace("self._state, self.np_random.bit_generator.state = state", "pass"))
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(site)]
+    said = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=site, check=False).stdout
+    assert "1 failed, 6 passed" in said and "put back in the same environment, it goes on otherwise" in said
 
 
 def test_the_new_agent_learns_the_new_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

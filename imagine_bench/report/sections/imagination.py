@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -235,10 +236,10 @@ def _capital(agent: str) -> str:
 
 
 def encoder_views(result: BenchResult) -> list[EncoderView]:
-    """Card and image of every encoder used, found beside the bundled artefact of the same content.
+    """Card and image of every encoder used, found beside the artefact of the same content.
 
     Raises:
-        ArtefactError: A bundled card is damaged.
+        ArtefactError: A card is damaged.
     """
     readers: dict[str, list[str]] = {}
     for agent in result.protocol.agents:
@@ -246,10 +247,9 @@ def encoder_views(result: BenchResult) -> list[EncoderView]:
         identity = result.protocol.encoder_of(entry.encoder_kind)
         if entry.needs_encoder and identity is not None:
             readers.setdefault(identity, []).append(agent)
-    bundled = {encoders.identity(path): path for path in encoders.bundled().values()} if readers else {}
     views = []
     for identity, agents in readers.items():
-        path = bundled.get(identity)
+        path = encoders.find(identity)
         card, image = (path.with_suffix(".json"), path.with_suffix(".png")) if path else (None, None)
         facts = read_json(card, "an encoder's card") if card and card.is_file() else {}
         shown = image if image and image.is_file() else None
@@ -270,7 +270,7 @@ def _encoders(views: Sequence[EncoderView]) -> Section:
             images.append(Image.of(content, name=f"encoder-{name}", alt=alt, caption=caption))
         shown = {key: value for key, value in view.card.items() if key not in _CARD_HIDDEN}
         rows = [[_CARD_NAMES.get(key, key), _card_text(key, value)] for key, value in shown.items()]
-        missing = "" if rows else "It is not one of the bundled encoders, so its card is beside its file and not here."
+        missing = "" if rows else "It is not here, so its card is beside its file."
         tables.append(Table(name=f"card-{name}", header=[heading, "its card"], rows=rows, caption=missing, prose=True))
     return Section(
         title="What the agents see",
@@ -289,5 +289,5 @@ def _card_text(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{inner} {_card_text(key, item)}" for inner, item in value.items())
     if isinstance(value, float):
-        return f"{100.0 * value:.2f} %" if key == "probe" else f"{value:.4g}"
+        return DASH if math.isnan(value) else f"{100.0 * value:.2f} %" if key == "probe" else f"{value:.4g}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

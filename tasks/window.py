@@ -1,0 +1,84 @@
+"""A window on the desktop that shows images, by pygame: the only module that imports it, and only when one opens."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from types import ModuleType
+from typing import Any
+
+from imagine_bench.errors import SetupError
+from imagine_bench.interfaces import Frame
+
+HAS_PYGAME = importlib.util.find_spec("pygame") is not None
+
+
+def open_display(*, seen: bool) -> ModuleType:
+    """Open pygame's display; where there is no desktop, one that nobody sees, unless it must be ``seen``.
+
+    SDL's driver "offscreen", its own choice there, would end MuJoCo's OpenGL too when the window closes.
+
+    Raises:
+        SetupError: There is no pygame, or no desktop. ``SDL_VIDEODRIVER=dummy`` does without one, for tests.
+    """
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import pygame  # noqa: PLC0415  (an extra)
+    except ImportError as error:
+        raise SetupError("Windows need pygame: pip install 'imagine-bench[play]'.") from error
+    if pygame.display.get_init() or "SDL_VIDEODRIVER" in os.environ or sys.platform != "linux":
+        pygame.display.init()
+        return pygame
+    for driver in ("x11", "wayland", "dummy"):
+        os.environ["SDL_VIDEODRIVER"] = driver
+        try:
+            pygame.display.init()
+            break
+        except pygame.error:
+            continue
+        finally:
+            del os.environ["SDL_VIDEODRIVER"]
+    if seen and pygame.display.get_driver() == "dummy":
+        pygame.display.quit()
+        raise SetupError(
+            "There is no desktop to open a window on; run this on one. SDL_VIDEODRIVER=dummy opens one unseen."
+        )
+    return pygame
+
+
+class Window:
+    """One window with a title; it opens with the first image and takes its size."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._pygame: Any = None
+        self._clock: Any = None
+
+    def show(self, image: Frame, per_s: float) -> None:
+        """Show an image (H, W, 3) and wait until it is time for the next one, so many a second.
+
+        Raises:
+            SetupError: As :func:`open_display`.
+        """
+        if self._pygame is None:
+            self._pygame = open_display(seen=False)
+            self._clock = self._pygame.time.Clock()
+        pygame, (height, width, _) = self._pygame, image.shape
+        screen = pygame.display.get_surface()
+        if screen is None or screen.get_size() != (width, height):
+            screen = pygame.display.set_mode((width, height))
+            pygame.display.set_caption(self._title)
+        screen.blit(pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
+        pygame.event.pump()
+        pygame.display.flip()
+        self._clock.tick(per_s)
+
+    def close(self) -> None:
+        """Close it; may be called again, and a later image opens it anew."""
+        if self._pygame is not None:
+            self._pygame.display.quit()
+            self._pygame = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._title,)

@@ -1,0 +1,157 @@
+"""Encoders, studies, regression tasks and regressors that packages beside this one offer."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from guest_packages import install
+from imagine_bench.agents import offered_encoder
+from imagine_bench.agents.encoders.encoder import Encoder
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.bench.bench import bench, plan
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
+from imagine_bench.machine import versions
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.regression.runner import run
+from imagine_bench.store import encoders
+from imagine_bench.store.trained import load_trained
+
+_PYPROJECT = """
+[project]
+name = "their_things"
+version = "1.0"
+[project.entry-points."imagine_bench.encoders"]
+tiles = "their_things:TILES"
+blind = "their_things:BLIND"
+broken = "their_things:Tiles"
+[project.entry-points."imagine_bench.studies"]
+their_study = "their_things:STUDY"
+smoke = "their_things:STUDY"
+[project.entry-points."imagine_bench.regressions"]
+their_data = "their_things:DATA"
+[project.entry-points."imagine_bench.regressors"]
+their_regressor = "their_things:REGRESSOR"
+"""
+_MODULE = '''
+import dataclasses
+import numpy as np
+from imagine_bench import registry
+from imagine_bench.registry import EncoderEntry, RegressorEntry
+from imagine_bench.studies.study import Study, Variant
+
+class Tiles:
+    """Mean colors of 16 tiles, in thousands, so that somebody must scale them."""
+    def encode(self, frames):
+        return 1000.0 * frames.reshape(len(frames), 4, 16, 4, 16, 3).mean(axis=(2, 4)).reshape(len(frames), 48) / 255.0
+    def decode(self, latents):
+        return (latents.reshape(-1, 4, 4, 3) / 1000.0).repeat(16, axis=1).repeat(16, axis=2)
+
+class Blind:
+    def encode(self, frames):
+        return np.full((len(frames), 3), np.nan)
+
+TILES = EncoderEntry(make="their_things:Tiles")
+BLIND = EncoderEntry(make="their_things:Blind")
+RANDOM = Variant(name="random", factor="base", agent="random")
+STUDY = Study(name="their_study", question="Whose?", budgets=(2,), variants=(RANDOM,))
+DATA = dataclasses.replace(registry.regression("toy_regression"), id="their_data", variants=("base",))
+REGRESSOR = RegressorEntry(
+    make="imagine_bench.agents.regressors.regressor:make_mc_dropout", title="theirs", description="A regressor."
+)
+'''
+
+
+@pytest.fixture(autouse=True)
+def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    folder = tmp_path / "site"
+    folder.mkdir()
+    (folder / "pyproject.toml").write_text(_PYPROJECT)
+    (folder / "their_things.py").write_text(_MODULE)
+    monkeypatch.syspath_prepend(install(folder))
+    monkeypatch.delitem(sys.modules, "their_things", raising=False)
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(offered_encoder, "_FRAMES", 600)
+    monkeypatch.setattr(offered_encoder, "_PROBE_STEPS", 300)
+    registry.offers.cache_clear()
+    yield
+    registry.offers.cache_clear()
+
+
+def test_all_are_listed_and_named_in_results(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    said = capsys.readouterr().out
+    for name in ("tiles", "their_study", "their_data", "their_regressor"):
+        assert name in said
+    assert "as study smoke, a name that is taken" in said and "and no EncoderEntry; mend" in said
+    assert versions()["their_things"].startswith("1.0+")
+
+
+@pytest.mark.parametrize("agent", ["dqn", pytest.param("imagination", marks=pytest.mark.slow)])
+def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str], agent: str) -> None:
+    few = {"budgets": (2,), "evaluation_episodes": 2, "execution": "kinematic"}
+    few |= {"open_loop_starts": 2, "sampled_futures": 0, "recorded_episodes": 0}
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)
+    assert "The scale and the probe of tiles for arrow_puzzle at clean are made" in capsys.readouterr().out
+    again, _ = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)
+    assert again == wanted and capsys.readouterr().out == "", "found again"
+    assert str(wanted.encoder).startswith("tiles-arrow_puzzle-clean@")
+    (result,) = bench(wanted, paths, root=tmp_path, launcher=Inline()).runs
+    assert (result.checkpoints[0].open_loop is None) == (agent == "dqn")
+    assert load_trained(result.folder).spec.encoder == paths["latents"]
+
+    encoder, spec = Encoder.load(paths["latents"]), registry.task("arrow_puzzle")
+    states = np.array(spec.rules.states[:50])
+    frames = spec.render_macrostates(states, "clean", np.random.default_rng(1))
+    mu, sigma = encoder.encode(frames)
+    assert mu.shape == (50, 48) and float(sigma.max()) < 1e-3 and float(mu.abs().median()) < 3.0
+    pictures = encoder.decode(mu)
+    expected = frames.reshape(50, 4, 16, 4, 16, 3).mean(axis=(2, 4)) / 255.0
+    assert pictures.shape == (50, 64, 64, 3) and np.abs(pictures[:, ::16, ::16] - expected).max() < 0.01
+    right = (encoder.read_macrostate(mu) == states).all(axis=1).mean()
+    assert right > 0.2 > 4 / len(spec.rules.states)
+
+
+def test_one_without_a_decoder_draws_gray(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean", "tiles")
+    monkeypatch.delattr(sys.modules["their_things"].Tiles, "decode")
+    encoder = Encoder.load(path)
+    pictures = encoder.decode(encoder.encode(np.zeros((2, 64, 64, 3), np.uint8))[0])
+    assert pictures.shape == (2, 64, 64) and (pictures == 0.5).all()
+    monkeypatch.delattr(sys.modules["their_things"], "Tiles")
+    with pytest.raises(ArtefactError, match="has no attribute 'Tiles'"):
+        Encoder.load(path)
+
+
+def test_one_that_is_none_is_refused_in_a_sentence() -> None:
+    for name, error, sentence in (
+        (
+            "blind",
+            InvalidValueError,
+            r"blind \(their_things:Blind\) gave latents of shape \(8, 3\) for 8 frames; it mu",
+        ),
+        ("broken", SetupError, "and no EncoderEntry"),
+    ):
+        with pytest.raises(error, match=sentence):
+            plan("arrow_puzzle", "smoke", agents=("dqn",), encoder=name)
+
+
+def test_a_study_of_theirs_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["study", "--task", "arrow_puzzle", "--name", "their_study", "--out", str(tmp_path)]
+    assert main([*words, "--variants", "none"]) == 2
+    assert "No variant 'none'" in capsys.readouterr().err
+    found = registry.offered("their_study", {}, registry.STUDY_GROUP)
+    assert found.question == "Whose?" and main([*words[:3], "--name", "thei_study"]) == 2
+
+
+def test_their_regressor_learns_their_data(tmp_path: Path) -> None:
+    tiny = (("components", 3), ("epochs", 2), ("hidden", [8, 8]), ("weight_samples", 3))
+    wanted, none = plan("their_data", "smoke", agents=("their_regressor",), test_points=10, overrides=tiny)
+    found = run(RunSpec(protocol=wanted, agent="their_regressor", seed=0), tmp_path, lambda progress: None)
+    assert not none and {row["variant"] for row in found.rows} == {"base"}
