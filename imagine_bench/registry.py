@@ -350,13 +350,18 @@ def task_entry(name: str) -> TaskEntry:
 
 
 def register_env(entry: TaskEntry) -> None:
-    """Register a task's environment with Gymnasium, unless its id is known already, and its vector environment."""
+    """Register a task's environment with Gymnasium, unless its id is known already."""
     if entry.env_id not in gymnasium.registry:
-        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
-        gymnasium.register(
-            vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
-            max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
-        )  # fmt: skip
+        options = dict(entry.options)
+        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=options)
+
+
+def register_vector_env(entry: TaskEntry) -> None:
+    """Register the vector environment of a task whose environment is one of this suite's."""
+    gymnasium.register(
+        vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
+        max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
+    )  # fmt: skip
 
 
 def vector_id(env_id: str) -> str:
