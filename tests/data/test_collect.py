@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bench_fakes import TableAgent
 from small_datasets import collected, written
-from small_runs import do
+from small_runs import Inline, do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -18,6 +18,7 @@ from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import episode_seed
+from imagine_bench.tools import standard_data
 
 TASK = registry.task("arrow_puzzle")
 
@@ -125,6 +126,18 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
         capsys.readouterr().err
         == f"imagine-bench: {out} exists; give another folder with --out. Nothing was written.\n"
     )
+
+
+def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(standard_data, "MEDIUM", {"arrow_puzzle": 3})
+    monkeypatch.setattr(standard_data, "launcher", lambda *_: Inline())
+    folders = list(standard_data.standard_sets(tmp_path, "npz", 4))
+    assert [folder.name for folder in folders] == [f"arrow_puzzle-{name}" for name in ("random", "medium", "optimal")]
+    cards = [read_dataset(folder).card or {} for folder in folders]
+    assert [card["policy"] for card in cards] == ["random", "dqn", "oracle"]
+    assert cards[1]["played"] == "greedy after 3 episodes of seed 1000" and cards[2]["successes"] == 4
+    monkeypatch.setattr(standard_data, "collect", None)
+    assert list(standard_data.standard_sets(tmp_path, "npz", 4)) == folders
 
 
 @pytest.mark.parametrize(
