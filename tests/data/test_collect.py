@@ -162,7 +162,8 @@ def test_a_wrong_command_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     assert main(["dataset", *words]) == 2
     said = capsys.readouterr().err
-    assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+    assert sentence in said and said.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_file_where_a_folder_should_be_is_refused(tmp_path: Path) -> None:
