@@ -14,6 +14,7 @@ takes_generalise := TASK ENCODER ARGS
 takes_policy := TASK ENCODER ARGS
 takes_view := TASK ARGS
 takes_report := TASK ARGS
+takes_data := ARGS
 takes_encoder := TASK APPEARANCE ARGS
 takes_film := TASK APPEARANCE ARGS
 takes_speed := ARGS
@@ -39,7 +40,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan generalise policy study view report encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan generalise policy study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -74,6 +75,9 @@ view: ready  ## Open the newest recording in the Rerun viewer
 
 report: ready  ## Write the newest bench's report again and show its table
 	@$(BIN)/imagine-bench report $(options)
+
+data: ready  ## Make random, medium and optimal datasets of three tasks below datasets/ (minutes)
+	@$(BIN)/imagine-bench dataset --standard $(options)
 
 encoder: ready  ## Train an encoder for TASK anew and say how it compares to the bundled one
 	@$(BIN)/imagine-bench encoder $(options)

@@ -15,7 +15,7 @@ from imagine_bench.errors import InvalidValueError, require_known
 
 Purpose = Literal[
     "training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning",
-    "earlier_training", "feedback",
+    "earlier_training", "feedback", "dataset",
 ]  # fmt: skip
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
 _SEED_BITS, _EPISODE_BITS = 24, 32

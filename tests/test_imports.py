@@ -21,16 +21,17 @@ ARROWS: dict[str, set[str]] = {
     "machine": {"registry"},
     "protocols": {"entrants", "registry"},
     "store": {"entrants", "registry", "protocols", "statistics"},
-    "bench": {*_DATA, "machine"},
+    "data": {*_DATA, "machine", "statistics"},
+    "bench": {*_DATA, "machine", "data"},
     "judge": {*_DATA, "statistics"},
     "recording": {*_DATA, "judge"},
     "studies": {*_DATA, "bench", "statistics"},
     "report": {*_DATA, "bench", "judge", "studies", "machine", "statistics", "reference"},
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
     "adapters": {"registry"},
-    "tools": {"registry", "machine", "store", "statistics", "bench"},
+    "tools": {"registry", "machine", "store", "statistics", "bench", "data"},
     "testing": {"registry", "tools"},
-    "cli": {*_DATA, "bench", "judge", "recording", "studies", "report", "tools"},
+    "cli": {*_DATA, "data", "bench", "judge", "recording", "studies", "report", "tools"},
     "__init__": {"registry"},
     "__main__": {"cli"},
 }
@@ -50,6 +51,8 @@ _HEAVY = {
     "OpenGL": "tasks",
     "pygame": "tasks",
     "rerun": "imagine_bench/recording",
+    "pyarrow": "imagine_bench/data",
+    "minari": "imagine_bench/data",
 }
 _SOURCES = sorted(path for room in ("imagine_bench", "tasks", "agents") for path in (_TOP / room).rglob("*.py"))
 _NUMPY_RANDOM = {"Generator", "SeedSequence", "default_rng", "PCG64", "BitGenerator"}

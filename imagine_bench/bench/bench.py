@@ -27,7 +27,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
     """The protocol of a bench and the encoders it uses, with everything checked that can be before anything is run.
 
     ``options`` are fields of the protocol that differ from the preset's; for control tasks also ``encoder``, a bundled
-    name or a path.
+    name or a path, and ``dataset``, a folder.
 
     Raises:
         UnknownNameError: Any name that does not exist.
@@ -96,7 +96,9 @@ def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int |
     entry = registry.agent_entry(agent) if acts else None  # regressors have no encoder and pause nowhere
     needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
     pauses = until if entry is not None and not entry.external_training_loop else None
-    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, encoder=needed, until=pauses)
+    spec = RunSpec(
+        protocol=store.protocol, agent=agent, seed=seed, encoder=needed, dataset=paths.get("dataset"), until=pauses
+    )
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 
 

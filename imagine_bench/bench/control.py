@@ -9,6 +9,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.queries import require_able
+from imagine_bench.data.folder import read_dataset, require_of_task
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
@@ -22,12 +23,19 @@ from imagine_bench.store.results import BenchResult, RunResult
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
-def plan_control(task: str, preset: str, *, encoder: str | None = None, **changes: Any) -> tuple[Protocol, Encoders]:
+def plan_control(
+    task: str, preset: str, *, encoder: str | None = None, dataset: Path | str | None = None, **changes: Any
+) -> tuple[Protocol, Encoders]:
     """The protocol of a control bench and the encoders it uses; errors as of :func:`imagine_bench.bench.bench.plan`.
 
     ``encoder`` is a bundled name or a path, instead of the task's own. One that gives codes is for every agent, one
-    that gives latents for those that read latents.
+    that gives latents for those that read latents. ``dataset`` is a folder; without budgets, its episodes are all that
+    learners have.
     """
+    found = None if dataset is None else read_dataset(Path(dataset))
+    if found is not None:
+        require_of_task(found, registry.task(task))
+        changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
     wanted = protocol(task, preset, **changes)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":
@@ -37,7 +45,9 @@ def plan_control(task: str, preset: str, *, encoder: str | None = None, **change
     filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
     whole = protocol(task, preset, **{**changes, **filled})
     rests_on_others = any(map(_rests_on_others, whole.agents))
-    if encoder or whole.after or whole.demonstrations or whole.queries or rests_on_others:
+    if found is not None:
+        paths = {**paths, "dataset": found.folder.resolve()}
+    if encoder or whole.dataset or whole.after or whole.demonstrations or whole.queries or rests_on_others:
         _check_abilities(whole, paths)
     return whole, paths
 

@@ -10,6 +10,7 @@ from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, play, play
 from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen, demonstrator
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
+from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store.counters import EvaluationCounts
@@ -41,11 +42,22 @@ def _earlier_episode(run: Run, env: Env) -> None:
 
 
 def train(run: Run, budget: int) -> None:
-    """Train until the agent has had ``budget`` episodes: the first ones demonstrated, the others its own."""
+    """Train until the agent has had ``budget`` episodes: first those of a dataset or demonstrated, then its own."""
+    offline = 0 if run.dataset is None else len(run.dataset)
     while run.counters.episode < budget:
         with run.training_time():
-            _training_episode(run, demonstrated=run.counters.episode < run.protocol.demonstrations)
+            if run.dataset is not None and run.counters.episode < offline:
+                _episode_of_dataset(run, run.dataset)
+            else:
+                _training_episode(run, demonstrated=run.counters.episode < run.protocol.demonstrations)
         run.made_progress("training")
+
+
+def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
+    counters, episode = run.counters, run.counters.episode
+    for transition in dataset.transitions(episode):
+        run.agent.observe(transition, episode=episode)
+    counters.add_episode(bool(dataset.success[episode]), int(dataset.lengths[episode]))
 
 
 def _training_episode(run: Run, *, demonstrated: bool) -> None:

@@ -27,6 +27,11 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
         raise InvalidValueError(
             f"Agent {name!r} trains in a loop of its own and cannot watch; leave --demonstrations out, or that agent."
         )
+    if protocol.dataset and (isinstance(agent, ExternalTrainer) or registry.agent_entry(name).privileged):
+        why = "trains in a loop of its own" if isinstance(agent, ExternalTrainer) else "is shown true macrostates"
+        raise InvalidValueError(
+            f"Agent {name!r} {why} and cannot learn from a dataset; leave --dataset out, or that agent."
+        )
     if protocol.after and not isinstance(agent, TransferLearner):
         raise InvalidValueError(
             f"Agent {name!r} has no model of the world to carry over from {', '.join(protocol.after)}; leave --after "

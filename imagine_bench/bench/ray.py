@@ -105,8 +105,8 @@ def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Fai
 
 def _absolute(job: Job) -> Job:
     """The job with paths that mean the same in every process."""
-    encoder = job.spec.encoder
-    spec = replace(job.spec, encoder=None if encoder is None else encoder.resolve())
+    paths = {name: getattr(job.spec, name) for name in ("encoder", "dataset")}
+    spec = replace(job.spec, **{name: path.resolve() for name, path in paths.items() if path is not None})
     return replace(job, spec=spec, folder=job.folder.resolve())
 
 

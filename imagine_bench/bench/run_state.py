@@ -14,6 +14,8 @@ import gymnasium
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import Env
 from imagine_bench.bench.queries import Teacher, require_able
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Agent
 from imagine_bench.protocols.control import Protocol
@@ -62,6 +64,7 @@ class Run:
         self.env, self.test_env = env, test_env
         self.task, self.entry = registry.task(spec.protocol.task), registry.agent_entry(spec.agent)
         self._require_its_encoder()
+        self.dataset = self._its_dataset() if self.entry.learns else None
         self.agent: Agent = registry.make_agent(spec.agent, spec.context())
         if self.entry.learns:
             require_able(self.agent, spec.agent, spec.protocol)
@@ -91,6 +94,17 @@ class Run:
             found = encoders.identity(self.spec.encoder)
             if found != wanted:
                 raise ArtefactError(f"{self.spec.encoder} is encoder {found}, and this bench is of {wanted}.")
+
+    def _its_dataset(self) -> Episodes | None:
+        """The protocol's dataset, if it has one; ArtefactError for another, such as one that changed since."""
+        if self.protocol.dataset is None or self.spec.dataset is None:
+            return None
+        found = read_dataset(self.spec.dataset)
+        if found.identity != self.protocol.dataset:
+            raise ArtefactError(
+                f"{self.spec.dataset} is dataset {found.identity}, and this bench is of {self.protocol.dataset}."
+            )
+        return found.episodes
 
     def _config(self) -> Mapping[str, Any]:
         settings = getattr(self.agent, "settings", None)

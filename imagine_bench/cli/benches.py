@@ -62,6 +62,8 @@ class Bench:
     """Real training episodes on each of them."""
     demonstrations: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """First training episodes that the oracle plays and learners watch; budgets count them."""
+    dataset: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    """Folder of a dataset whose episodes come first in training; budgets count them, and are them alone by default."""
     queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
     feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
@@ -85,7 +87,7 @@ class Bench:
             require_values(name, getattr(self, name))
         names = (
             *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
-            "after_episodes", "demonstrations", "queries", "feedback", "feedback_error",
+            "after_episodes", "demonstrations", "queries", "dataset", "feedback", "feedback_error",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None

@@ -56,6 +56,9 @@ class Protocol(ProtocolData):
     #: real episodes as any, and budgets count them.
     demonstrations: int = 0
     queries: int = 0  #: Most oracle queries of a learner in a training episode
+    #: The first training episodes are those of a dataset, ``"<policy>-<episodes>@<12 hex digits of its content>"``;
+    #: they are real episodes as any, and budgets count them.
+    dataset: str | None = field(default=None, metadata=LATER)
     #: Reward on top of the world's own for a macro-action of its own that an optimal agent could have chosen, and less
     #: for another: a teacher's feedback in training. Demonstrations and earlier tasks get none.
     feedback: float = field(default=0.0, metadata=LATER)
@@ -87,6 +90,8 @@ class Protocol(ProtocolData):
                 f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
             )
         self._require_physics()
+        if self.dataset is not None and self.demonstrations:
+            raise InvalidValueError("Both a dataset and demonstrations would come first; give one of them.")
         if not self.after and self.after_episodes != _AFTER_EPISODES:
             raise InvalidValueError(
                 f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."

@@ -25,6 +25,7 @@ class RunSpec(Generic[P_co]):
     agent: str  #: Registered agent or regressor
     seed: int  #: One of the protocol's seeds
     encoder: Path | None = None  #: The encoder artefact, or None if the agent needs none
+    dataset: Path | None = None  #: The folder of the dataset that comes first, or None
     until: int | None = None  #: Budget after which it pauses, or None to the end
     checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
 

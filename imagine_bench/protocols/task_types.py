@@ -21,7 +21,7 @@ from imagine_bench.protocols.runs import OnProgress, RunSpec
 
 P = TypeVar("P", bound=ProtocolData)
 Encoders = Mapping[str, Path]
-"""The encoder artefacts of a bench, by kind; none where nothing needs one."""
+"""The encoder artefacts of a bench, by kind, none where nothing needs one, and its ``"dataset"``, a folder."""
 
 
 class FinishedRun(Interface):

@@ -57,7 +57,8 @@ def test_any_change_changes_the_hash():
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
         "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0,
-        "settings_digest": "0123456789ab", "test_appearance": "strong", "physics": (("pad_friction", 0.5),),
+        "dataset": "random-3@0123456789ab", "settings_digest": "0123456789ab", "test_appearance": "strong",
+        "physics": (("pad_friction", 0.5),),
     }  # fmt: skip
     assert {*changes, "after_episodes", "feedback_error"} >= {field.name for field in dataclasses.fields(Protocol)}
     after = dataclasses.replace(base, after=("arrow_puzzle",))

@@ -1,0 +1,126 @@
+"""A dataset's folder: the episodes in one of three formats, a card, and files apart that no learner is given."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.data.episodes import Episodes, content_hash
+from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.store.codec import write_arrays
+from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_json, writing
+
+FORMATS = {name: f"imagine_bench.data.{name}" for name in ("npz", "lerobot", "minari")}
+"""Modules of ``write`` and ``read``, none of which is imported before it is needed."""
+_MARKS = {
+    "episodes.npz": "npz",
+    "meta/info.json": "lerobot",
+    "data/metadata.json": "minari",
+    "*/data/metadata.json": "minari",
+}
+"""Files by which formats are known; their modules read from there."""
+_CARD = "card.json"
+Apart = Mapping[str, Mapping[str, NDArray[Any]]]
+"""Named arrays that no learner is given, by the file they are in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """A dataset as it was read."""
+
+    folder: Path  #: Where it lies
+    format: str  #: One of :data:`FORMATS`
+    episodes: Episodes  #: What is in it
+    card: Mapping[str, Any] | None  #: What it is, as :func:`.collect.collect` says; None for one of others
+
+    @property
+    def identity(self) -> str:
+        """What stands for it in a protocol: policy, episodes, and 12 digits of its content's hash; no format."""
+        policy = "foreign" if self.card is None else self.card["policy"]
+        return f"{policy}-{len(self.episodes)}@{self.episodes.hash[:12]}"
+
+
+def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[str, Any], format: str) -> Dataset:
+    """Write a dataset into a new folder, whole or not at all.
+
+    Raises:
+        UnknownNameError: An unknown format.
+        SetupError: The library that the format needs is not installed, or the folder cannot be written.
+        InvalidValueError: The folder exists.
+    """
+    require_format(format)
+    require_new(folder)
+    partial = make_folder(folder.with_name(f".{folder.name}.partial"))
+    whole = {**card, "format": format, "content": episodes.hash}
+    whole["apart"] = {name: content_hash(arrays) for name, arrays in apart.items()}
+    try:
+        with writing(folder):
+            registry.load(FORMATS[format]).write(partial, episodes, card)
+            for name, arrays in apart.items():
+                write_arrays(partial / f"{name}.npz", arrays)
+            write_json(partial / _CARD, sealed(whole))
+            partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Dataset(folder=folder, format=format, episodes=episodes, card=whole)
+
+
+def require_format(format: str) -> None:
+    """Raise UnknownNameError for an unknown format, or SetupError where the library that it needs is not installed."""
+    registry.load(FORMATS[require_known("format", format, FORMATS)])
+
+
+def require_new(folder: Path) -> None:
+    """Raise InvalidValueError for a folder that exists."""
+    if folder.exists():
+        raise InvalidValueError(f"{folder} exists; give another folder with --out. Nothing was written.")
+
+
+def read_dataset(folder: Path) -> Dataset:
+    """Read a dataset, all that is in it but the files apart, and check it against its card if it has one.
+
+    Raises:
+        ArtefactError: There is none, a file is damaged, or the content is not what the card says.
+        SetupError: The library that its format needs is not installed.
+    """
+    found = next(((name, path) for mark, name in _MARKS.items() for path in sorted(folder.glob(mark))), None)
+    if found is None:
+        marks = ", ".join(f"{mark} ({name})" for mark, name in _MARKS.items())
+        raise ArtefactError(f"{folder} is no dataset; give a folder with {marks}.")
+    format, path = found
+    card = read_sealed(folder / _CARD, "a dataset's card") if (folder / _CARD).exists() else None
+    episodes = registry.load(FORMATS[format]).read(path)
+    if card is not None and card.get("content") != episodes.hash:
+        raise ArtefactError(f"{folder} is damaged: its episodes are not those of its card. It was left untouched.")
+    return Dataset(folder=folder, format=format, episodes=episodes, card=card)
+
+
+def read_apart(dataset: Dataset) -> dict[str, dict[str, NDArray[Any]]]:
+    """What no learner is given, by file, such as ``privileged``: ``macrostates`` (N + E, M) and ``seeds`` (E,).
+
+    Raises ArtefactError: a file is missing or damaged.
+    """
+    found = {}
+    for name, digest in (dataset.card or {}).get("apart", {}).items():
+        path = dataset.folder / f"{name}.npz"
+        with reading(path, "a part of a dataset"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            found[name] = dict(arrays)
+            if content_hash(found[name]) != digest:
+                raise InvalidValueError("it is not what the card says")
+    return found
+
+
+def require_of_task(dataset: Dataset, spec: TaskSpec) -> None:
+    """Raise InvalidValueError for a dataset that is of another task, by its card or by its number of actions."""
+    task = spec.id if dataset.card is None else dataset.card.get("task")
+    if (task, dataset.episodes.n_actions) != (spec.id, spec.n_actions):
+        of = f"{task}, of {dataset.episodes.n_actions} macro-actions"
+        raise InvalidValueError(f"{dataset.folder} is of {of}, not of {spec.id}; give a dataset of {spec.id}.")

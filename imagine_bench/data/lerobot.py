@@ -1,0 +1,190 @@
+"""Episodes in the layout of LeRobot datasets, version 3.0, written with pyarrow; images are PNG, without loss.
+
+A row is a macro-action: the frame before it, the action, and what came of it (``next.reward``, ``next.done``, ...). The
+layout has no row for the frame that an episode ends with; it lies in ``final_frames.parquet``, which only we read.
+
+Source: https://github.com/huggingface/lerobot, ``src/lerobot/datasets``, version 0.4.4.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from imagine_bench.data.episodes import FRAME_SHAPE, Episodes
+from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.interfaces import Frame
+from imagine_bench.store.files import make_folder, read_json, reading, write_json
+
+try:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+except ImportError as error:
+    raise SetupError("pyarrow is missing: run \"pip install 'imagine-bench[data]'\", or take --format npz.") from error
+
+_VERSION, _INFO, _FINAL = "v3.0", "meta/info.json", "final_frames.parquet"
+_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_IMAGE, _MASK, _EPISODE = "observation.image", "available", "episode_index"
+_ROWS, _FILES = 20_000, 1000
+"""Rows of a file, at most 100 MB; files of a chunk."""
+_TYPES = {
+    "action": "float32", "next.reward": "float64", "next.terminated": "bool", "next.truncated": "bool",
+    "next.done": "bool", "next.success": "bool", "timestamp": "float32", "frame_index": "int64", _EPISODE: "int64",
+    "index": "int64", "task_index": "int64",
+}  # fmt: skip
+"""Columns of one number a row. LeRobot's own tools take actions to be real numbers; a second is a macro-action."""
+
+
+def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
+    """Write data, metadata and statistics of episodes; ``card`` has the task's ``description``."""
+    firsts, (before, last) = np.cumsum(episodes.lengths) - episodes.lengths, episodes.rows
+    columns, frames, masks = _columns(episodes, firsts), episodes.frames[before], episodes.action_masks.astype(np.bool_)
+    table, text = _table({**columns, _MASK: masks[before]}, frames), [str(card["description"])]
+    places = [{"chunk_index": file // _FILES, "file_index": file % _FILES} for file in (firsts // _ROWS).tolist()]
+    spans = [
+        slice(first, first + length) for first, length in zip(firsts.tolist(), episodes.lengths.tolist(), strict=True)
+    ]
+    for place in (dict(found) for found in dict.fromkeys(tuple(place.items()) for place in places)):
+        with pq.ParquetWriter(_file(folder / "data", **place), table.schema) as writer:
+            for span in (span for span, where in zip(spans, places, strict=True) if where == place):
+                writer.write_table(table[span])
+    rows = []
+    for index, (span, place) in enumerate(zip(spans, places, strict=True)):
+        stats = _statistics({name: column[span] for name, column in columns.items()}, frames[span])
+        row = {_EPISODE: index, "tasks": text, "length": span.stop - span.start, "dataset_from_index": span.start}
+        row |= {"dataset_to_index": span.stop, **{f"data/{name}": number for name, number in place.items()}}
+        row |= {f"meta/episodes/{name}": 0 for name in place}
+        rows.append(row | {f"stats/{name}/{each}": value for name, of in stats.items() for each, value in of.items()})
+    pq.write_table(pa.Table.from_pylist(rows), _file(folder / "meta/episodes", 0, 0))
+    pq.write_table(_tasks(text), folder / "meta/tasks.parquet")
+    pq.write_table(_table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, episodes.frames[last]), folder / _FINAL)
+    write_json(folder / "meta/stats.json", _statistics(columns, frames))
+    write_json(folder / _INFO, _info(episodes))
+
+
+def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    """The columns of one number a row, in the order of their types."""
+    which, index = np.repeat(np.arange(len(firsts)), episodes.lengths), np.arange(len(episodes.actions))
+    done = episodes.terminated | episodes.truncated
+    count = index - firsts[which]
+    columns = (
+        episodes.actions, episodes.rewards, episodes.terminated, episodes.truncated, done,
+        done & episodes.success[which], count, count, which, index, np.zeros_like(index),
+    )  # fmt: skip
+    return {name: array.astype(dtype) for (name, dtype), array in zip(_TYPES.items(), columns, strict=True)}
+
+
+def _table(columns: Mapping[str, NDArray[Any]], frames: Frame) -> pa.Table:
+    """Columns and images, and what the ``datasets`` library is told of them."""
+    arrays: list[pa.Array] = [_pngs(frames)]
+    features: dict[str, dict[str, Any]] = {_IMAGE: {"_type": "Image"}}
+    for name, column in columns.items():
+        features[name] = {"dtype": str(column.dtype), "_type": "Value"}
+        arrays.append(pa.array(column.ravel()))
+        if column.ndim > 1:
+            features[name] = {"feature": features[name], "length": column.shape[1], "_type": "Sequence"}
+            arrays[-1] = pa.FixedSizeListArray.from_arrays(arrays[-1], column.shape[1])
+    told = {"huggingface": json.dumps({"info": {"features": features}})}
+    return pa.table(arrays, names=list(features), metadata=told)
+
+
+def _pngs(frames: Frame) -> pa.Array:
+    images = []
+    for frame in frames:
+        with io.BytesIO() as stream:
+            PIL.Image.fromarray(frame).save(stream, "PNG")
+            images.append({"bytes": stream.getvalue(), "path": None})
+    return pa.array(images, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+
+
+def _file(folder: Path, chunk_index: int, file_index: int) -> Path:
+    path = folder / _PATH.format(chunk_index=chunk_index, file_index=file_index)
+    make_folder(path.parent)
+    return path
+
+
+def _statistics(columns: Mapping[str, NDArray[Any]], frames: Frame) -> dict[str, dict[str, list[Any]]]:
+    """Of every column, and of each color in [0, 1], whose arrays have the shape (3, 1, 1)."""
+    levels = np.arange(256) / 255
+    counts = [np.bincount(frames[..., color].ravel(), minlength=256) for color in range(3)]
+    means = [np.average(levels, weights=count) for count in counts]
+    spreads = [
+        np.average((levels - mean) ** 2, weights=count) ** 0.5 for mean, count in zip(means, counts, strict=True)
+    ]
+    seen = [levels[count > 0] for count in counts]
+    colors = {"min": [s[0] for s in seen], "max": [s[-1] for s in seen], "mean": means, "std": spreads}
+    found: dict[str, dict[str, list[Any]]] = {
+        _IMAGE: {which: [[[float(value)]] for value in values] for which, values in colors.items()}
+    }
+    for name, column in columns.items():
+        found[name] = {which: [float(getattr(column, which)())] for which in colors}
+    return {name: {**of, "count": [len(frames)]} for name, of in found.items()}
+
+
+def _tasks(text: list[str]) -> pa.Table:
+    """What pandas writes of a table whose index is the description and whose one column is ``task_index``."""
+    index, column = "__index_level_0__", {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    columns = [
+        {**column, "name": "task_index", "field_name": "task_index"},
+        {**column, "name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
+    ]
+    told = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
+    table = pa.table({"task_index": pa.array([0], pa.int64()), index: text})
+    return table.replace_schema_metadata({"pandas": json.dumps(told)})
+
+
+def _info(episodes: Episodes) -> dict[str, Any]:
+    features: dict[str, Any] = {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _TYPES.items()}
+    features["action"]["names"] = ["macro_action"]
+    features[_MASK] = {"dtype": "bool", "shape": [episodes.n_actions], "names": None}
+    features[_IMAGE] = {"dtype": "image", "shape": list(FRAME_SHAPE), "names": ["height", "width", "channels"]}
+    return {
+        "codebase_version": _VERSION, "robot_type": None, "total_episodes": len(episodes),
+        "total_frames": len(episodes.actions), "total_tasks": 1, "chunks_size": _FILES, "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200, "fps": 1, "splits": {"train": f"0:{len(episodes)}"},
+        "data_path": f"data/{_PATH}", "video_path": None, "features": features,
+    }  # fmt: skip
+
+
+def read(path: Path) -> Episodes:
+    """Read such a dataset from its ``info.json``. Raises ArtefactError: damaged, not whole, or not of our columns."""
+    info, folder = read_json(path, "the metadata of a LeRobot dataset"), path.parents[1]
+    with reading(folder / _FINAL, "the last frames of episodes"):
+        ends = pq.read_table(folder / _FINAL)
+    with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
+        if info["codebase_version"] != _VERSION:
+            raise InvalidValueError(f"it is of version {info['codebase_version']}")
+        table = pa.concat_tables(map(pq.read_table, sorted(folder.glob("data/*/*.parquet"))))
+        column = {name: table[name].to_numpy() for name in _TYPES}
+        lengths = np.bincount(column[_EPISODE], minlength=len(ends))
+        if (len(table), len(lengths), len(ends)) != (info["total_frames"], *[info["total_episodes"]] * 2):
+            raise InvalidValueError(f"{info['total_frames']} rows are said to be in it and {len(table)} are")
+        if not np.array_equal(column["index"], np.arange(len(table))) or (np.diff(column[_EPISODE]) < 0).any():
+            raise InvalidValueError("its rows are not in order")
+        if not np.array_equal(column["action"].astype(np.int64), column["action"]):
+            raise InvalidValueError("an action is no integer")
+        frames, masks = ([*part, *last] for part, last in zip(_decoded(table), _decoded(ends), strict=True))
+        order = np.argsort(np.concatenate([np.arange(len(table)), np.cumsum(lengths) - 0.5]))
+        return Episodes(
+            lengths=lengths, frames=np.stack(frames)[order], action_masks=np.array(masks, dtype=np.int8)[order],
+            actions=column["action"].astype(np.int64), rewards=column["next.reward"],
+            terminated=column["next.terminated"], truncated=column["next.truncated"],
+            success=column["next.success"][np.cumsum(lengths) - 1],
+        )  # fmt: skip
+
+
+def _decoded(table: pa.Table) -> Iterator[list[Any]]:
+    """The images of a table, and its masks."""
+    images = [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in table[_IMAGE].to_pylist()]
+    for image in images:
+        if (image.mode, image.size) != ("RGB", FRAME_SHAPE[:2]):
+            raise InvalidValueError(f"an image is {image.mode} of {image.size} pixels")
+    yield [np.asarray(image) for image in images]
+    yield table[_MASK].to_pylist()

@@ -1,0 +1,93 @@
+"""Episodes as a Minari dataset; its own loader reads it from the folder that ``MINARI_DATASETS_PATH`` names.
+
+Observations are kept as they are: by default Minari would make JPEGs of them. What its own recorder wrote of an
+environment of ours is read too.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.data.episodes import Episodes, joined
+from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.store.files import reading
+
+try:
+    import minari
+    from minari.data_collector import EpisodeBuffer
+except ImportError as error:
+    raise SetupError("minari is missing: run \"pip install 'imagine-bench[data]'\", or take --format npz.") from error
+
+_ROOT = "MINARI_DATASETS_PATH"
+
+
+def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
+    """Write the dataset ``<task>-<policy>-v0``; the card says which environment it is of."""
+    name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
+    with _root(folder), warnings.catch_warnings(), closing(_environment(card)) as env:
+        warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
+        minari.create_dataset_from_buffers(
+            f"{name}-v0", [_buffer(episodes, index) for index in range(len(episodes))], env=env,
+            algorithm_name=str(card["policy"]), description=str(card["description"]), data_format="parquet",
+            jpeg_encoding=False,
+        )  # fmt: skip
+
+
+def _environment(card: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    return gymnasium.make(
+        registry.task_entry(card["task"]).env_id, execution=card["execution"], appearance=card["appearance"]
+    )
+
+
+@contextmanager
+def _root(folder: Path) -> Iterator[None]:
+    """Have Minari write below a folder."""
+    before = dict(os.environ)
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[_ROOT]
+        os.environ.update(before)
+
+
+def _buffer(episodes: Episodes, index: int) -> EpisodeBuffer:
+    steps, frames = episodes.steps(index)
+    success = [False] * int(episodes.lengths[index]) + [bool(episodes.success[index])]
+    return EpisodeBuffer(
+        id=index, observations=episodes.frames[frames], actions=episodes.actions[steps],
+        rewards=episodes.rewards[steps], terminations=episodes.terminated[steps], truncations=episodes.truncated[steps],
+        infos={"action_mask": episodes.action_masks[frames], "is_success": success},
+    )  # fmt: skip
+
+
+def read(path: Path) -> Episodes:
+    """Read a dataset from its ``metadata.json``. Raises ArtefactError: damaged, or of an environment unlike ours."""
+    with reading(path, "a Minari dataset of macro-actions"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = minari.MinariDataset(path.parent)
+        try:
+            parts = [_part(episode) for episode in found.iterate_episodes()]
+        except FileNotFoundError as error:
+            raise InvalidValueError(f"a file of it is missing ({error})") from error
+        if len(parts) != found.total_episodes or sum(len(part["actions"]) for part in parts) != found.total_steps:
+            raise InvalidValueError(f"{found.total_episodes} episodes are said to be in it and {len(parts)} are")
+        return joined(parts)
+
+
+def _part(episode: Any) -> dict[str, Any]:
+    return {
+        "frames": episode.observations, "actions": episode.actions, "rewards": episode.rewards,
+        "terminated": episode.terminations, "truncated": episode.truncations,
+        "action_masks": episode.infos["action_mask"], "success": bool(np.asarray(episode.infos["is_success"])[-1]),
+    }  # fmt: skip

@@ -1,0 +1,24 @@
+"""Episodes as one numpy archive, ``episodes.npz``, of the arrays of :class:`.Episodes`; it needs no other library."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.store.codec import write_arrays
+from imagine_bench.store.files import reading
+
+
+def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
+    """Write the archive."""
+    write_arrays(folder / "episodes.npz", episodes.arrays())
+
+
+def read(path: Path) -> Episodes:
+    """Read an archive. Raises ArtefactError: it is damaged, or the arrays are not those of episodes."""
+    with reading(path, "an archive of episodes"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        return Episodes(**arrays)

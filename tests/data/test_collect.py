@@ -1,0 +1,159 @@
+"""A collected dataset is what happened: it can be replayed, its policies are what they say, one seed is one content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from bench_fakes import TableAgent
+from small_datasets import collected, written
+from small_runs import do
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.data.collect import collect, describe, policy_of
+from imagine_bench.data.folder import read_dataset
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Observation
+from imagine_bench.seeding import episode_seed
+
+TASK = registry.task("arrow_puzzle")
+
+
+@pytest.mark.parametrize("policy", ["mixed", "uniform"])
+def test_replaying_the_actions_gives_every_frame_again(policy: str) -> None:
+    episodes, apart, _ = collected(policy)
+    hidden, shown = apart["privileged"], []
+    with gymnasium.make(TASK.env_id, execution="kinematic", appearance="mild") as env:
+        for index, seed in enumerate(hidden["seeds"].tolist()):
+            steps, frames = episodes.steps(index)
+            options = {"macrostate": hidden["macrostates"][frames][0]} if policy == "uniform" else None
+            frame, info = env.reset(seed=seed, options=options)
+            shown.append((frame, info["macrostate"]))
+            for step in range(steps.start, steps.stop):
+                frame, reward, terminated, truncated, info = env.step(int(episodes.actions[step]))
+                shown.append((frame, info["macrostate"]))
+                assert (reward, terminated) == (episodes.rewards[step], episodes.terminated[step])
+                assert truncated == episodes.truncated[step] or policy == "uniform"
+            assert info["is_success"] == episodes.success[index]
+    assert np.array_equal([frame for frame, _ in shown], episodes.frames)
+    assert np.array_equal([state for _, state in shown], hidden["macrostates"])
+
+
+def test_one_seed_is_one_content_and_another_is_another() -> None:
+    first, _, _ = collected(episodes=3)
+    again, _, _ = collected.__wrapped__(episodes=3)
+    other, _, _ = collected(episodes=3, seed=1)
+    assert first.hash == again.hash != other.hash
+    longer, _, _ = collected(episodes=6)
+    assert np.array_equal(longer.frames[: len(first.frames)], first.frames), "more episodes begin with the same"
+
+
+def test_starts_are_those_of_no_run() -> None:
+    seeds = collected()[1]["privileged"]["seeds"].tolist()
+    others = [episode_seed(purpose, 0, k) for purpose in ("training", "evaluation", "tuning") for k in range(6)]
+    assert len({*seeds, *others}) == 6 + 18
+
+
+def test_the_oracle_is_optimal_and_chance_is_not() -> None:
+    optimal, _, card = collected("oracle", episodes=20)
+    chance, _, other = collected("random", episodes=20)
+    assert optimal.success.all() and card["successes"] == 20 and card["optimum"] == 1.0
+    assert other["successes"] == chance.success.sum() < 10
+    assert card["mean_return"] == optimal.rewards.sum() / 20
+    assert other["chance_level"] == TASK.facts().chance_level < 0.1
+    mixed, _, _ = collected()
+    assert mixed.success[1::2].all() and not mixed.success[::2].all(), "the oracle plays every other episode"
+
+
+def test_uniform_is_one_action_from_any_open_macrostate() -> None:
+    """200 draws of about 100 states: a state in which no episode begins is among them, and none in which all ended."""
+    episodes, apart, _ = collected("uniform", episodes=200)
+    starts = [tuple(state) for state in apart["privileged"]["macrostates"][::2].tolist()]
+    open_states = {state for state in TASK.rules.states if not TASK.rules.is_terminal(state)}
+    assert set(starts) <= open_states and len(set(starts)) > 0.6 * len(open_states)
+    assert (episodes.lengths == 1).all() and np.array_equal(episodes.truncated, ~episodes.terminated)
+    assert np.bincount(episodes.actions, minlength=6).min() > 15
+
+
+def test_a_trained_agent_acts_greedily(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    do(tmp_path / "run", agent="table")
+    policy = policy_of(str(tmp_path / "run"), TASK, 0)
+    (agent, _), explored = policy.players[0], []
+    act = TableAgent.act
+
+    def noted(self: TableAgent, observation: Observation, *, explore: bool) -> int:
+        explored.append(explore)
+        return act(self, observation, explore=explore)
+
+    monkeypatch.setattr(TableAgent, "act", noted)
+    episodes, _, card = collect(TASK, policy, episodes=3, seed=0, execution="kinematic", appearance="clean")
+    assert explored == [False] * len(episodes.actions)
+    wanted = [act(agent, Observation(frame=frame), explore=False) for frame in episodes.frames[episodes.rows[0]]]
+    assert wanted == episodes.actions.tolist()
+    assert card["policy"] == "table" and card["played"] == "greedy after 9 episodes of seed 0"
+    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place; give a run of pick_place"):
+        policy_of(str(tmp_path / "run"), registry.task("pick_place"), 0)
+
+
+def test_the_arms_motion_is_kept_apart_where_asked_for() -> None:
+    policy = policy_of("oracle", TASK, 0)
+    episodes, apart, card = collect(
+        TASK, policy, episodes=1, seed=0, execution="physics", appearance="clean", motion_hz=20
+    )
+    arm, total = apart["arm"], int(apart["arm"]["samples"].sum())
+    assert len(arm["samples"]) == len(episodes.actions) and card["motion_hz"] == 20
+    assert arm["joint_command_rad"].shape == (total, 7) and arm["tcp_in_world"].shape == (total, 7)
+    begins = np.cumsum(arm["samples"]) - arm["samples"]
+    assert (arm["time_s"][begins] == 0).all() and np.ptp(arm["joint_rad"], axis=0).max() > 0.1
+
+
+def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "set"
+    words = ["dataset", "arrow_puzzle", "--policy", "oracle", "--episodes", "2", "--execution", "kinematic"]
+    assert main([*words, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert main(["dataset", "--describe", str(out)]) == 0
+    assert capsys.readouterr().out == said.partition("\n")[2], "what is read is what was written"
+    for part in ("oracle (optimal macro-actions by the rules), seed 0", "100.0% of episodes [34.2%", "chance 4.6%"):
+        assert part in said
+    assert describe(read_dataset(out)) in said and read_dataset(out).episodes.hash in said
+    assert main([*words, "--out", str(out)]) == 2
+    assert (
+        capsys.readouterr().err
+        == f"imagine-bench: {out} exists; give another folder with --out. Nothing was written.\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "Give a task to collect episodes of, or one of --describe and --standard."),
+        (["arrow_puzzle", "--standard"], "Give a task to collect"),
+        (["toy_regression"], "No task 'toy_regression'"),
+        (["arrow_puzzle", "--policy", "best"], "No policy 'best'. Known: random, uniform, oracle, mixed, or a run's"),
+        (["arrow_puzzle", "--policy", "."], "a run's configuration; give a run's folder"),
+        (["arrow_puzzle", "--episodes", "0"], "episodes is 0 and seed 0; give 1 to 100,000 episodes"),
+        (["arrow_puzzle", "--seed", "-1"], "Seed -1 is negative; give an integer of at least 0."),
+        (["arrow_puzzle", "--format", "csv"], "No format 'csv'. Known: npz, lerobot, minari."),
+        (["arrow_puzzle", "--execution", "magic"], "No execution 'magic'"),
+        (["arrow_puzzle", "--motion-hz", "5000", "--episodes", "1"], "Motion cannot be captured at 5000.0 Hz"),
+        (["--describe", "nowhere"], "nowhere is no dataset; give a folder with episodes.npz (npz), meta/info.json"),
+    ],
+)
+def test_a_wrong_command_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["dataset", *words]) == 2
+    said = capsys.readouterr().err
+    assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_a_file_where_a_folder_should_be_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "set").write_text("mine")
+    with pytest.raises(InvalidValueError, match="exists; give another folder"):
+        written(tmp_path / "set")
+    assert (tmp_path / "set").read_text() == "mine"

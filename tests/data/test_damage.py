@@ -1,0 +1,185 @@
+"""A dataset that was damaged, changed or made up ends in one sentence that names it, and is left untouched."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from small_datasets import FORMATS, collected, written
+
+from imagine_bench.data.collect import describe
+from imagine_bench.data.folder import read_dataset
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("sets")
+    for format in FORMATS:
+        written(root / format, format)
+    return root
+
+
+def refused(folder: Path, sentence: str) -> None:
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(ArtefactError) as caught:
+        describe(read_dataset(folder))
+    said = str(caught.value)
+    assert sentence in said and str(folder) in said and "\n" not in said and len(said) < 1500, said
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def archive(**changes: Any) -> Callable[[Path], None]:
+    """Writes the archive again with other arrays; None leaves one out."""
+
+    def change(folder: Path) -> None:
+        arrays = {**collected()[0].arrays(), **changes}
+        np.savez(folder / "episodes.npz", **{name: array for name, array in arrays.items() if array is not None})
+
+    return change
+
+
+def bytes_of(name: str, change: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        (path,) = folder.glob(name)
+        path.write_bytes(change(path.read_bytes()))
+
+    return damage
+
+
+def with_item(name: str, index: int, value: Any) -> Callable[[Path], None]:
+    array = getattr(collected()[0], name).copy()
+    array[index] = value
+    return archive(**{name: array})
+
+
+_DATA = "data/chunk-000/file-000.parquet"
+
+
+def table(change: Callable[[pa.Table], pa.Table], name: str = _DATA) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        pq.write_table(change(pq.read_table(folder / name)), folder / name)
+
+    return damage
+
+
+def info(**values: Any) -> Callable[[Path], None]:
+    return bytes_of("meta/info.json", lambda old: json.dumps({**json.loads(old), **values}).encode())
+
+
+def with_image(content: bytes) -> Callable[[pa.Table], pa.Table]:
+    def change(old: pa.Table) -> pa.Table:
+        images = old["observation.image"].to_pylist()
+        images[3] = {"bytes": content, "path": None}
+        column = old.schema.get_field_index("observation.image")
+        return old.set_column(column, "observation.image", pa.array(images, old.schema.field(column).type))
+
+    return change
+
+
+def png(size: tuple[int, int], mode: str = "RGB") -> bytes:
+    with io.BytesIO() as stream:
+        PIL.Image.new(mode, size).save(stream, "PNG")
+        return stream.getvalue()
+
+
+def flipped(content: bytes) -> bytes:
+    return content[:-200] + bytes([content[-200] ^ 1]) + content[-199:]
+
+
+_LONG = np.ones(6, dtype=np.int64)
+DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
+    ("npz", bytes_of("episodes.npz", lambda old: old[:-1000]), "is not an archive of episodes"),
+    ("npz", bytes_of("episodes.npz", lambda old: b""), "is not an archive of episodes"),
+    ("npz", bytes_of("episodes.npz", lambda old: b"PK\x03\x04garbage"), "is not an archive of episodes"),
+    ("npz", bytes_of("episodes.npz", lambda old: old[: len(old) // 2] + b"\0" + old[len(old) // 2 + 1 :]), ""),
+    ("npz", archive(actions=np.array([[1], [1, 2]], dtype=object)), "pickle"),
+    ("npz", archive(rewards=None), "rewards"),
+    ("npz", archive(more=_LONG), "more"),
+    ("npz", with_item("rewards", 2, np.nan), "reward 2 is not finite"),
+    ("npz", with_item("rewards", 0, np.inf), "reward 0 is not finite"),
+    ("npz", with_item("actions", 0, 6), "actions must lie from 0 to 5"),
+    ("npz", with_item("actions", 0, -1), "actions must lie from 0 to 5"),
+    ("npz", with_item("action_masks", 0, 2), "an action mask is neither 0 nor 1"),
+    ("npz", with_item("terminated", 1, True), "an episode goes on after its end, or has none"),
+    ("npz", archive(frames=collected()[0].frames[1:]), "frames has shape"),
+    ("npz", archive(frames=collected()[0].frames.astype(np.float32)), "frames holds float32, not uint8"),
+    ("npz", archive(frames=collected()[0].frames[..., :2]), "frames has shape"),
+    ("npz", archive(lengths=np.zeros(0, dtype=np.int64)), "one or more episodes"),
+    ("npz", archive(lengths=-_LONG), "each of at least 1"),
+    ("npz", with_item("frames", 0, 7), "is damaged: its episodes are not those of its card"),
+    ("npz", with_item("success", 0, ~collected()[0].success[0]), "is damaged: its episodes are not those of its card"),
+    ("npz", bytes_of("card.json", lambda old: old.replace(b'"mixed"', b'"oracle"')), "card.json is damaged"),
+    ("npz", bytes_of("card.json", lambda old: b"[]"), "is not a dataset's card"),
+    ("npz", bytes_of("privileged.npz", flipped), "privileged.npz is not a part of a dataset"),
+    ("npz", lambda folder: (folder / "privileged.npz").unlink(), "There is no"),
+    ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "the last frames of episodes"),
+    ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "is not a LeRobot dataset of macro-actions"),
+    ("lerobot", bytes_of(_DATA, lambda old: old[:-200]), "is not a LeRobot dataset of macro-actions"),
+    ("lerobot", table(lambda old: old[:-1]), "rows are said to be in it and"),
+    ("lerobot", table(lambda old: old[:-1], "final_frames.parquet"), "rows are said to be in it and"),
+    ("lerobot", table(lambda old: old.take(list(range(len(old)))[::-1])), "its rows are not in order"),
+    ("lerobot", table(lambda old: old.drop_columns(["next.reward"])), "next.reward"),
+    ("lerobot", table(with_image(b"not a PNG")), "cannot identify image"),
+    ("lerobot", table(with_image(png((64, 64))[:60])), "image file is truncated"),
+    ("lerobot", table(with_image(png((6400, 64)))), "an image is RGB of (6400, 64) pixels"),
+    ("lerobot", table(with_image(png((64, 64), "L"))), "an image is L of (64, 64) pixels"),
+    ("lerobot", table(with_image(png((64, 64)))), "is damaged: its episodes are not those of its card"),
+    ("lerobot", info(codebase_version="v2.1"), "it is of version v2.1"),
+    ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it"),
+    ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
+    ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
+    ("minari", bytes_of("*/data/metadata.json", lambda old: old.replace(b"0.5", b"9.5")), "is not a Minari dataset"),
+    ("minari", bytes_of("*/data/2/*.parquet", lambda old: old[:-200]), "is not a Minari dataset of macro-actions"),
+    ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("format", "damage", "sentence"), DAMAGES, ids=range(len(DAMAGES)))
+def test_what_is_damaged_is_refused(
+    sets: Path, tmp_path: Path, format: str, damage: Callable[[Path], Any], sentence: str
+) -> None:
+    folder = tmp_path / "set"
+    shutil.copytree(sets / format, folder)
+    read_dataset(folder)
+    damage(folder)
+    refused(folder, sentence)
+
+
+@pytest.mark.parametrize("make", [lambda path: None, Path.mkdir, Path.touch], ids=["nothing", "a folder", "a file"])
+def test_what_is_no_dataset_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "set")
+    with pytest.raises(ArtefactError, match="is no dataset; give a folder with episodes"):
+        read_dataset(tmp_path / "set")
+
+
+def test_a_card_of_another_set_is_refused(sets: Path, tmp_path: Path) -> None:
+    shutil.copytree(sets / "npz", tmp_path / "set")
+    other = written(tmp_path / "other", episodes=3)
+    shutil.copy(other.folder / "card.json", tmp_path / "set/card.json")
+    refused(tmp_path / "set", "is damaged: its episodes are not those of its card")
+
+
+def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("imagine_bench.data.npz.write", full)
+    with pytest.raises(ImagineBenchError, match="the disk is full"):
+        written(tmp_path / "set")
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_episodes_and_no_numbers_are_refused_before_writing() -> None:
+    with pytest.raises(InvalidValueError, match="lengths holds list, not int64"):
+        dataclasses.replace(collected()[0], lengths=[1, 2])

@@ -1,0 +1,193 @@
+"""Three formats hold the same episodes to the bit, in the layouts that other people's readers expect."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import sys
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import PIL.Image
+import pyarrow.parquet as pq
+import pytest
+from small_datasets import FORMATS, collected, written
+
+from imagine_bench import registry
+from imagine_bench.data import lerobot
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.data.folder import read_apart, read_dataset, require_format
+from imagine_bench.errors import SetupError, UnknownNameError
+
+
+def same(one: Episodes, other: Episodes) -> bool:
+    pairs = [(array, other.arrays()[name]) for name, array in one.arrays().items()]
+    return all(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_every_format_gives_back_every_bit(tmp_path: Path, format: str) -> None:
+    episodes, apart, card = collected()
+    dataset = written(tmp_path / "set", format)
+    found = read_dataset(tmp_path / "set")
+    assert same(found.episodes, episodes) and found.format == format
+    assert found.card is not None and {**card, "format": format}.items() <= found.card.items()
+    assert found.identity == dataset.identity == f"mixed-6@{episodes.hash[:12]}"
+    assert {name: set(arrays) for name, arrays in read_apart(found).items()} == {"privileged": {"macrostates", "seeds"}}
+    assert np.array_equal(read_apart(found)["privileged"]["macrostates"], apart["privileged"]["macrostates"])
+    assert not list(tmp_path.glob(".*")), "nothing half-written is left"
+
+
+def test_nothing_a_learner_reads_holds_macrostates(tmp_path: Path) -> None:
+    """Four columns of small integers would be found in a file of one of the formats, had they been written there."""
+    states = collected()[1]["privileged"]["macrostates"]
+    assert states.shape[1] == 4
+    for format in FORMATS:
+        written(tmp_path / format, format)
+    assert set(np.load(tmp_path / "npz/episodes.npz").files) == {field.name for field in dataclasses.fields(Episodes)}
+    columns = pq.read_table(tmp_path / "lerobot/data/chunk-000/file-000.parquet").schema.names
+    assert not [name for name in columns if "state" in name]
+    (data,) = (tmp_path / "minari").glob("*/data")
+    assert set(next(iter(minari.MinariDataset(data))).infos) == {"action_mask", "is_success"}
+
+
+def test_a_hash_stands_for_the_content_alone() -> None:
+    episodes = collected()[0]
+    sha = hashlib.sha256()
+    for name, array in sorted(episodes.arrays().items()):
+        sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
+    assert episodes.hash == sha.hexdigest()
+    for name in ("frames", "rewards", "success", "action_masks"):
+        changed = getattr(episodes, name).copy()
+        changed[-1] = 1 - changed[-1] if name != "success" else ~changed[-1]
+        assert dataclasses.replace(episodes, **{name: changed}).hash != episodes.hash
+
+
+# --- Minari ----------------------------------------------------------------------------------------------------------
+
+
+def test_minari_loads_the_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(tmp_path / "set", "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "set"))
+    found = minari.load_dataset("arrow_puzzle-mixed-v0")
+    episodes = collected()[0]
+    assert (found.total_episodes, found.total_steps) == (6, len(episodes.actions))
+    for index, episode in enumerate(found.iterate_episodes()):
+        steps, frames = episodes.steps(index)
+        assert np.array_equal(episode.observations, episodes.frames[frames]), "lossless: no JPEG"
+        assert np.array_equal(episode.actions, episodes.actions[steps])
+        assert np.array_equal(episode.rewards, episodes.rewards[steps])
+    env = found.recover_environment()
+    assert env.spec is not None and env.spec.id == "imagine_bench/ArrowPuzzle-v0"
+    assert env.spec.kwargs["execution"] == "kinematic" and env.spec.kwargs["appearance"] == "mild"
+    env.close()
+
+
+def test_a_set_of_others_is_read_without_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Minari's own recorder writes it: every key of info, and no file of ours."""
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    with gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic") as env:
+        buffers = []
+        for seed in range(2):
+            frame, info = env.reset(seed=seed)
+            frames, infos, rewards, ends, over = [frame], [info], [], [], False
+            while not over:
+                frame, reward, terminated, truncated, info = env.step(0)
+                over = terminated or truncated
+                frames, infos = [*frames, frame], [*infos, info]
+                rewards, ends = [*rewards, reward], [*ends, (terminated, truncated)]
+            told = {
+                name: [each[name] for each in infos] for name in ("action_mask", "is_success", "macrostate", "fault")
+            }
+            buffers.append(EpisodeBuffer(
+                observations=np.stack(frames), actions=[0] * len(rewards), rewards=rewards,
+                terminations=[end[0] for end in ends], truncations=[end[1] for end in ends], infos=told,
+            ))  # fmt: skip
+        with pytest.warns(UserWarning):
+            minari.create_dataset_from_buffers("mine-v3", buffers, env=env, data_format="arrow", jpeg_encoding=False)
+    for folder in (tmp_path, tmp_path / "mine-v3"):
+        found = read_dataset(folder)
+        assert found.card is None and found.identity.startswith("foreign-2@")
+        assert np.array_equal(found.episodes.frames[: len(buffers[0]) + 1], buffers[0].observations)
+
+
+# --- LeRobot ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_layout_is_lerobots(tmp_path: Path) -> None:
+    """What LeRobot 0.4.4's own reader needs; it was run on such a set, but cannot be installed beside us."""
+    written(tmp_path / "set", "lerobot")
+    episodes, folder = collected()[0], tmp_path / "set"
+    info = json.loads((folder / "meta/info.json").read_text())
+    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
+    table, listed = pq.read_table(path), pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert info["codebase_version"] == "v3.0" and set(table.schema.names) == set(info["features"])
+    assert (len(table), len(listed)) == (info["total_frames"], info["total_episodes"]) == (len(episodes.actions), 6)
+    before, _ = episodes.rows
+    for row, frame in zip(table["observation.image"].to_pylist(), episodes.frames[before], strict=True):
+        assert row["bytes"].startswith(b"\x89PNG") and row["path"] is None
+        assert np.array_equal(np.asarray(PIL.Image.open(io.BytesIO(row["bytes"]))), frame)
+    for index, row in enumerate(listed):
+        steps, _ = episodes.steps(index)
+        assert (row["dataset_from_index"], row["dataset_to_index"], row["length"]) == (
+            steps.start, steps.stop, steps.stop - steps.start,
+        )  # fmt: skip
+        assert row["stats/next.reward/min"] == [episodes.rewards[steps].min()]
+    assert np.array_equal(table["next.done"].to_numpy(), np.diff(table["episode_index"].to_numpy(), append=99) > 0)
+    assert table["timestamp"].to_pylist() == table["frame_index"].to_pylist()
+    tasks = pq.read_table(folder / "meta/tasks.parquet")
+    (index,) = json.loads(tasks.schema.metadata[b"pandas"])["index_columns"]
+    assert tasks.to_pydict() == {"task_index": [0], index: [registry.task("arrow_puzzle").description]}
+    told = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+    assert told["observation.image"] == {"_type": "Image"} and told["action"] == {"dtype": "float32", "_type": "Value"}
+
+
+def test_statistics_are_those_of_the_arrays(tmp_path: Path) -> None:
+    written(tmp_path / "set", "lerobot")
+    episodes = collected()[0]
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    frames = episodes.frames[episodes.rows[0]].reshape(-1, 3) / 255
+    for values, name, shape in ((frames, "observation.image", (3, 1, 1)), (episodes.rewards, "next.reward", (1,))):
+        for which in ("min", "max", "mean", "std"):
+            wanted = getattr(values, which)(axis=0).reshape(shape)
+            assert np.allclose(stats[name][which], wanted, rtol=1e-12, atol=1e-12), (name, which)
+        assert stats[name]["count"] == [len(episodes.actions)]
+
+
+def test_large_sets_lie_in_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot, "_ROWS", 5)
+    monkeypatch.setattr(lerobot, "_FILES", 2)
+    written(tmp_path / "set", "lerobot")
+    listed = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    places = {(row["data/chunk_index"], row["data/file_index"]) for row in listed}
+    assert len(places) > 2 and max(places)[0] > 0
+    for row in listed:
+        chunk, file = row["data/chunk_index"], row["data/file_index"]
+        there = pq.read_table(tmp_path / f"set/data/chunk-{chunk:03d}/file-{file:03d}.parquet")
+        assert row["episode_index"] in there["episode_index"].to_pylist()
+    assert same(read_dataset(tmp_path / "set").episodes, collected()[0])
+
+
+# --- the extra -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("library", "format"), [("pyarrow", "lerobot"), ("minari", "minari")])
+def test_a_missing_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch, library: str, format: str) -> None:
+    monkeypatch.delitem(sys.modules, f"imagine_bench.data.{format}", raising=False)
+    for name in [name for name in sys.modules if name.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(SetupError, match=rf"^{library} is missing: run .*imagine-bench\[data\].* --format npz\.$"):
+        require_format(format)
+    require_format("npz")
+
+
+def test_an_unknown_format_is_named() -> None:
+    with pytest.raises(UnknownNameError, match=r"^No format 'hdf5'\. Known: npz, lerobot, minari\.$"):
+        require_format("hdf5")
