@@ -71,9 +71,9 @@ def _require_sound(wanted: Protocol) -> None:
             if (each.shape, each.dtype) != ((64, 64, 3), np.uint8):
                 raise InvalidValueError(f"{what} gives frames of {each.dtype} and shape {each.shape}")
     except Exception as error:  # whatever a guest does wrong is one sentence
-        raise InvalidValueError(
-            f"Task {wanted.task} cannot be run: {plain(error)}. 'imagine-bench check --task {wanted.task}' says more."
-        ) from error
+        why = " ".join(plain(error).split()).rstrip(".")
+        more = f"'imagine-bench check --task {wanted.task}' says more"
+        raise InvalidValueError(f"Task {wanted.task} cannot be run: {why}. {more}.") from error
 
 
 def _rests_on_others(agent: str) -> bool:
