@@ -365,6 +365,20 @@ def register_env(entry: TaskEntry) -> None:
         gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=options)
 
 
+def register_vector_env(entry: TaskEntry) -> None:
+    """Register the vector environment of a task whose environment is one of this suite's."""
+    gymnasium.register(
+        vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
+        max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
+    )  # fmt: skip
+
+
+def vector_id(env_id: str) -> str:
+    """The id of an environment's own vector environment; that of the single one keeps Gymnasium's default, sync."""
+    name, _, version = env_id.rpartition("-v")
+    return f"{name}-vector-v{version}"
+
+
 def agent_entry(name: str) -> AgentEntry:
     """The registry line of an agent, this suite's or an installed package's; an entrant's title says its settings.
 

@@ -151,7 +151,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """
         info = self.restart(seed=seed, options=options)
         self._show()
-        return self.observe(), info
+        return self.observe([self])[0], info
 
     def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
         """As :meth:`reset`, without an observation."""
@@ -174,7 +174,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """
         reward, terminated, info = finish(self.acting(action))
         self._show()
-        return self.observe(), reward, terminated, False, info
+        return self.observe([self])[0], reward, terminated, False, info
 
     def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
         """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
@@ -184,7 +184,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
-        chosen = self._checked(action)
+        chosen = self.checked(action)
         self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
@@ -207,9 +207,19 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         info = self._info(success=outcome.success, legal=legal, fault=fault)
         return float(outcome.reward), outcome.terminated, info
 
-    def observe(self) -> Any:
-        """What :meth:`reset` and :meth:`step` return of the scene as it stands."""
-        return self._observer.observe(self._macrostate)
+    @property
+    def execution(self) -> str:
+        """``"physics"`` or ``"kinematic"``."""
+        return self._execution
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is an episode to go on with."""
+        return self._begun
+
+    def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
+        """What :meth:`reset` and :meth:`step` return of environments like this as they stand, by its cameras."""
+        return self._observer.observe([(env._observer, env._macrostate) for env in envs])
 
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
@@ -218,7 +228,11 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
-        return self._render_camera.frame(self.world.data) if self.render_mode == "rgb_array" else None
+        return self.rendered([self])[0] if self.render_mode == "rgb_array" else None
+
+    def rendered(self, envs: Sequence[MacroEnv]) -> list[Frame]:
+        """What :meth:`render` returns of environments like this, drawn by its camera."""
+        return self._render_camera.frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
@@ -411,7 +425,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             return f"{len(top)} integers from 0 to at most {top}"
         return f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
 
-    def _checked(self, action: np.int64 | int) -> int:
+    def checked(self, action: np.int64 | int) -> int:
+        """A macro-action as a number. Raises InvalidValueError: no such action."""
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         try:
             chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.interfaces import Frame
 
 from .rendering import Renderer
 from .scene_reader import ArmColumns, tcp_in_world
@@ -67,20 +68,25 @@ class Observer:
         chosen = {name: spaces[name] for name in self._names}
         self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
 
-    def observe(self, macrostate: tuple[int, ...]) -> Any:
-        """The world as it stands, which was read as ``macrostate``."""
-        parts = {name: self._part(name, macrostate) for name in self._names}
-        return parts if len(parts) > 1 else parts[self._names[0]]
+    def observe(self, moments: Sequence[tuple[Observer, tuple[int, ...]]]) -> list[Any]:
+        """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""
+        scenes = [(observer._world.model, observer._world.data) for observer, _ in moments]
+        images = {name: camera.frames(scenes) for name, camera in self._cameras.items()}
+        seen = []
+        for row, (observer, macrostate) in enumerate(moments):
+            drawn = {name: frames[row] for name, frames in images.items()}
+            parts = {name: observer._part(name, macrostate, drawn) for name in self._names}
+            seen.append(parts if len(parts) > 1 else parts[self._names[0]])
+        return seen
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""
         for camera in self._cameras.values():
             camera.close()
 
-    def _part(self, name: str, macrostate: tuple[int, ...]) -> NDArray[Any]:
-        if name in self._cameras:
-            image = self._cameras[name].frame(self._world.data, self._world.model)
-            return self._world.develop(image) if name == "frame" else image
+    def _part(self, name: str, macrostate: tuple[int, ...], drawn: Mapping[Any, Frame]) -> NDArray[Any]:
+        if name in drawn:
+            return self._world.develop(drawn[name]) if name == "frame" else drawn[name]
         if name == "state":
             one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
             one_hot[self._offsets[:-1] + macrostate] = 1.0

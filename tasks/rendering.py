@@ -17,7 +17,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -218,16 +218,26 @@ class Renderer:
         Raises:
             SetupError: The machine has no OpenGL.
         """
+        return self.frames([(model or self._model, data)])[0]
+
+    def frames(self, scenes: Sequence[tuple[mujoco.MjModel, mujoco.MjData]]) -> list[NDArray[np.uint8]]:
+        """Draw several scenes, each as :meth:`frame` draws one.
+
+        Raises:
+            SetupError: As :meth:`frame`.
+        """
+        drawn = []
         with self._one_at_a_time():
             canvas = self._ready_canvas()
             canvas.make_current()
-            shown = (model or self._model, data, self._option, None, self._camera)
-            mujoco.mjv_updateScene(*shown, _ALL_OBJECTS, self._scene)
-            mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
-            mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
+            for scene in scenes:
+                mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+                mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
+                mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
+                drawn.append(self._bottom_up[::-1].copy())
             if self._takeovers > 1:
                 canvas.release()
-            return self._bottom_up[::-1].copy()
+        return drawn
 
     def _one_at_a_time(self) -> AbstractContextManager[Any]:
         """The lock of this process: a thread of the parent's that held it when this was forked lives there alone."""

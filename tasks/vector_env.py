@@ -1,0 +1,347 @@
+"""Many environments at once: their macro-actions are planned one after another and simulated on all cores.
+
+While one lane is planned, the contact physics of those before it runs on other threads, each lane's on its own data and
+for as long as its own motion takes. So the lanes are equal to single environments, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from numpy.typing import NDArray
+
+from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
+
+from .macro_env import MacroEnv
+from .motion.executor import Motion
+
+_MODES = {mode.value: mode for mode in AutoresetMode}
+_Step = tuple[float, bool, dict[str, Any]]
+Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+@dataclass
+class _Acting:
+    """A lane in the middle of a macro-action, or of the reset that takes its place."""
+
+    motion: Motion[_Step] | None  #: None for a reset
+    simulated: Future[None] | None = None  #: what the motion waits for
+    due_s: float = 0.0  #: when it ends, on the clock that all lanes share
+    step: _Step | None = None  #: what became of it
+
+    def go_on(self, threads: ThreadPoolExecutor, timestep_s: float) -> None:
+        """Up to where the motion needs its next simulation, or to its end."""
+        assert self.motion is not None
+        try:
+            simulation = next(self.motion)
+        except StopIteration as end:
+            self.simulated, self.step = None, end.value
+        else:
+            self.due_s += timestep_s * len(simulation.control)
+            self.simulated = threads.submit(simulation.run)
+
+
+class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
+    """Several environments of one task in step, or each at its own pace by :meth:`send` and :meth:`recv`.
+
+    Spaces, info and seeds are those of ``gymnasium.vector.SyncVectorEnv``: lane i is seeded ``seed + i``, info holds
+    arrays with a mask ``_key`` for each ``key``. A lane whose simulation blows up is truncated, with the fault in its
+    info and the observation before; the others go on.
+
+    Args:
+        lanes: The environments, made alike; ``envs`` holds them. The first one's cameras draw all.
+        max_episode_steps: Macro-actions before truncation, or None.
+        autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
+            ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
+            resets, by ``reset(options={"reset_mask": ...})``), or Gymnasium's enum.
+        threads: Simulations at once; one a core if None.
+
+    Raises:
+        UnknownNameError: Another mode.
+        InvalidValueError: No lanes or threads.
+    """
+
+    def __init__(
+        self,
+        lanes: Sequence[MacroEnv],
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        threads: int | None = None,
+    ) -> None:
+        name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self.autoreset_mode = _MODES[require_known("autoreset mode", name, _MODES)]
+        threads = _cores() if threads is None else threads
+        for what, value in (("num_envs", len(lanes)), ("threads", threads)):
+            if not isinstance(value, int) or value < 1:
+                raise InvalidValueError(f"{what} is {brief(value)}; give an integer from 1 on.")
+        self.envs, self.num_envs, self._horizon = tuple(lanes), len(lanes), max_episode_steps
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
+        mode = lanes[0].render_mode
+        self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
+        self.single_observation_space, self.single_action_space = lanes[0].observation_space, lanes[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._threads = ThreadPoolExecutor(threads, "simulation")
+        self._seen: list[Any] = [None] * self.num_envs
+        self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
+        self._over = np.ones(self.num_envs, dtype=np.bool_)
+        self._acting: dict[int, _Acting] = {}
+        self._clock_s = 0.0
+
+    # --- Gymnasium -----------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in every lane, whatever it was doing, or in those of ``options["reset_mask"]``.
+
+        Args:
+            seed: One number, which lane i adds i to, or one for each lane.
+            options: Those of the task, the same for all lanes, and ``reset_mask``, bool of shape (num_envs,).
+
+        Raises:
+            InvalidValueError: Seeds or mask of another length or type, or a macrostate that is none.
+            UnknownNameError: An unknown option.
+        """
+        options = dict(options or {})
+        chosen = self._masked(options.pop("reset_mask", None))
+        seeds = self._seeds(seed)
+        for lane in chosen:
+            acting = self._acting.pop(lane, None)
+            if acting is not None and acting.simulated is not None:
+                acting.simulated.exception()  # its data is in use until then
+        infos = self._restart(chosen, seeds, options)
+        return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
+
+    def step(self, actions: NDArray[np.int64]) -> Batch:
+        """One macro-action in every lane.
+
+        Raises:
+            InvalidValueError: As :meth:`send`; nothing has moved then.
+        """
+        self.send(actions)
+        return self._received(list(range(self.num_envs)))
+
+    def render(self) -> tuple[Any, ...] | None:
+        """An image of each lane, or None without a render mode."""
+        return None if self.render_mode is None else tuple(self.envs[0].rendered(self.envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free threads and OpenGL contexts."""
+        del kwargs
+        self._threads.shutdown()
+        for lane in self.envs:
+            lane.close()
+
+    # --- at its own pace -----------------------------------------------------------------------------------------
+
+    def send(self, actions: NDArray[np.int64] | Sequence[int], ids: Sequence[int] | None = None) -> None:
+        """Begin a macro-action in each of these lanes, or all; :meth:`recv` returns what became of it.
+
+        Args:
+            actions: One for each lane. Shape (n,).
+            ids: Different lanes, none of which is acting. Shape (n,).
+
+        Raises:
+            InvalidValueError: No such action or lane, a lane that acts already, or whose episode is over in the mode
+                without autoreset; nothing has moved then.
+        """
+        lanes = self._named(ids)
+        if len(actions) != len(lanes):
+            raise InvalidValueError(f"{len(actions)} actions are given for {len(lanes)} lanes; give one for each.")
+        for lane in lanes:
+            if lane in self._acting:
+                raise InvalidValueError(f"Lane {lane} is acting; receive it first.")
+            if self._seen[lane] is None or (self._over[lane] and self.autoreset_mode == AutoresetMode.DISABLED):
+                raise InvalidValueError(f"Lane {lane} has no episode to go on with; reset it first.")
+        given = actions.tolist() if isinstance(actions, np.ndarray) else actions
+        chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, given, strict=True)]
+        for lane, action in zip(lanes, chosen, strict=True):
+            motion = None if self._over[lane] else self.envs[lane].acting(action)
+            self._acting[lane] = acting = _Acting(motion=motion, due_s=self._clock_s)
+            if motion is not None:
+                acting.go_on(self._threads, self._timestep_s)
+
+    def recv(self, n: int | None = None) -> Batch:
+        """What became of the ``n`` lanes, or all, that end first.
+
+        First is first in simulated time, where lanes act side by side; it never depends on how fast anything runs.
+        ``info["env_id"]`` says which they are, as every array of shape (n, ...) in this order.
+
+        Raises:
+            InvalidValueError: Not so many lanes are acting.
+        """
+        n = len(self._acting) if n is None else n
+        if not 1 <= n <= len(self._acting):
+            raise InvalidValueError(f"{brief(n)} lanes cannot be received: {len(self._acting)} are acting.")
+        first = sorted(self._acting, key=lambda lane: self._acting[lane].due_s)[:n]
+        self._clock_s = max(self._acting[lane].due_s for lane in first)
+        batch = self._received(first)
+        infos = _rows(batch[-1], first)
+        infos["env_id"] = np.array(first)
+        return (*batch[:-1], infos)
+
+    # --- details -------------------------------------------------------------------------------------------------
+
+    @property
+    def _timestep_s(self) -> float:
+        return float(self.envs[0].model.opt.timestep)
+
+    def _received(self, lanes: list[int]) -> Batch:
+        """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
+        rewards, ends = np.zeros(len(lanes)), np.zeros((2, len(lanes)), dtype=np.bool_)
+        infos: dict[int, dict[str, Any]] = {}
+        for row, lane in enumerate(lanes):
+            acting = self._acting.pop(lane)
+            if acting.motion is not None:
+                rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting)
+        self._over[lanes], mode = ends.any(axis=0), self.autoreset_mode
+        diverged = [lane for lane in infos if not self.envs[lane].begun]
+        self._look([lane for lane in infos if lane not in diverged])
+        collected: dict[str, Any] = {}
+        again = [lane for lane in lanes if lane not in infos]
+        if mode == AutoresetMode.SAME_STEP:
+            again = [lane for lane in lanes if self._over[lane]]
+            final = {lane: {"final_obs": self._seen[lane], "final_info": infos[lane]} for lane in again}
+            collected = _columns(final, self.num_envs)
+        infos.update(self._restart(again, [None] * self.num_envs, {}))
+        collected.update(_columns(infos, self.num_envs))
+        if mode == AutoresetMode.SAME_STEP:
+            self._over[lanes] = False
+        return self._stacked(lanes), rewards, ends[0], ends[1], collected
+
+    def _conclude(self, lane: int, acting: _Acting) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Reward, terminated, truncated and info, when all has been simulated."""
+        self._elapsed[lane] += 1
+        try:
+            while acting.simulated is not None:
+                acting.simulated.result()
+                acting.go_on(self._threads, self._timestep_s)
+        except DivergedError as error:
+            return 0.0, False, True, self.envs[lane].diverged(error)
+        assert acting.step is not None
+        reward, terminated, info = acting.step
+        return reward, terminated, self._horizon is not None and self._elapsed[lane] >= self._horizon, info
+
+    def _restart(
+        self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any]
+    ) -> dict[int, dict[str, Any]]:
+        infos = {lane: self.envs[lane].restart(seed=seeds[lane], options=options) for lane in lanes}
+        self._elapsed[list(lanes)] = 0
+        self._over[list(lanes)] = False
+        self._look(lanes)
+        return infos
+
+    def _look(self, lanes: Sequence[int]) -> None:
+        """Observe lanes anew, all by the cameras of the first."""
+        if lanes:
+            seen = self.envs[0].observe([self.envs[lane] for lane in lanes])
+            for lane, observation in zip(lanes, seen, strict=True):
+                self._seen[lane] = observation
+
+    def _stacked(self, lanes: Sequence[int]) -> Any:
+        """The latest observations of these lanes, copied."""
+        out: Any = create_empty_array(self.single_observation_space, n=len(lanes))
+        return concatenate(self.single_observation_space, [self._seen[lane] for lane in lanes], out)
+
+    def _named(self, ids: Sequence[int] | None) -> list[int]:
+        given = np.arange(self.num_envs) if ids is None else np.asarray(ids)
+        known = given.ndim == 1 and len(given) and np.issubdtype(given.dtype, np.integer)
+        lanes: list[int] = given.tolist() if known else []
+        if not lanes or len(set(lanes)) < len(lanes) or not 0 <= min(lanes) <= max(lanes) < self.num_envs:
+            raise InvalidValueError(f"Lanes {brief(ids)}: give different integers from 0 to {self.num_envs - 1}.")
+        return lanes
+
+    def _masked(self, mask: Any) -> list[int]:
+        if mask is None:
+            return list(range(self.num_envs))
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            words = f"a bool array of shape ({self.num_envs},) in which one at least is True"
+            raise InvalidValueError(f"reset_mask is {brief(mask)}; give {words}.")
+        lanes: list[int] = np.flatnonzero(mask).tolist()
+        if any(self._seen[lane] is None for lane in np.flatnonzero(~mask)):
+            raise InvalidValueError("reset_mask leaves out lanes that were never reset; reset all lanes first.")
+        return lanes
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        if seed is None or isinstance(seed, (int, np.integer)):
+            return [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise InvalidValueError(f"{len(seed)} seeds are given for {self.num_envs} lanes; give one for each.")
+        return list(seed)
+
+
+def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
+    """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
+    lanes = list(infos)
+    columns: dict[str, Any] = {}
+    mask = np.zeros(n, dtype=np.bool_)
+    mask[lanes] = True
+    for key, example in next(iter(infos.values()), {}).items():
+        values = [info[key] for info in infos.values()]
+        if isinstance(example, dict):
+            columns[key] = _columns(dict(zip(lanes, values, strict=True)), n)
+        elif key != "final_obs" and isinstance(example, np.ndarray | np.number | float | int):
+            columns[key] = np.zeros((n, *np.shape(example)), dtype=np.asarray(example).dtype)
+            columns[key][lanes] = values
+        else:
+            columns[key] = np.full(n, None, dtype=object)
+            for lane, value in zip(lanes, values, strict=True):
+                columns[key][lane] = value
+        columns[f"_{key}"] = mask.copy()
+    return columns
+
+
+def _rows(infos: dict[str, Any], lanes: list[int]) -> dict[str, Any]:
+    """Those lanes of arrays over all lanes."""
+    return {key: _rows(value, lanes) if isinstance(value, dict) else value[lanes] for key, value in infos.items()}
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def make(
+    num_envs: int,
+    *,
+    env: str,
+    max_episode_steps: int | None = None,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+    threads: int | None = None,
+    **options: Any,
+) -> MacroVectorEnv:
+    """The vector environment of a task, for ``gymnasium.make_vec``.
+
+    Args:
+        num_envs: Lanes.
+        env: ``"module:attr"`` of the environment's constructor.
+        max_episode_steps: As :class:`MacroVectorEnv`.
+        autoreset_mode: As :class:`MacroVectorEnv`.
+        threads: As :class:`MacroVectorEnv`.
+        **options: Keyword arguments of the constructor, the same for all lanes.
+
+    Raises:
+        InvalidValueError: A number out of range, or a constructor of something else.
+    """
+    if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+        raise InvalidValueError(f"num_envs is {brief(num_envs)}; give an integer from 1 on.")
+    creator = load_env_creator(env)
+    lanes: list[Any] = [creator(**options) for _ in range(int(num_envs))]
+    for lane in lanes:
+        if not isinstance(lane, MacroEnv):
+            raise InvalidValueError(
+                f"{env} makes {brief(lane)}, which this suite cannot run in one process with others; "
+                "give gymnasium.make_vec the id of the single environment."
+            )
+    return MacroVectorEnv(lanes, max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, threads=threads)

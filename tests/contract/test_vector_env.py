@@ -1,0 +1,330 @@
+"""The vector environment: lanes are single environments to the bit, in every mode, whatever happens beside them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import textwrap
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
+from imagine_bench.tasks import rendering
+from worlds import WORLDS
+
+from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
+
+KINEMATIC = {"execution": "kinematic"}
+MODES = tuple(AutoresetMode)
+N_LANES = 3
+START = (0, 1, 2, 0)
+"""Of the arrow puzzle."""
+
+
+def make(task="arrow_puzzle", n=N_LANES, **options):
+    return gymnasium.make_vec(registry.vector_id(registry.TASKS[task].env_id), num_envs=n, **options)
+
+
+def make_sync(task, mode, n=N_LANES, **options):
+    options["vector_kwargs"] = {"autoreset_mode": mode}
+    return gymnasium.make_vec(registry.TASKS[task].env_id, num_envs=n, vectorization_mode="sync", **options)
+
+
+def assert_same(one, other, where=""):
+    """Nested dicts, tuples and arrays, equal to the bit and of the same types."""
+    if isinstance(one, dict):
+        assert set(one) == set(other), where
+        for key in one:
+            assert_same(one[key], other[key], f"{where}/{key}")
+        return
+    one, other = np.asarray(one), np.asarray(other)
+    assert (one.dtype, one.shape) == (other.dtype, other.shape), where
+    if one.dtype == object:
+        for each, its in zip(one, other, strict=True):
+            assert type(each) is type(its) and np.array_equal(each, its), where
+    else:
+        assert np.array_equal(one, other), where
+
+
+def walk_both(one, other, steps, n_actions, *, mask):
+    """Step two vector environments alike and compare what they return: how many episodes ended by rule and limit."""
+    for each in zip(one.reset(seed=3), other.reset(seed=3), strict=True):
+        assert_same(*each)
+    rng, ended = np.random.default_rng(0), np.zeros(2, dtype=int)
+    for step in range(steps):
+        actions = rng.integers(n_actions, size=one.num_envs)
+        its, own = one.step(actions), other.step(actions)
+        for each in zip(its, own, strict=True):
+            assert_same(*each, f"step {step}")
+        over = its[2] | its[3]
+        ended += its[2].sum(), (its[3] & ~its[2]).sum()
+        if mask and over.any():
+            for each in zip(*(env.reset(options={"reset_mask": over.copy()}) for env in (one, other)), strict=True):
+                assert_same(*each, f"reset after step {step}")
+    return ended
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("task", WORLDS)
+def test_lanes_step_as_sync_in_every_mode(task, mode):
+    """Through ends by rule and by the limit."""
+    options = {**KINEMATIC, "appearance": "strong", "max_episode_steps": 2}
+    sync, vector = make_sync(task, mode, **options), make(task, autoreset_mode=mode, **options)
+    ended = walk_both(sync, vector, 16, sync.single_action_space.n, mask=mode == AutoresetMode.DISABLED)
+    assert (ended > 0).all()
+    sync.close()
+    vector.close()
+
+
+@pytest.mark.parametrize(("task", "mode"), [(WORLDS[0], MODES[1]), (WORLDS[1], MODES[0])], ids=str)
+def test_lanes_of_different_length_step_as_sync_in_physics(task, mode):
+    sync, vector = make_sync(task, mode), make(task, autoreset_mode=mode)
+    assert walk_both(sync, vector, 5, sync.single_action_space.n, mask=False)[0] > 0
+    sync.close()
+    vector.close()
+
+
+def test_async_and_vector_agree():
+    options = {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}, **KINEMATIC}
+    name = registry.TASKS["arrow_puzzle"].env_id
+    apart = gymnasium.make_vec(name, num_envs=2, vectorization_mode="async", **options)
+    vector = make(n=2, **KINEMATIC)
+    try:
+        assert walk_both(apart, vector, 8, 6, mask=False)[0] > 0
+    finally:
+        apart.close()
+    vector.close()
+
+
+def test_observations_of_choice_are_batched():
+    options = {"observation": "frame,state,proprio", "size": 32, "autoreset_mode": AutoresetMode.NEXT_STEP}
+    vector = make(**KINEMATIC, **options)
+    mode = options.pop("autoreset_mode")
+    sync = make_sync("arrow_puzzle", mode, **KINEMATIC, **options)
+    walk_both(sync, vector, 4, 6, mask=False)
+    assert vector.observation_space.contains(vector.step(np.zeros(3, dtype=int))[0])
+    sync.close()
+    vector.close()
+
+
+def quiet_plan(rules, state, length, rng):
+    """Actions that end no episode."""
+    actions = []
+    for _ in range(length):
+        going = [action for action in range(rules.n_actions) if not rules.outcomes(state, action)[0].terminated]
+        actions.append(int(rng.choice(going)))
+        state = rules.outcomes(state, actions[-1])[0].macrostate
+    return actions
+
+
+def test_each_lane_goes_its_own_pace_as_if_alone():
+    rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(0)
+    plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
+    vector = make(autoreset_mode="Disabled")
+    seen = [[frame] for frame in vector.reset(seed=7, options={"macrostate": START})[0]]
+    ends, received = np.zeros(N_LANES), []
+    vector.send([plan[0] for plan in plans])
+    for n in (2, 2, 1, 2, 1, 1):
+        frames, *_, infos = vector.recv(n)
+        lanes = infos["env_id"].tolist()
+        assert infos["macrostate"].shape == (n, 4) and infos["_macrostate"].all()
+        ends[lanes] += infos["sim_time_s"]
+        received += ends[lanes].tolist()
+        for lane, frame in zip(lanes, frames, strict=True):
+            seen[lane].append(frame)
+        going = [lane for lane in lanes if len(seen[lane]) <= 3]
+        if going:
+            vector.send([plans[lane][len(seen[lane]) - 1] for lane in going], going)
+    assert len(set(received)) > N_LANES, "lengths differ"
+    for lane, plan in enumerate(plans):
+        alone = gymnasium.make("imagine_bench/ArrowPuzzle-v0")
+        expected = [alone.reset(seed=7 + lane, options={"macrostate": START})[0]]
+        assert_same(seen[lane], [*expected, *(alone.step(action)[0] for action in plan)])
+        alone.close()
+    vector.close()
+
+
+def test_the_first_in_simulated_time_is_received_first():
+    """Pick-and-place: reaching out in vain is short, picking is long."""
+    vector = make("pick_place")
+    vector.reset(seed=0, options={"macrostate": (0, 0, 0, 0)})
+    vector.send([0, 3, 1])
+    order = [vector.recv(1)[-1] for _ in range(3)]
+    times = [float(info["sim_time_s"][0]) for info in order]
+    assert times == sorted(times) and times[0] < times[2]
+    assert order[0]["env_id"].tolist() == [1]
+    vector.close()
+
+
+def test_how_many_threads_changes_no_bit():
+    walks = []
+    for threads in (1, 3):
+        vector = make(n=4, threads=threads, appearance="mild")
+        walks.append([vector.reset(seed=0)[0], *vector.step(np.arange(4))[:2], *vector.step(np.arange(4))[:2]])
+        vector.close()
+    for one, other in zip(*walks, strict=True):
+        assert_same(one, other)
+
+
+def test_a_lane_s_state_goes_on_in_a_single_environment():
+    vector, alone = make(), gymnasium.make("imagine_bench/ArrowPuzzle-v0").unwrapped
+    vector.reset(seed=1)
+    vector.step(np.array([0, 2, 4]))
+    alone.reset(seed=0)
+    alone.set_state(vector.envs[1].get_state())
+    frame, reward, *_ = alone.step(3)
+    frames, rewards, _, _, infos = vector.step(np.array([1, 3, 5]))
+    its = infos["final_obs"][1] if infos.get("_final_obs", np.zeros(3, bool))[1] else frames[1]
+    assert np.array_equal(its, frame) and rewards[1] == reward
+    vector.envs[2].set_state(alone.get_state())
+    assert vector.envs[2].get_state().macrostate == alone.get_state().macrostate
+    alone.close()
+    vector.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_lane_that_blows_up_is_its_own_fault(mode, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+    sync, vector = make_sync("arrow_puzzle", mode), make(autoreset_mode=mode)
+    for env in (sync, vector):
+        before, _ = env.reset(seed=0, options={"macrostate": START})
+    (action,) = quiet_plan(registry.task("arrow_puzzle").rules, START, 1, np.random.default_rng(0))
+    healthy = sync.step(np.full(3, action))
+    vector.envs[1].world.data.joint("cube_2_joint").qpos[0] = 1e11
+    frames, rewards, terminated, truncated, infos = vector.step(np.full(3, action))
+    assert truncated.tolist() == [False, True, False] and not terminated[1] and rewards[1] == 0.0
+    last, seen = (infos["final_info"], infos["final_obs"][1]) if mode == AutoresetMode.SAME_STEP else (infos, frames[1])
+    assert "diverged" in last["fault_reason"][1] and last["macrostate"][1].tolist() == list(START)
+    assert np.array_equal(seen, before[1])
+    for lane in (0, 2):
+        assert np.array_equal(frames[lane], healthy[0][lane]) and rewards[lane] == healthy[1][lane]
+    if mode == AutoresetMode.DISABLED:
+        with pytest.raises(InvalidValueError, match="Lane 1 has no episode to go on with; reset it first"):
+            vector.step(np.zeros(3, dtype=int))
+        vector.reset(options={"reset_mask": truncated})
+    *_, infos = vector.step(np.full(3, action))
+    assert not infos["fault"][1]
+    sync.close()
+    vector.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n": 0}, "num_envs is 0; give an integer from 1 on"),
+        ({"threads": 0}, "threads is 0; give an integer from 1 on"),
+        ({"autoreset_mode": "same_step"}, r"No autoreset mode 'same_step'\. Did you mean 'SameStep'\?"),
+        ({"render_mode": "human"}, r"No render mode 'human'\..* Known: rgb_array"),
+        ({"execution": "kinematik"}, "Did you mean 'kinematic'"),
+    ],
+    ids=str,
+)
+def test_wrong_options_name_what_is_allowed(options, message):
+    with pytest.raises(ImagineBenchError, match=message):
+        make(**{**KINEMATIC, **options})
+
+
+def test_what_cannot_be_done_moves_nothing():
+    vector = make(**KINEMATIC)
+    with pytest.raises(InvalidValueError, match="Lane 0 has no episode to go on with; reset it first"):
+        vector.step(np.zeros(3, dtype=int))
+    with pytest.raises(InvalidValueError, match="leaves out lanes that were never reset"):
+        vector.reset(options={"reset_mask": np.array([True, False, False])})
+    vector.reset(seed=0)
+    before = [lane.get_state().world.physics for lane in vector.envs]
+    for call, message in (
+        (lambda: vector.step(np.array([0, 1, 6])), "Action 6 does not exist; give an integer from 0 to 5"),
+        (lambda: vector.step(np.array([0, 1])), "2 actions are given for 3 lanes"),
+        (lambda: vector.send([0, 0], [1, 1]), "give different integers from 0 to 2"),
+        (lambda: vector.send([0], [3]), r"Lanes \[3\]: give different integers from 0 to 2"),
+        (lambda: vector.send([], []), "give different integers"),
+        (vector.recv, "0 lanes cannot be received: 0 are acting"),
+        (lambda: vector.reset(seed=[1, 2]), "2 seeds are given for 3 lanes"),
+        (lambda: vector.reset(options={"reset_mask": np.zeros(3, bool)}), "in which one at least is True"),
+        (lambda: vector.reset(options={"reset_mask": np.ones(3)}), r"give a bool array of shape \(3,\)"),
+    ):
+        with pytest.raises(InvalidValueError, match=message):
+            call()
+    assert_same([lane.get_state().world.physics for lane in vector.envs], before)
+    vector.send([0], [1])
+    with pytest.raises(InvalidValueError, match="Lane 1 is acting; receive it first"):
+        vector.step(np.zeros(3, dtype=int))
+    with pytest.raises(InvalidValueError, match="2 lanes cannot be received: 1 are acting"):
+        vector.recv(2)
+    vector.close()
+
+
+def test_a_reset_forgets_what_a_lane_was_doing():
+    vector = make(n=2)
+    first, _ = vector.reset(seed=4)
+    vector.send([0, 2])
+    again, _ = vector.reset(seed=4)
+    assert np.array_equal(first, again)
+    frames, *_ = vector.step(np.array([0, 2]))
+    assert not np.shares_memory(frames, again)
+    vector.close()
+
+
+def test_gymnasium_s_vector_wrappers_see_the_same_episodes():
+    ended = []
+    for env in (make_sync("arrow_puzzle", AutoresetMode.SAME_STEP, **KINEMATIC), make(**KINEMATIC)):
+        wrapped = DictInfoToList(RecordEpisodeStatistics(NormalizeReward(env)))
+        wrapped.reset(seed=0)
+        rng, episodes = np.random.default_rng(0), []
+        for _ in range(20):
+            *_, infos = wrapped.step(rng.integers(6, size=3))
+            episodes += [(info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info]
+        ended.append(episodes)
+        wrapped.close()
+    assert ended[0] == ended[1] and len(ended[0]) > 5
+
+
+def test_every_task_has_a_vector_id_and_keeps_its_default():
+    for entry in registry.TASKS.values():
+        spec = gymnasium.spec(registry.vector_id(entry.env_id))
+        assert spec.vector_entry_point and spec.entry_point is None and spec.max_episode_steps == entry.horizon
+        assert gymnasium.spec(entry.env_id).vector_entry_point is None
+    usual = gymnasium.make_vec("imagine_bench/ArrowPuzzle-v0", num_envs=1, **KINEMATIC)
+    assert isinstance(usual, SyncVectorEnv)
+    usual.close()
+
+
+def test_lanes_are_drawn_in_one_context_which_is_freed():
+    before = len(rendering._open)
+    vector = make(n=4, **KINEMATIC, render_mode="rgb_array", width=48, height=32)
+    vector.reset(seed=0)
+    vector.step(np.zeros(4, dtype=int))
+    assert len(rendering._open) == before + 1
+    images = vector.render()
+    assert [image.shape for image in images] == [(32, 48, 3)] * 4
+    assert len(rendering._open) == before + 2
+    vector.close()
+    assert len(rendering._open) == before
+    assert make(**KINEMATIC).render() is None
+
+
+def test_an_environment_of_another_kind_is_refused():
+    from imagine_bench.tasks.vector_env import make as make_lanes
+
+    with pytest.raises(InvalidValueError, match=r"give gymnasium\.make_vec the id of the single environment"):
+        make_lanes(2, env="gymnasium.envs.classic_control.cartpole:CartPoleEnv")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_sixty_four_lanes_fit_into_little_memory():
+    script = """
+        import gymnasium, imagine_bench, numpy as np
+        vector = gymnasium.make_vec("imagine_bench/ArrowPuzzle-vector-v0", num_envs=64)
+        vector.reset(seed=0)
+        for action in range(3):
+            vector.step(np.full(64, action))
+        print(next(int(line.split()[1]) / 1024 for line in open("/proc/self/status") if line.startswith("VmHWM")))
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 1300
