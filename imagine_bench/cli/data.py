@@ -12,6 +12,7 @@ from imagine_bench import registry
 from imagine_bench.cli.options import shown
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.store.files import require_writable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,7 @@ class Dataset:
         policy = policy_of(self.policy, spec, self.seed, self.encoder)
         folder = self.out or Path("datasets") / f"{self.task}-{policy.name}"
         require_new(folder)
+        require_writable(folder.parent)
         episodes, files, card = collect(
             spec, policy, episodes=self.episodes, seed=self.seed, execution=self.execution, appearance=self.appearance,
             motion_hz=self.motion_hz,

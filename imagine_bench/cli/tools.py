@@ -87,6 +87,31 @@ class Film:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Play:
+    """Solve a task by keyboard; says at the end how often, beside chance and optimum."""
+
+    task: Annotated[str | None, tyro.conf.Positional, shown("STR", "(default: the model's)")] = None
+    """Task to play."""
+    model: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    """A run's folder, whose agent imagines the same keys beside the real scene."""
+    execution: Annotated[str | None, shown("STR", "(default: the model's, else physics)")] = None
+    """physics or kinematic."""
+    appearance: Annotated[str | None, shown("STR", "(default: the model's, else clean)")] = None
+    """Appearance level."""
+    encoder: Annotated[str | None, shown("STR", "(default: the bundled one)")] = None
+    """Name or file of the encoder that the model used."""
+    seed: int = 0
+    """Chooses the episodes."""
+
+    def __call__(self) -> None:
+        """Play."""
+        from imagine_bench.tools.play import play  # noqa: PLC0415 - an extra
+
+        print(play(self.task, model=self.model, seed=self.seed, execution=self.execution,
+                   appearance=self.appearance, encoder=self.encoder))  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
 class Speed:
     """Measure every speed and fidelity figure that has a target, beside the target."""
 

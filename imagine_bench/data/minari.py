@@ -34,7 +34,8 @@ _ROOT = "MINARI_DATASETS_PATH"
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     """Write the dataset ``<task>-<policy>-v0``; the card says which environment it is of."""
     name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
-    with _root(folder), warnings.catch_warnings(), closing(_environment(card)) as env:
+    env_id, made = registry.task_entry(card["task"]).env_id, {name: card[name] for name in ("execution", "appearance")}
+    with _below(folder), warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
         warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
         minari.create_dataset_from_buffers(
             f"{name}-v0", [_buffer(episodes, index) for index in range(len(episodes))], env=env,
@@ -43,14 +44,8 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
         )  # fmt: skip
 
 
-def _environment(card: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
-    return gymnasium.make(
-        registry.task_entry(card["task"]).env_id, execution=card["execution"], appearance=card["appearance"]
-    )
-
-
 @contextmanager
-def _root(folder: Path) -> Iterator[None]:
+def _below(folder: Path) -> Iterator[None]:
     """Have Minari write below a folder."""
     before = dict(os.environ)
     os.environ[_ROOT] = str(folder)

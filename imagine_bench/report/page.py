@@ -37,6 +37,7 @@ def write_report(result: BenchResult) -> Path:
     page = Page(
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
+        f"{f'trained first on dataset {protocol.dataset} · ' if protocol.dataset else ''}"
         f"protocol {result.protocol_hash}",
         question=text.question(data),
         answers=text.answers(data),
@@ -107,6 +108,7 @@ def summary_table(result: BenchResult) -> str:
         f"{data.spec.title}: test episodes solved, % [{_interval_words(data)}]; preset {protocol.preset}, "
         f"{protocol.execution}, {protocol.looks}, {len(protocol.seeds)} seed(s) x "
         f"{protocol.evaluation_episodes} test episodes"
+        f"{f'; trained first on dataset {protocol.dataset}' if protocol.dataset else ''}"
     )
     return "\n".join([title, "", *aligned(rows), "", *text.answers(data)])
 

@@ -20,6 +20,7 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.report import summary_table, write_report
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.results import RunResult
 
@@ -171,4 +172,7 @@ def test_a_bench_of_a_dataset_stands_beside_the_fixed_agents(tmp_path: Path) -> 
     assert {run.agent: run.checkpoints[-1].env_steps for run in result.runs} == {
         "random": 0, "oracle": 0, "table": len(collected()[0].actions),
     }  # fmt: skip
+    page = write_report(result).read_text()
+    assert f"trained first on dataset {wanted.dataset}" in page
+    assert f"trained first on dataset {wanted.dataset}" in summary_table(result)
     assert wanted.dataset == f"mixed-6@{collected()[0].hash[:12]}"

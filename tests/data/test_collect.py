@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bench_fakes import TableAgent
 from small_datasets import collected, written
-from small_runs import do
+from small_runs import Inline, do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -18,6 +18,7 @@ from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import episode_seed
+from imagine_bench.tools import standard_data
 
 TASK = registry.task("arrow_puzzle")
 
@@ -127,6 +128,18 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
     )
 
 
+def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(standard_data, "MEDIUM", {"arrow_puzzle": 3})
+    monkeypatch.setattr(standard_data, "launcher", lambda *_: Inline())
+    folders = list(standard_data.standard_sets(tmp_path, "npz", 4))
+    assert [folder.name for folder in folders] == [f"arrow_puzzle-{name}" for name in ("random", "medium", "optimal")]
+    cards = [read_dataset(folder).card or {} for folder in folders]
+    assert [card["policy"] for card in cards] == ["random", "dqn", "oracle"]
+    assert cards[1]["played"] == "greedy after 3 episodes of seed 1000" and cards[2]["successes"] == 4
+    monkeypatch.setattr(standard_data, "collect", None)
+    assert list(standard_data.standard_sets(tmp_path, "npz", 4)) == folders
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -149,7 +162,8 @@ def test_a_wrong_command_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     assert main(["dataset", *words]) == 2
     said = capsys.readouterr().err
-    assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+    assert sentence in said and said.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_file_where_a_folder_should_be_is_refused(tmp_path: Path) -> None:

@@ -6,7 +6,10 @@ import dataclasses
 import hashlib
 import io
 import json
+import re
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import gymnasium
@@ -15,6 +18,7 @@ import numpy as np
 import PIL.Image
 import pyarrow.parquet as pq
 import pytest
+import rerun
 from small_datasets import FORMATS, collected, written
 
 from imagine_bench import registry
@@ -172,6 +176,28 @@ def test_large_sets_lie_in_several_files(tmp_path: Path, monkeypatch: pytest.Mon
         there = pq.read_table(tmp_path / f"set/data/chunk-{chunk:03d}/file-{file:03d}.parquet")
         assert row["episode_index"] in there["episode_index"].to_pylist()
     assert same(read_dataset(tmp_path / "set").episodes, collected()[0])
+
+
+def test_rerun_opens_the_layout(tmp_path: Path) -> None:
+    """Its own reader of LeRobot datasets finds every image, action and reward."""
+    written(tmp_path / "set", "lerobot")
+    path, recording, size = tmp_path / "set.rrd", rerun.RecordingStream("set"), -1
+    recording.save(path)
+    recording.log_file_from_path(tmp_path / "set")
+    for _ in range(100):  # it reads in a thread of its own
+        recording.flush()
+        if size == (size := path.stat().st_size) and size > 20_000:
+            break
+        time.sleep(0.1)
+    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for entity, component in (
+        ("observation.image", "EncodedImage:blob"),
+        ("action", "Scalars"),
+        ("next.reward", "Scalars"),
+    ):
+        rows = re.findall(rf"with (\d+) rows .* - /{re.escape(entity)} - .*{component}", said)
+        assert sum(map(int, rows)) == len(collected()[0].actions), entity
 
 
 # --- the extra -------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from worlds import WORLDS
+from worlds import WORLDS, draw_quickly
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -17,6 +17,11 @@ from imagine_bench.interfaces import EXECUTIONS
 
 KINEMATIC = {"execution": "kinematic"}
 ALL = "frame,human,state,proprio"
+
+
+@pytest.fixture(autouse=True)
+def without_shadows(monkeypatch):
+    draw_quickly(monkeypatch)
 
 
 def make(task="arrow_puzzle", **options):

@@ -1,0 +1,194 @@
+"""``imagine-bench play``: a task by keyboard, and beside it what a learned world model imagines of the same keys."""
+
+from __future__ import annotations
+
+import string
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from imagine_bench import registry
+from imagine_bench.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.statistics import wilson
+from imagine_bench.store.trained import load_trained
+
+KEYS = "123456789" + string.ascii_lowercase
+"""Of the macro-actions, in their order."""
+_FPS, _HOLD = 25, 50
+"""Images a second, and those for which the end of an episode stands still."""
+_WIDTH, _HEIGHT, _PANEL, _FRAME, _TOP = 640, 480, 284, 192, 36
+"""Pixels: the scene, the width of a panel beside it, the edge of a frame in that, and where it begins."""
+
+
+class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A task, made with ``render_mode="rgb_array"``, for ``gymnasium.utils.play``: a step is one image of a window.
+
+    Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
+    change nothing; the last one returns its result.
+
+    Args:
+        env: The task's environment.
+        task: What it is.
+        imaginer: Whose imagination is shown: of each episode it sees the first frame, then keys alone.
+        seed: Of the first episode, and of what the imagination draws.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.Discrete(task.n_actions + 1)
+        self._task, self._imaginer, self._seed = task, imaginer, seed
+        self._reset_seed: int | None = seed
+        self._scene = cast(Any, env.unwrapped)
+        self._scene.capture_motion_hz = float(_FPS)
+        self.episodes = self.solved = self.foreseen = self.imagined = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; only the first one is seeded, or all would begin alike."""
+        self._frame, self._info = self.env.reset(seed=self._reset_seed, options=options)
+        self._reset_seed, self._start, self._actions = None, self._frame, list[int]()
+        self._rollout: ImaginedRollout | None = None
+        self._due: tuple[Any, Any, bool, bool, dict[str, Any]] | None = None
+        self._said, self._released = "press a key", False
+        self._images, self._image = iter(list[Frame]()), self._window()
+        return self._frame, self._info
+
+    def step(self, action: int) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Show one more image, else return what came of a macro-action, else wait or carry one out."""
+        waits = action == self._task.n_actions
+        self._released |= waits
+        image, due = next(self._images, None), self._due
+        if image is not None:
+            self._image = image
+        elif due is not None:
+            self._due = None
+            return due
+        elif self._released and not waits:
+            self._released = False
+            self._act(int(action))
+        return self._frame, 0.0, False, False, self._info
+
+    def render(self) -> Frame:
+        """The window as it is now. Shape (H, W, 3)."""
+        return self._image
+
+    def summary(self) -> str:
+        """How often the person solved the task, beside chance and optimum, and how often the model foresaw it."""
+        facts, said = self._task.facts(), "No episode was finished"
+        if self.episodes:
+            low, high = wilson(self.solved, self.episodes)
+            share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
+            said = f"Solved {self.solved} of {self.episodes} episodes ({share})"
+        said += f"; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}."
+        foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates."
+        return said + (foreseen if self.imagined else "")
+
+    def _act(self, action: int) -> None:
+        self._said = self._task.action_names[action]
+        if self._imaginer is not None:  # the same draws each time, so that what was imagined before stays as it was
+            self._actions.append(action)
+            actions, rng = np.array(self._actions), np.random.default_rng(self._seed)
+            self._rollout = self._imaginer.imagine(self._start, actions=actions, depth=len(actions), rng=rng)
+        self._due = self.env.step(action)
+        self._images = self._showing(*self._due)
+
+    def _showing(self, frame: Frame, reward: Any, terminated: bool, truncated: bool, info: Any) -> Iterator[Frame]:
+        """Images of a macro-action, each drawn when it is due, and of what came of it."""
+        for _ in getattr(self._scene, "replay", tuple)():
+            yield self._window()
+        self._frame, self._info = frame, info
+        self.episodes += terminated or truncated
+        self.solved += bool(info["success"])
+        if self._rollout is not None:
+            self.imagined += 1
+            self.foreseen += bool(np.array_equal(self._rollout.macrostates[-1], info["macrostate"]))
+        end = "solved" if info["success"] else "an illegal end" if terminated else "out of time" if truncated else ""
+        self._said += f"\nreward {reward:+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
+        yield from [self._window()] * (_HOLD if end else 1)
+
+    def _window(self) -> Frame:
+        """The scene, the agent's frame, what is imagined of it, and words."""
+        named = zip(KEYS, self._task.action_names, strict=False)
+        keys = "\n".join(f"{key}  {name}" for key, name in named)
+        said = f"{self._said}\n\nsolved {self.solved} of {self.episodes}\n\n{keys}"
+        panels = [("what the agent sees", self._frame, said)]
+        if self._imaginer is not None:
+            panels.append(("what the model imagines", *self._imagination()))
+        canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT), "white")
+        canvas.paste(Image.fromarray(np.asarray(self.env.render())).resize((_WIDTH, _HEIGHT)), (0, 0))
+        draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(14)
+        for column, (title, image, words) in enumerate(panels):
+            left = _WIDTH + 8 + column * _PANEL
+            draw.text((left, _TOP // 3), title, "black", font)
+            canvas.paste(Image.fromarray(image).resize((_FRAME, _FRAME), Image.Resampling.NEAREST), (left, _TOP))
+            draw.multiline_text((left, _TOP + _FRAME + 8), words, "black", font)
+        return np.array(canvas)
+
+    def _imagination(self) -> tuple[Frame, str]:
+        """The latest imagined image, and in words what the model predicts and how sure it is."""
+        rollout = self._rollout
+        if rollout is None:
+            return np.full_like(self._start, 200), "nothing yet"
+        image = np.rint(255 * np.clip(rollout.frames[-1], 0.0, 1.0)).astype(np.uint8)
+        kept = "would be learned from" if rollout.accepted[-1] else "would be filtered out"
+        return np.broadcast_to(image if image.ndim == 3 else image[..., None], (*image.shape[:2], 3)), (
+            f"reward {rollout.rewards[-1]:+.1f}, end {rollout.p_terminated[-1]:.0%}\n\nuncertainty\n"
+            f"    epistemic {rollout.epistemic[-1]:.3g}\n    aleatoric {rollout.aleatoric[-1]:.3g}\n"
+            f"    modal {rollout.modal[-1]:.3g}\n{kept}\n\nforeseen {self.foreseen} of {self.imagined}"
+        )
+
+
+def play(
+    task: str | None, *, model: Path | None = None, seed: int = 0, execution: str | None = None,
+    appearance: str | None = None, encoder: str | None = None,
+) -> str:  # fmt: skip
+    """Open a window in which a person plays until it is closed.
+
+    Args:
+        task: Registered task; None takes the model's.
+        model: A run's folder, ``runs/<task>/<bench>/<agent>/seed_<n>``, whose agent imagines beside the person.
+        seed: Of the first episode.
+        execution: None takes the model's, else ``"physics"``.
+        appearance: None takes the model's, else ``"clean"``.
+        encoder: As of :func:`imagine_bench.store.trained.load_trained`.
+
+    Returns:
+        The person's success rate beside chance and optimum.
+
+    Raises:
+        UnknownNameError: No such task, execution or appearance.
+        InvalidValueError: Neither task nor model, a model of another task, or one that does not imagine.
+        ArtefactError: As of ``load_trained``.
+        SetupError: There is no pygame, or no desktop.
+    """
+    chosen: dict[str, Any] = {"execution": "physics", "appearance": "clean"}
+    imaginer = None
+    if model is not None:
+        trained = load_trained(model, encoder=encoder)
+        if task not in (None, trained.task.id):
+            raise InvalidValueError(f"{model} was trained on {trained.task.id!r}, not on {task!r}; leave the task out.")
+        task, imaginer, protocol = trained.task.id, trained.imaginer, trained.spec.protocol
+        chosen = {"execution": protocol.execution, "appearance": protocol.appearance}
+    if task is None:
+        raise InvalidValueError("There is nothing to play; give a task or --model.")
+    spec = registry.task(task)
+    chosen |= {name: value for name, value in (("execution", execution), ("appearance", appearance)) if value}
+    registry.load("imagine_bench.tasks.window:open_display")(seen=True)
+    with warnings.catch_warnings():  # it wants matplotlib to open windows, too
+        warnings.simplefilter("ignore")
+        from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
+    if "matplotlib" in sys.modules:
+        sys.modules["matplotlib"].use("agg")
+    env = gymnasium.make(spec.env_id, render_mode="rgb_array", disable_env_checker=True, **chosen)
+    keys = dict(zip(KEYS, range(spec.n_actions), strict=False))
+    with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
+        keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
+    return game.summary()

@@ -1,0 +1,227 @@
+"""A person plays: scripted keys under SDL's dummy driver, in the task and beside a model that imagines."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from fake_agents import FakeAgent, FakeImaginer
+from worlds import draw_quickly
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.tools import play as module
+from imagine_bench.tools.play import KEYS, KeyboardGame, play
+
+pygame = pytest.importorskip("pygame")  # of the extra play
+WAIT = 6
+START = (1, 2, 0, 1)
+
+
+@pytest.fixture(autouse=True)
+def without_shadows(monkeypatch):
+    draw_quickly(monkeypatch)
+
+
+def game_of(imaginer=None, seed=0, **options):
+    env = gymnasium.make(
+        "imagine_bench/ArrowPuzzle-v0",
+        render_mode="rgb_array",
+        disable_env_checker=True,
+        width=64,
+        height=48,
+        **options,
+    )
+    return KeyboardGame(env, registry.task("arrow_puzzle"), imaginer, seed)
+
+
+def until_done(game, action):
+    """Press and let go; everything that steps return until the macro-action's result, and the images shown."""
+    assert game.step(WAIT)[1:4] == (0.0, False, False)
+    seen, images = [game.step(action)], []
+    while seen[-1][1] == 0.0:
+        images.append(game.render())
+        seen.append(game.step(WAIT))
+    return seen, images
+
+
+def test_keys_do_what_the_environment_does():
+    game, plain = game_of(), game_of().env
+    frame, _ = game.reset(seed=99)  # play gives its seed again and again
+    np.testing.assert_array_equal(frame, plain.reset(seed=0)[0])
+    plain.unwrapped.capture_motion_hz = game.unwrapped.capture_motion_hz = 5
+    for action in (0, 3):
+        seen, images = until_done(game, action)
+        result, expected = seen[-1], plain.step(action)
+        np.testing.assert_equal(result, expected)
+        assert all(each[1:4] == (0.0, False, False) for each in seen[:-1])
+        assert len(images) == pytest.approx(5 * expected[4]["sim_time_s"], abs=3 + 50 * expected[2])
+        assert len({image.tobytes() for image in images}) > 5
+        if expected[2]:
+            break
+    game.close()
+    plain.close()
+
+
+def test_a_key_that_stays_down_acts_once():
+    game = game_of(execution="kinematic")
+    game.reset()
+    before = game.unwrapped.get_state().macrostate
+    for _ in range(10):
+        game.step(0)  # held since before the episode
+    assert game.unwrapped.get_state().macrostate == before
+    game.step(WAIT)
+    moved = []
+    for _ in range(10):
+        game.step(2)
+        moved.append(game.unwrapped.get_state().macrostate)
+    assert len(set(moved)) == 1 and moved[0] != before
+    game.step(WAIT)
+    game.step(2)
+    assert game.unwrapped.get_state().macrostate not in (before, moved[0])
+    game.close()
+
+
+def test_success_is_counted_beside_chance_and_optimum():
+    game, spec = game_of(execution="kinematic"), registry.task("arrow_puzzle")
+    starts = []
+    assert game.summary() == "No episode was finished; chance 4.6%, optimum 100.0%."
+    for solve in (True, False, True):
+        _, info = game.reset()
+        starts.append(tuple(info["macrostate"].tolist()))
+        terminated = False
+        while not terminated:
+            macrostate = tuple(info["macrostate"].tolist())
+            wanted = spec.rules.optimal_action(macrostate)
+            bad = [a for a in range(6) if (end := spec.rules.outcomes(macrostate, a)[0]).terminated and not end.success]
+            seen, images = until_done(game, wanted if solve or not bad else bad[0])
+            *_, terminated, _, info = seen[-1]
+        assert len(images) > 50  # the end stands still
+        assert info["success"] == (solve or not bad)
+    assert len(set(starts)) > 1
+    assert game.summary().startswith("Solved 2 of 3 episodes (66.7%, 95 % interval 20.8% to 93.9%); chance 4.6%")
+    game.close()
+
+
+def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
+    asked = []
+
+    class Imaginer(FakeImaginer):
+        def imagine(self, frame, *, actions, depth, rng):
+            asked.append((frame, actions.tolist(), depth, rng.random()))
+            rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+            right = registry.task("arrow_puzzle").rules.outcomes(START, 4)[0].macrostate
+            return dataclasses.replace(rollout, macrostates=np.array([right] * depth))  # of the first, not the second
+
+    monkeypatch.setattr(module, "_HOLD", 1)
+    game = game_of(Imaginer(), execution="kinematic")
+    blank = game.reset(options={"macrostate": START}) and game.render()
+    frame = game._start
+    for action in (4, 4):
+        seen, _ = until_done(game, action)
+    assert [each[1:3] for each in asked] == [([4], 1), ([4, 4], 2)]
+    assert all(np.array_equal(each[0], frame) for each in asked)
+    assert asked[0][3] == asked[1][3]  # the same draws: the imagined past stays
+    image, words = game._imagination()
+    gray = frame.mean(axis=2)
+    np.testing.assert_allclose(image[..., 0], 0.9 * gray, atol=1)
+    for said in (
+        "reward -1.0, end 10%",
+        "epistemic 0.1\n",
+        "aleatoric 0.05\n",
+        "modal 0.01\n",
+        "would be learned from",
+    ):
+        assert said in words
+    left = game.render()[:, :-284]
+    right, empty = game.render()[:, -284:], blank[:, -284:]
+    assert not np.array_equal(right, empty)
+    shown = right[36 : 36 + 192 : 3, 8 : 8 + 192 : 3]
+    np.testing.assert_array_equal(shown, image)
+    np.testing.assert_array_equal(left[36 : 36 + 192 : 3, -276 : -276 + 192 : 3], seen[-1][0])
+    assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
+    game.close()
+
+
+@pytest.fixture
+def keyboard(monkeypatch):
+    """Keys pressed one after another, each held for three images, then the window is closed; what it showed last."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr(module, "_HOLD", 1)
+    importlib.import_module("matplotlib.pyplot").switch_backend("svg")
+    last = {}
+
+    def press(keys):
+        flip, script = pygame.display.flip, []
+        for key in keys:
+            script += [None, (pygame.KEYDOWN, key), None, None, (pygame.KEYUP, key), *[None] * 6]
+        script.append((pygame.QUIT, None))
+        events = iter(script)
+
+        def flipped():
+            flip()
+            if (event := next(events, None)) is not None:
+                kind, key = event
+                last["image"] = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+                pygame.event.post(pygame.event.Event(kind, {"key": ord(key)} if key else {}))
+
+        monkeypatch.setattr(pygame.display, "flip", flipped)
+        monkeypatch.setattr(pygame.time, "Clock", lambda: SimpleNamespace(tick=lambda fps: None))
+        return last
+
+    yield press
+    pygame.quit()
+
+
+def test_keyboard_events_play_the_task(keyboard, capsys):
+    rules = registry.task("arrow_puzzle").rules
+    twin = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    twin.reset(seed=5)  # the window's first episode ...
+    _, info = twin.reset()  # ... is the second: play begins twice
+    macrostate, keys = tuple(info["macrostate"].tolist()), ""
+    while not rules.is_terminal(macrostate):
+        action = rules.optimal_action(macrostate)
+        keys, macrostate = keys + KEYS[action], rules.outcomes(macrostate, action)[0].macrostate
+    last = keyboard(keys)
+    assert main(["play", "arrow_puzzle", "--execution", "kinematic", "--seed", "5"]) == 0
+    assert "Solved 1 of 1 episodes (100.0%" in capsys.readouterr().out
+    assert last["image"].shape == (480, 640 + 284, 3)
+    assert sys.modules["matplotlib"].get_backend().lower() == "agg"
+    twin.close()
+
+
+def trained(agent, task="arrow_puzzle"):
+    protocol = SimpleNamespace(execution="kinematic", appearance="mild")
+    spec = registry.task(task)
+    return lambda folder, encoder: SimpleNamespace(
+        task=spec, imaginer=agent, spec=SimpleNamespace(protocol=protocol), folder=folder, encoder=encoder
+    )
+
+
+def test_a_model_brings_its_task_and_its_looks(keyboard, monkeypatch, tmp_path):
+    made, make = [], gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", lambda *args, **options: made.append(options) or make(*args, **options))
+    monkeypatch.setattr(module, "load_trained", trained(FakeImaginer()))
+    last = keyboard("1")
+    assert "The model foresaw 0 of 1 macrostates." in play(None, model=tmp_path)
+    assert last["image"].shape == (480, 640 + 2 * 284, 3)
+    assert (made[0]["execution"], made[0]["appearance"]) == ("kinematic", "mild")
+
+
+def test_what_cannot_be_played_is_refused(monkeypatch, tmp_path):
+    with pytest.raises(InvalidValueError, match=r"There is nothing to play; give a task or --model\."):
+        play(None)
+    monkeypatch.setattr(module, "load_trained", trained(FakeAgent()))
+    with pytest.raises(
+        InvalidValueError, match="was trained on 'arrow_puzzle', not on 'pick_place'; leave the task out"
+    ):
+        play("pick_place", model=tmp_path)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(SetupError, match=r"imagine-bench\[play\]"):
+        play("arrow_puzzle")
