@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple
@@ -13,7 +14,15 @@ from typing import Any, NamedTuple
 import gymnasium
 
 from imagine_bench.entrants import entrant
-from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, brief, plain, require_known
+from imagine_bench.errors import (
+    ImagineBenchError,
+    InvalidValueError,
+    SetupError,
+    UnknownNameError,
+    brief,
+    plain,
+    require_known,
+)
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
@@ -410,7 +419,23 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], gro
         UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    return load(agent_entry(agent).settings).resolve(hyperparameters, own_settings(agent, overrides), group)
+    entry, own = agent_entry(agent), entrant(agent).agent in AGENTS
+    with _guests_faults(f"Agent {agent} (settings {entry.settings})", own=own):
+        return load(entry.settings).resolve(hyperparameters, own_settings(agent, overrides), group)
+
+
+@contextmanager
+def _guests_faults(what: str, *, own: bool) -> Iterator[None]:
+    """Whatever code of another package does wrong is one sentence; of this suite's own a traceback says more."""
+    try:
+        yield
+    except ImagineBenchError:
+        raise
+    except Exception as error:
+        if own:
+            raise
+        why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
+        raise SetupError(f"{what} cannot be used ({why}); mend or uninstall its package.") from error
 
 
 def task(name: str) -> TaskSpec:
@@ -421,8 +446,11 @@ def task(name: str) -> TaskSpec:
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
-    loaded = load(entry.spec)
-    spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
+    with _guests_faults(f"Task {name} ({entry.spec})", own=name in TASKS):
+        loaded = load(entry.spec)
+        spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
+        if not isinstance(spec, TaskSpec):
+            raise TypeError(f"it is {brief(spec)} and no TaskSpec")
     counts = tuple(1 + max(values) for values in zip(*spec.rules.states, strict=True))
     for what, ours, theirs in (
         ("id", name, spec.id),
@@ -441,8 +469,11 @@ def task(name: str) -> TaskSpec:
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:
-    """A new agent by its registered name."""
-    return load(agent_entry(name).make)(context)
+    """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
+    entry, own = agent_entry(name), entrant(name).agent in AGENTS
+    with _guests_faults(f"Agent {name} ({entry.make})", own=own):
+        agent: Agent = load(entry.make)(context)
+    return agent
 
 
 def regression(name: str) -> RegressionSpec:

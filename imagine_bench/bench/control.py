@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.queries import require_able
+from imagine_bench.bench.run_state import make_env
 from imagine_bench.data.folder import read_dataset, require_of_task
 from imagine_bench.entrants import entrant
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import InvalidValueError, UnknownNameError, plain
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress, RunSpec
@@ -37,6 +41,8 @@ def plan_control(
         require_of_task(found, registry.task(task))
         changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
     wanted = protocol(task, preset, **changes)
+    if task not in registry.TASKS:
+        _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
@@ -50,6 +56,24 @@ def plan_control(
     if encoder or whole.dataset or whole.after or whole.demonstrations or whole.queries or rests_on_others:
         _check_abilities(whole, paths)
     return whole, paths
+
+
+def _require_sound(wanted: Protocol) -> None:
+    """Raise InvalidValueError for a package's task whose rules, frames or environment would end every run or report."""
+    spec = registry.task(wanted.task)
+    try:
+        spec.facts()
+        frame = spec.render_macrostates(np.array(spec.rules.states[:1]), wanted.appearance, np.random.default_rng(0))
+        seen = [("render_macrostates", frame[0])]
+        with closing(make_env(wanted, wanted.task)) as env:
+            seen.append(("its environment", env.reset(seed=0)[0]))
+        for what, each in seen:
+            if (each.shape, each.dtype) != ((64, 64, 3), np.uint8):
+                raise InvalidValueError(f"{what} gives frames of {each.dtype} and shape {each.shape}")
+    except Exception as error:  # whatever a guest does wrong is one sentence
+        why = " ".join(plain(error).split()).rstrip(".")
+        more = f"'imagine-bench check --task {wanted.task}' says more"
+        raise InvalidValueError(f"Task {wanted.task} cannot be run: {why}. {more}.") from error
 
 
 def _rests_on_others(agent: str) -> bool:

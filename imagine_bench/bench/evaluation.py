@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
 from imagine_bench.store.counters import EvaluationCounts
@@ -37,12 +39,14 @@ def play(
     Before each macro-action, ``before_acting`` is called with what the agent sees and the ``info`` that it does not.
     """
     frame, info = env.reset(seed=seed)
+    _require_sound(env, frame, 0.0)
     before, over = observation(frame, info, privileged=privileged), False
     while not over:
         if before_acting is not None:
             before_acting(before, info)
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
+        _require_sound(env, frame, reward)
         after = observation(frame, info, privileged=privileged)
         transition = Transition(
             observation=before, action=action, reward=float(reward), next_observation=after,
@@ -50,6 +54,18 @@ def play(
         )  # fmt: skip
         yield transition, info
         before, over = after, terminated or truncated
+
+
+def _require_sound(env: Env, frame: Any, reward: Any) -> None:
+    """Raise InvalidValueError for what no agent should be shown: a package's environment can give anything."""
+    space = env.observation_space
+    if isinstance(space, gymnasium.spaces.Box) and (frame.shape, frame.dtype) != (space.shape, space.dtype):
+        raise InvalidValueError(
+            f"{env} gave a frame of {frame.dtype} and shape {frame.shape}; it declares {space.dtype} of shape "
+            f"{space.shape}. 'imagine-bench check --task' finds such faults."
+        )
+    if not math.isfinite(reward):
+        raise InvalidValueError(f"{env} gave the reward {reward}; rewards are finite.")
 
 
 def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:

@@ -17,7 +17,7 @@ from imagine_bench import __version__
 from imagine_bench.cli.analysis import Generalise, Plan, Policy
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
-from imagine_bench.cli.tools import Check, Coverage, Doctor, Encoder, Film, Margins, New, Play, Speed, View
+from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, brief, plain
 from imagine_bench.store.files import reason
 
@@ -41,6 +41,7 @@ Command = (
     | Margins
     | Coverage
     | Check
+    | Describe
     | New
     | Doctor
     | List

@@ -16,7 +16,7 @@ from imagine_bench.entrants import parse_settings
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
-from imagine_bench.protocols.task_types import Encoders, Result, task_type, task_types
+from imagine_bench.protocols.task_types import Encoders, Result, task_types, type_of
 from imagine_bench.store.archive import is_archive, load_archive
 from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol
 from imagine_bench.store.encoders import bundled
@@ -201,7 +201,7 @@ def _load_control(folder: Path) -> BenchResult:
 
 def _show(folder: Path, result: Result | None = None) -> None:
     """Write a bench's report, or that of another result of its type, and print its table and where everything lies."""
-    kind = task_type(read_protocol(folder).task)
+    kind = type_of(read_protocol(folder))
     if result is None:
         result = load_archive(folder) if is_archive(folder) else kind.load_so_far(folder)
     report = next(_REPORTS[name] for name, each in task_types().items() if each is kind)

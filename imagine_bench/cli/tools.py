@@ -67,6 +67,20 @@ class Encoder:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Describe:
+    """Say what a task is: macro-actions, macrostates, chance, optimum, plan lengths, all exact."""
+
+    task: Annotated[str, tyro.conf.Positional]
+    """Task; 'imagine-bench list' names them."""
+
+    def __call__(self) -> None:
+        """Describe."""
+        from imagine_bench.tools.describe import describe  # noqa: PLC0415 - nothing else needs it
+
+        print(describe(self.task))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Film:
     """Film an episode of optimal macro-actions in contact physics, as a GIF."""
 

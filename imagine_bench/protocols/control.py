@@ -72,10 +72,7 @@ class Protocol(ProtocolData):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        task_entry(self.task)
         object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        for agent in self.agents:
-            agent_entry(agent)
         for appearance in (self.appearance, self.test_appearance or self.appearance):
             require_known("appearance", appearance, APPEARANCES)
         require_known("execution", self.execution, EXECUTIONS)
@@ -93,7 +90,6 @@ class Protocol(ProtocolData):
                 f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
             )
         self._require_physics()
-        require_same_world(self.task, self.after)
         if self.dataset is not None and self.demonstrations:
             raise InvalidValueError("Both a dataset and demonstrations would come first; give one of them.")
         if not self.after and self.after_episodes != _AFTER_EPISODES:
@@ -189,7 +185,11 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
-    return Protocol(task=task_name, preset=preset, **values)
+    wanted = Protocol(task=task_name, preset=preset, **values)
+    for agent in wanted.agents:  # what is only read may be of a package that is not here
+        agent_entry(agent)
+    require_same_world(task_name, wanted.after)
+    return wanted
 
 
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:

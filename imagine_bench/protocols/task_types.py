@@ -78,6 +78,25 @@ def task_type(task: str) -> TaskType[ProtocolData]:
     raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks()])
 
 
+def type_of(protocol: ProtocolData) -> TaskType[ProtocolData]:
+    """The type of a protocol's task, be its package here or not."""
+    return next(kind for kind in task_types().values() if isinstance(protocol, kind.protocol))
+
+
+def read_as(data: Mapping[str, Any]) -> ProtocolData:
+    """A protocol from what :meth:`.ProtocolData.as_dict` gave; where its task is of a package that is not here, its
+    fields say of which type it is. Raises as :func:`task_type` and the protocol.
+    """
+    try:
+        kind = task_type(data["task"])
+    except (UnknownNameError, SetupError):
+        fields = {name: {field.name for field in dataclasses.fields(k.protocol)} for name, k in task_types().items()}
+        if not data.keys() <= fields["control"]:
+            raise
+        kind = task_types()["control"]
+    return kind.protocol.from_dict(dict(data))
+
+
 def require_options(task: str, options: Mapping[str, Any]) -> None:
     """Raise InvalidValueError for an option that protocols of this task's type do not have."""
     fields = [field.name for field in dataclasses.fields(task_type(task).protocol)]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench import reference, registry, statistics
+from imagine_bench import reference, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
+from imagine_bench.report.missing import known_agent, known_task
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
@@ -149,9 +150,9 @@ class ReportData:
 
 def collect(result: BenchResult) -> ReportData:
     """Compute a report's numbers."""
-    spec = registry.task(result.protocol.task)
-    facts, agents = spec.facts(), result.protocol.agents
-    learners = [agent for agent in agents if registry.agent_entry(agent).learns]
+    spec = known_task(result.protocol.task)
+    facts, agents, is_here = spec.facts(), result.protocol.agents, bool(spec.action_names)
+    learners = [agent for agent in agents if known_agent(agent).learns and is_here]
     thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in agents}
     thesis_gains = {agent: reference.gain(spec.reference, agent) if spec.reference else {} for agent in agents}
     open_loops = {agent: _open_loop(result.of(agent)) for agent in agents}
@@ -163,10 +164,10 @@ def collect(result: BenchResult) -> ReportData:
         comparisons=_comparisons(result, thesis_gains),
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
-        futures={agent: summary for agent in agents if (summary := _futures(result.of(agent)))},
+        futures={agent: summary for agent in agents if is_here and (summary := _futures(result.of(agent)))},
         reached={agent: _reached(result, agent, spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
-        timing={agent: _timing(result.of(agent), learns=registry.agent_entry(agent).learns) for agent in agents},
+        timing={agent: _timing(result.of(agent), learns=known_agent(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
         frames_before={agent: _frames_before(result, agent) for agent in agents},
         thesis={agent: rows for agent, rows in thesis.items() if rows},
@@ -249,7 +250,7 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
     agents = result.protocol.agents
     if BASE_AGENT not in agents:
         return {}
-    treated = [each for each in agents if each != BASE_AGENT and registry.agent_entry(each).learns]
+    treated = [each for each in agents if each != BASE_AGENT and known_agent(each).learns]
     rates, budgets = {agent: result.success_rates(agent) for agent in (*treated, BASE_AGENT)}, result.protocol.budgets
     trials, cells = result.protocol.evaluation_episodes, [(agent, i) for agent in treated for i in range(len(budgets))]
     pairs = [(rates[agent][:, index], rates[BASE_AGENT][:, index]) for agent, index in cells]
@@ -385,9 +386,9 @@ def _prices(runs: tuple[RunResult, ...]) -> dict[int, Price]:
 
 def _frames_before(result: BenchResult, agent: str) -> int | None:
     """Frames that the encoder of an agent was trained on, by its card; 0 for an agent that has none."""
-    entry = registry.agent_entry(agent)
-    if not entry.needs_encoder:
-        return 0
+    entry = known_agent(agent)
+    if not entry.make or not entry.needs_encoder:
+        return 0 if entry.make else None
     card = encoders.card(result.protocol.encoder_of(entry.encoder_kind))
     return None if card is None or card.get("offer") else int(card["recipe"]["frames"])
 

@@ -271,8 +271,9 @@ def _success_legend(axes: Axes, data: ReportData, *, thesis: bool) -> None:
     axes.plot([], [], color=_INK, marker="o", markersize=4.5, label="this run, band: 95 % interval")
     if thesis:
         axes.plot([], [], color=_INK, label="thesis, bar: standard deviation", **_THESIS_LINE)
-    levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
-    axes.plot([], [], label=levels, **_REFERENCE_LINE)
+    if np.isfinite(data.facts.optimum):
+        levels = f"optimum {100 * data.facts.optimum:.1f} % and chance level {100 * data.facts.chance_level:.1f} %"
+        axes.plot([], [], label=levels, **_REFERENCE_LINE)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=3, fontsize=9)
 
 

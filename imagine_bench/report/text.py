@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imagine_bench import registry, statistics
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench import statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
+from imagine_bench.report.missing import known_agent, missing
 from imagine_bench.report.sections import DASH
 from imagine_bench.statistics import Estimate, PairedTests
 
@@ -25,13 +25,9 @@ class AgentWords(NamedTuple):
 
 
 def agent_words(agent: str) -> AgentWords:
-    """Title and description of an agent from its registry line; of one that is not registered, its name alone."""
-    spoken = agent.replace("_", " ")
-    try:
-        entry = registry.agent_entry(agent)
-    except ImagineBenchError:
-        return AgentWords(spoken, "")
-    return AgentWords(entry.title or spoken, entry.description)
+    """Title and description of an agent from its registry line; of one that is not here, its name."""
+    entry = known_agent(agent)
+    return AgentWords(entry.title or agent.replace("_", " "), entry.description)
 
 
 def lasting(budgets: Sequence[int | None]) -> str:
@@ -99,6 +95,7 @@ def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
     budget = data.decisive_budget
     sentences = [_unfinished(data)] if data.result.missing else []
+    sentences += [absent] if (absent := missing(data.result.protocol)) else []
     if BASE_AGENT in data.scores:
         where = ", where the learners differ most," if data.spread(budget) > 0 and len(data.budgets) > 1 else ""
         sentences.append(

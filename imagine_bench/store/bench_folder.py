@@ -18,7 +18,7 @@ from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, digest
-from imagine_bench.protocols.task_types import Result, task_type
+from imagine_bench.protocols.task_types import Result, read_as, type_of
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import (
     lock,
@@ -117,7 +117,7 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
 def load_bench(folder: Path) -> Result:
     """Read a finished bench. Raises ArtefactError: it is no bench, runs are missing, or a file is damaged."""
     protocol = read_protocol(folder)
-    kind, store = task_type(protocol.task), BenchStore(folder, protocol)
+    kind, store = type_of(protocol), BenchStore(folder, protocol)
     folders = [store.run_folder(agent, seed) for agent in protocol.agents for seed in protocol.seeds]
     done = [run for run in folders if run_folder.is_done(run)]
     store.require_own(done)
@@ -195,8 +195,7 @@ def read_protocol(folder: Path) -> ProtocolData:
             f"{path} is damaged: {name[1]} in its folder's name stands for another protocol. It was left untouched."
         )
     with reading(path, what):
-        data = data["protocol"] if kept else data
-        return task_type(data["task"]).protocol.from_dict(data)
+        return read_as(data["protocol"] if kept else data)
 
 
 def read_control(folder: Path) -> Protocol:

@@ -31,7 +31,8 @@ def load_so_far(folder: Path) -> BenchResult:
     """Read a bench of agents, finished or not.
 
     Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
-    and no agent has more seeds or episodes than another. Raises ArtefactError: it is not a bench, no seed has brought
+    and no agent has more seeds or episodes than another. Agents without any result are left out where all others are
+    finished. Raises ArtefactError: it is not a bench, no seed has brought
     every agent to the first budget, or a file is damaged.
     """
     whole = read_control(folder)
@@ -58,7 +59,7 @@ def largest_part(
 
     Raises ArtefactError: no seed has brought every agent to the first budget, or a file is damaged.
     """
-    part = _largest_table(whole, reached)
+    part = _largest_table(_without_failed(whole, reached), reached)
     missing = tuple(
         f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
         for (agent, seed), at in reached.items()
@@ -72,6 +73,13 @@ def largest_part(
         missing=missing,
         made_with=made_with,
     )
+
+
+def _without_failed(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:
+    """Without agents that have no result at all where all others are finished: they cost those nothing."""
+    tried = [agent for agent in whole.agents if any(reached[agent, seed] for seed in whole.seeds)]
+    finished = all(reached[agent, seed] == whole.budgets[-1] for agent in tried for seed in whole.seeds)
+    return dataclasses.replace(whole, agents=tuple(tried)) if tried and finished else whole
 
 
 def _reached(store: BenchStore, agent: str, seed: int) -> int:

@@ -26,7 +26,7 @@ def early_stage(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
     wanted = small(**{"budgets": (2, 4, 6, 9), "agents": ("table", "imaginer"), "seeds": (0, 1), **changes})
-    return benches.bench(wanted, None, root=root, launcher=launcher)
+    return benches.bench(wanted, {}, root=root, launcher=launcher)
 
 
 def test_all_runs_come_to_a_stage_before_any_goes_on(tmp_path: Path) -> None:

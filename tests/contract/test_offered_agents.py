@@ -87,6 +87,13 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     metrics = (folder / "their_agent/seed_0/metrics.csv").read_text().splitlines()
     row = dict(zip(metrics[0].split(","), metrics[-1].split(","), strict=True))
     assert float(row["diagnostics/real_transitions"]) == float(row["env_steps"]) > 0
+    install("other = their_package:ENTRY")
+    assert main(["report", str(folder)]) == 0, "what was measured can be read without the package"
+    said = capsys.readouterr().out
+    assert "Not installed here: agent their_agent. Not shown therefore: what they are." in said
+    assert re.search(r"chance +their agent +optimum", said)
+    assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 2
+    assert "No agent 'their_agent'" in capsys.readouterr().err
 
 
 def test_sources_that_changed_are_another_version(install: Install, tmp_path: Path) -> None:

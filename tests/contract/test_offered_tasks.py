@@ -20,7 +20,9 @@ from imagine_bench import registry, rules
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.report.page import summary_table
 from imagine_bench.store import encoders
+from imagine_bench.store.archive import archive_files, load_archive
 from imagine_bench.store.trained import learners, load_trained
 from imagine_bench.tools.new import new_package
 
@@ -60,6 +62,8 @@ def test_it_goes_from_list_to_recording(guest: Path, tmp_path: Path, capsys: pyt
     assert "lights_out" not in registry.TASKS
     assert main(["list"]) == 0
     assert re.search(r"^control tasks .*\blights_out\b", capsys.readouterr().out, re.MULTILINE)
+    assert main(["describe", "lights_out"]) == 0 and "16, 15 of them starts" in capsys.readouterr().out
+    assert main(["check", "--task", "lights_out"]) == 0 and capsys.readouterr().out.count("ok  ") == 7
     wanted, paths = plan(
         "lights_out", "smoke", agents=("oracle", "dqn", "factored"), execution="kinematic", budgets=(5,),
         evaluation_episodes=4, open_loop_starts=2, recorded_episodes=1,
@@ -85,6 +89,28 @@ def test_agents_without_an_encoder_act_in_it(guest: Path, tmp_path: Path) -> Non
     wanted, paths = plan("lights_out", "smoke", agents=("random", "oracle"), execution="kinematic", **few)
     runs = {run.agent: run.checkpoints[-1] for run in bench(wanted, paths, root=tmp_path, launcher=Inline()).runs}
     assert not paths and runs["oracle"].success_rate == 1.0 > runs["random"].success_rate
+
+
+def test_results_are_read_without_the_package(guest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = {"budgets": (5,), "evaluation_episodes": 20, "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted, paths = plan("lights_out", "smoke", agents=("random", "oracle"), execution="kinematic", **few)
+    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for name, content in archive_files(result).items():
+        (kept / name).write_text(content)
+    assert "chance" in summary_table(load_archive(kept)) and "–" not in summary_table(load_archive(kept))
+    (guest / "lights_out-0.1.dist-info" / "entry_points.txt").unlink()
+    registry.offers.cache_clear()
+    for folder in (kept, result.folder):
+        assert main(["report", str(folder)]) == 0
+        said = capsys.readouterr().out
+        assert "Not installed here: task lights_out. Not shown therefore: chance level, optimum, areas," in said
+        assert re.search(r"^5 +– .*100.0 .* –$", said, re.MULTILINE)
+        assert "nan" not in (folder / "report" / "report.md").read_text()
+    assert main(["report", "--task", "lights_out", "--out", str(tmp_path)]) == 2
+    assert main(["bench", "--task", "lights_out"]) == 2
+    assert "No task 'lights_out'" in capsys.readouterr().err
 
 
 def test_other_looks_are_another_encoder(guest: Path, monkeypatch: pytest.MonkeyPatch) -> None:

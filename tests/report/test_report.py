@@ -431,7 +431,7 @@ def test_episodes_to_success_use_the_threshold_of_the_task(
     first, seeds = result.protocol.budgets[0], len(result.protocol.seeds)
     for success_threshold, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
         demanding = dataclasses.replace(spec, success_threshold=success_threshold)
-        monkeypatch.setattr("imagine_bench.report.data.registry.task", lambda _, spec=demanding: spec)
+        monkeypatch.setattr("imagine_bench.report.missing.registry.task", lambda _, spec=demanding: spec)
         assert collect(result).reached[agent] == reached
 
 

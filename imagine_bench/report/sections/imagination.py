@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.report import plots
 from imagine_bench.report.data import ReportData
+from imagine_bench.report.missing import known_agent
 from imagine_bench.report.sections import DASH, Cell, Image, Section, Table
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.store import encoders
@@ -77,7 +77,8 @@ def sections(data: ReportData) -> Iterator[Section]:
         yield _open_loop(data)
     if data.futures:
         yield _futures(data)
-    if sheets := list(_sampled_rollouts(data)):
+    is_here = bool(data.spec.action_names)
+    if is_here and (sheets := list(_sampled_rollouts(data))):
         yield Section(
             title="One start, several futures",
             words=(
@@ -87,7 +88,7 @@ def sections(data: ReportData) -> Iterator[Section]:
             ),
             images=sheets,
         )
-    if strips := list(_filmstrips(data)):
+    if is_here and (strips := list(_filmstrips(data))):
         yield Section(
             title="What the agents imagine",
             words=(
@@ -243,7 +244,7 @@ def encoder_views(result: BenchResult) -> list[EncoderView]:
     """
     readers: dict[str, list[str]] = {}
     for agent in result.protocol.agents:
-        entry = registry.agent_entry(agent)
+        entry = known_agent(agent)
         identity = result.protocol.encoder_of(entry.encoder_kind)
         if entry.needs_encoder and identity is not None:
             readers.setdefault(identity, []).append(agent)

@@ -24,7 +24,9 @@ def compared(data: ReportData) -> Section:
     rows = [agent_words(agent) for agent in data.scores]
     return Section(
         title="What was compared",
-        words=(
+        words=(spec.description,)
+        if not spec.action_names
+        else (
             spec.description,
             f"The robot sees a 64×64 camera image and chooses among {spec.n_actions} macro-actions, whole movements of "
             f"the arm: {'; '.join(spec.action_names)}. An episode ends in success, in failure or after {spec.horizon} "

@@ -1,0 +1,60 @@
+"""What a task is, in a dozen lines, with the exact facts of its rules: ``imagine-bench describe``."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
+from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, tabulate
+from imagine_bench.store.encoders import bundled
+
+_MOST = 10
+"""Plan lengths that are listed one by one."""
+
+
+def describe(name: str) -> str:
+    """A control or regression task in words and numbers. Raises as :func:`.registry.task`."""
+    if name in registry.regressions():
+        data = registry.regression(name)
+        rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
+        return _page(data.title, data.description, rows)
+    spec = registry.task(name)
+    facts, states = spec.facts(), spec.rules.states
+    factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
+    chance = "some macro-actions have several outcomes" if is_random(spec.rules) else "none: each has one outcome"
+    rows = {
+        "Gymnasium id": spec.env_id,
+        "observation": f"64 x 64 RGB frame, for encoders preprocessed as {spec.preprocessing}",
+        "macro-actions": f"{spec.n_actions}: {'; '.join(spec.action_names)}",
+        "macrostate": "; ".join(factors),
+        "macrostates": f"{len(states):,}, {len(spec.rules.start_states):,} of them starts",
+        "chance": chance,
+        "horizon": f"{spec.horizon} macro-actions",
+        "chance level": f"{100 * facts.chance_level:.1f} % of episodes solved by blind choice",
+        "optimum": f"{100 * facts.optimum:.1f} %, with a return of {facts.optimal_return:.2f}",
+        "plan lengths": f"{_plan_lengths(spec)}; mean {facts.mean_plan_length:.2f}",
+        "encoders": _encoders(spec),
+    }
+    return _page(spec.title, spec.description, rows)
+
+
+def _page(title: str, description: str, rows: dict[str, str]) -> str:
+    return "\n".join([title, description, "", *(f"{name:16}{value}" for name, value in rows.items())])
+
+
+def _plan_lengths(spec: TaskSpec) -> str:
+    """Mean macro-actions of the optimal agent, to one decimal, and how many starts need so many."""
+    tables = tabulate(spec.rules)
+    values = evaluate(tables, greedy(optimal_policy(tables), spec.n_actions), spec.horizon)
+    lengths = Counter(np.round(values.length[tables.starts], 1).tolist())
+    if len(lengths) > _MOST:
+        return f"{min(lengths):g} to {max(lengths):g}"
+    return ", ".join(f"{length:g} ({lengths[length]} starts)" for length in sorted(lengths))
+
+
+def _encoders(spec: TaskSpec) -> str:
+    names = [bundled_name(spec.encoder, look, kind) for look in APPEARANCES for kind in ("latents", "codes")]
+    return ", ".join(name for name in names if name in bundled()) or "trained on first use"
