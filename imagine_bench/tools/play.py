@@ -33,13 +33,8 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A task, made with ``render_mode="rgb_array"``, for ``gymnasium.utils.play``: a step is one image of a window.
 
     Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
-    change nothing; the last one returns its result.
-
-    Args:
-        env: The task's environment.
-        task: What it is.
-        imaginer: Whose imagination is shown: of each episode it sees the first frame, then keys alone.
-        seed: Of the first episode, and of what the imagination draws.
+    change nothing; the last one returns its result. An ``imaginer`` sees the first frame of each episode, then keys
+    alone. ``seed`` is of the first episode, and of what the imagination draws.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
@@ -87,9 +82,8 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
             low, high = wilson(self.solved, self.episodes)
             share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
             said = f"Solved {self.solved} of {self.episodes} episodes ({share})"
-        said += f"; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}."
-        foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates."
-        return said + (foreseen if self.imagined else "")
+        foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates." if self.imagined else ""
+        return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
 
     def _act(self, action: int) -> None:
         self._said = self._task.action_names[action]
@@ -116,8 +110,7 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _window(self) -> Frame:
         """The scene, the agent's frame, what is imagined of it, and words."""
-        named = zip(KEYS, self._task.action_names, strict=False)
-        keys = "\n".join(f"{key}  {name}" for key, name in named)
+        keys = "\n".join(f"{key}  {name}" for key, name in zip(KEYS, self._task.action_names, strict=False))
         said = f"{self._said}\n\nsolved {self.solved} of {self.episodes}\n\n{keys}"
         panels = [("what the agent sees", self._frame, said)]
         if self._imaginer is not None:
@@ -150,24 +143,14 @@ def play(
     task: str | None, *, model: Path | None = None, seed: int = 0, execution: str | None = None,
     appearance: str | None = None, encoder: str | None = None,
 ) -> str:  # fmt: skip
-    """Open a window in which a person plays until it is closed.
+    """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
-    Args:
-        task: Registered task; None takes the model's.
-        model: A run's folder, ``runs/<task>/<bench>/<agent>/seed_<n>``, whose agent imagines beside the person.
-        seed: Of the first episode.
-        execution: None takes the model's, else ``"physics"``.
-        appearance: None takes the model's, else ``"clean"``.
-        encoder: As of :func:`imagine_bench.store.trained.load_trained`.
-
-    Returns:
-        The person's success rate beside chance and optimum.
+    ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else contact physics
+    and clean frames. ``encoder`` is as of :func:`imagine_bench.store.trained.load_trained`.
 
     Raises:
-        UnknownNameError: No such task, execution or appearance.
-        InvalidValueError: Neither task nor model, a model of another task, or one that does not imagine.
-        ArtefactError: As of ``load_trained``.
-        SetupError: There is no pygame, or no desktop.
+        ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what
+            ``load_trained`` raises, or neither pygame nor desktop.
     """
     chosen: dict[str, Any] = {"execution": "physics", "appearance": "clean"}
     imaginer = None
@@ -176,7 +159,7 @@ def play(
         if task not in (None, trained.task.id):
             raise InvalidValueError(f"{model} was trained on {trained.task.id!r}, not on {task!r}; leave the task out.")
         task, imaginer, protocol = trained.task.id, trained.imaginer, trained.spec.protocol
-        chosen = {"execution": protocol.execution, "appearance": protocol.appearance}
+        chosen = {**protocol.world, "appearance": protocol.appearance}
     if task is None:
         raise InvalidValueError("There is nothing to play; give a task or --model.")
     spec = registry.task(task)

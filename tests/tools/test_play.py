@@ -197,7 +197,7 @@ def test_keyboard_events_play_the_task(keyboard, capsys):
 
 
 def trained(agent, task="arrow_puzzle"):
-    protocol = SimpleNamespace(execution="kinematic", appearance="mild")
+    protocol = SimpleNamespace(world={"execution": "kinematic"}, appearance="mild")
     spec = registry.task(task)
     return lambda folder, encoder: SimpleNamespace(
         task=spec, imaginer=agent, spec=SimpleNamespace(protocol=protocol), folder=folder, encoder=encoder
