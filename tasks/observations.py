@@ -14,9 +14,10 @@ from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import Frame
 
 from .rendering import Renderer
-from .scene_reader import ArmColumns, tcp_in_world
+from .scene_reader import arm_columns, tcp_in_world
 from .world import World
 
+_Camera = Callable[[str, int], Renderer]
 PARTS = ("frame", "human", "state", "proprio")
 SIZES_PX = (32, 256)
 """Smallest and largest edge of an observed image."""
@@ -43,14 +44,7 @@ class Observer:
         InvalidValueError: A part twice, or another size.
     """
 
-    def __init__(
-        self,
-        choice: str,
-        size: int,
-        world: World,
-        values: Sequence[Sequence[str]],
-        camera: Callable[[str, int], Renderer],
-    ) -> None:
+    def __init__(self, choice: str, size: int, world: World, values: Sequence[Sequence[str]], camera: _Camera) -> None:
         names = choice.split(",") if isinstance(choice, str) else [choice]
         self._names = tuple(require_known("observation", name, PARTS) for name in names)
         if len(set(names)) < len(names):
@@ -58,7 +52,7 @@ class Observer:
         low, high = SIZES_PX
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
-        self._world, self._columns = world, ArmColumns.of(world.model) if "proprio" in names else None
+        self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
         self._cameras = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
@@ -91,7 +85,5 @@ class Observer:
             one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
             one_hot[self._offsets[:-1] + macrostate] = 1.0
             return one_hot
-        assert self._columns is not None
-        qpos = self._world.data.qpos
-        pose = tcp_in_world(self._world.model, self._world.data)
-        return np.concatenate([qpos[self._columns.arm_qpos], qpos[self._columns.finger_qpos], pose], dtype=np.float32)
+        arm, tool = self._world.data.qpos[self._arm_qpos], tcp_in_world(self._world.model, self._world.data)
+        return np.concatenate([arm, tool], dtype=np.float32)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -83,28 +81,12 @@ def poses_of(
     return poses
 
 
-@dataclass(frozen=True)
-class ArmColumns:
-    """Where arm and fingers are in the arrays of a model; each number is one joint's, from the base to the wrist."""
-
-    arm_qpos: list[int]
-    arm_qvel: list[int]
-    arm_ctrl: list[int]
-    finger_qpos: list[int]
-    finger_ctrl: list[int]
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel) -> ArmColumns:
-        """Those of a scene that holds the arm."""
-        arm, fingers = ([model.joint(name) for name in names] for names in (ARM_JOINTS, FINGER_JOINTS))
-        arm_ctrl, finger_ctrl = (
-            [int(model.actuator(name.replace("_slide", "") + "_servo").id) for name in names]
-            for names in (ARM_JOINTS, FINGER_JOINTS)
-        )
-        return cls(
-            arm_qpos=[int(joint.qposadr[0]) for joint in arm], arm_qvel=[int(joint.dofadr[0]) for joint in arm],
-            arm_ctrl=arm_ctrl, finger_qpos=[int(joint.qposadr[0]) for joint in fingers], finger_ctrl=finger_ctrl,
-        )  # fmt: skip
+def arm_columns(model: mujoco.MjModel) -> tuple[list[int], list[int], list[int]]:
+    """Where the seven joints, then the two fingers, are in positions, velocities and controls of a scene."""
+    names = (*ARM_JOINTS, *FINGER_JOINTS)
+    joints, servos = [model.joint(name) for name in names], [f"{name.replace('_slide', '')}_servo" for name in names]
+    qpos, qvel = [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
+    return qpos, qvel, [int(model.actuator(servo).id) for servo in servos]
 
 
 def tcp_in_world(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
@@ -117,13 +99,16 @@ def tcp_in_world(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
 
 def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Floats, ctrl: Floats) -> ArmMotion:
     """The arm's part of a scene's motion: times (K,), positions (K, nq), velocities (K, nv) and commands (K, nu)."""
-    data, at, poses = mujoco.MjData(model), ArmColumns.of(model), np.empty((len(qpos), 7))
+    data, poses = mujoco.MjData(model), np.empty((len(qpos), 7))
     for row, positions in enumerate(qpos):
         data.qpos[:] = positions
         mujoco.mj_kinematics(model, data)
         poses[row] = tcp_in_world(model, data)
+    at, moving, told = arm_columns(model)
+    (joints, fingers), (speeds, _), (commands, grips) = (
+        np.split(values, [len(ARM_JOINTS)], axis=1) for values in (qpos[:, at], qvel[:, moving], ctrl[:, told])
+    )
     return ArmMotion(
-        time_s=time_s, joint_rad=qpos[:, at.arm_qpos], joint_rad_s=qvel[:, at.arm_qvel],
-        gripper_m=qpos[:, at.finger_qpos], joint_command_rad=ctrl[:, at.arm_ctrl],
-        gripper_command_m=ctrl[:, at.finger_ctrl], tcp_in_world=poses,
+        time_s=time_s, joint_rad=joints, joint_rad_s=speeds, gripper_m=fingers,
+        joint_command_rad=commands, gripper_command_m=grips, tcp_in_world=poses,
     )  # fmt: skip

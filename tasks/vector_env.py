@@ -95,7 +95,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
-        self._clock_s = 0.0
+        self._clock_s, self._timestep_s = 0.0, float(lanes[0].model.opt.timestep)
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -192,10 +192,6 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
     # --- details -------------------------------------------------------------------------------------------------
 
-    @property
-    def _timestep_s(self) -> float:
-        return float(self.envs[0].model.opt.timestep)
-
     def _received(self, lanes: list[int]) -> Batch:
         """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
         rewards, ends = np.zeros(len(lanes)), np.zeros((2, len(lanes)), dtype=np.bool_)
@@ -283,21 +279,20 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
 def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
     """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
-    lanes = list(infos)
-    columns: dict[str, Any] = {}
+    lanes, columns = np.array(list(infos), dtype=np.int64), dict[str, Any]()
     mask = np.zeros(n, dtype=np.bool_)
     mask[lanes] = True
     for key, example in next(iter(infos.values()), {}).items():
         values = [info[key] for info in infos.values()]
         if isinstance(example, dict):
-            columns[key] = _columns(dict(zip(lanes, values, strict=True)), n)
-        elif key != "final_obs" and isinstance(example, np.ndarray | np.number | float | int):
-            columns[key] = np.zeros((n, *np.shape(example)), dtype=np.asarray(example).dtype)
+            columns[key] = _columns(dict(zip(infos, values, strict=True)), n)
+        elif isinstance(example, (np.ndarray, np.number)) and key != "final_obs":
+            columns[key] = np.zeros((n, *example.shape), dtype=example.dtype)
             columns[key][lanes] = values
         else:
-            columns[key] = np.full(n, None, dtype=object)
-            for lane, value in zip(lanes, values, strict=True):
-                columns[key][lane] = value
+            columns[key] = column = np.full(n, None, dtype=object)
+            for lane, value in zip(infos, values, strict=True):
+                column[lane] = value
         columns[f"_{key}"] = mask.copy()
     return columns
 

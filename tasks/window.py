@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import sys
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from imagine_bench.errors import SetupError
 from imagine_bench.interfaces import Frame
@@ -27,19 +28,14 @@ def open_display(*, seen: bool) -> ModuleType:
         import pygame  # noqa: PLC0415  (an extra)
     except ImportError as error:
         raise SetupError("Windows need pygame: pip install 'imagine-bench[play]'.") from error
-    if pygame.display.get_init() or "SDL_VIDEODRIVER" in os.environ or sys.platform != "linux":
-        pygame.display.init()
-        return pygame
-    for driver in ("x11", "wayland", "dummy"):
+    chosen, linux = os.environ.get("SDL_VIDEODRIVER"), sys.platform == "linux"
+    for driver in () if chosen or not linux else ("x11", "wayland", "dummy"):
         os.environ["SDL_VIDEODRIVER"] = driver
-        try:
+        with contextlib.suppress(pygame.error):
             pygame.display.init()
-            break
-        except pygame.error:
-            continue
-        finally:
-            del os.environ["SDL_VIDEODRIVER"]
-    if seen and pygame.display.get_driver() == "dummy":
+        del os.environ["SDL_VIDEODRIVER"]
+    pygame.display.init()
+    if seen and not chosen and pygame.display.get_driver() == "dummy":
         pygame.display.quit()
         raise SetupError(
             "There is no desktop to open a window on; run this on one. SDL_VIDEODRIVER=dummy opens one unseen."
@@ -48,19 +44,13 @@ def open_display(*, seen: bool) -> ModuleType:
 
 
 class Window:
-    """One window with a title; it opens with the first image and takes its size."""
+    """One window with a title, opened by its first image, of whose size it is."""
 
     def __init__(self, title: str) -> None:
-        self._title = title
-        self._pygame: Any = None
-        self._clock: Any = None
+        self._title, self._pygame, self._clock = title, cast(Any, None), cast(Any, None)
 
     def show(self, image: Frame, per_s: float) -> None:
-        """Show an image (H, W, 3) and wait until it is time for the next one, so many a second.
-
-        Raises:
-            SetupError: As :func:`open_display`.
-        """
+        """Show an image (H, W, 3) and wait until the next one is due, so many a second; SetupError without pygame."""
         if self._pygame is None:
             self._pygame = open_display(seen=False)
             self._clock = self._pygame.time.Clock()

@@ -30,17 +30,14 @@ _WIDTH, _HEIGHT, _PANEL, _FRAME, _TOP = 640, 480, 284, 192, 36
 
 
 class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A task, made with ``render_mode="rgb_array"``, for ``gymnasium.utils.play``: a step is one image of a window.
+    """A task for ``gymnasium.utils.play``: a step is one image of a window.
 
     Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
-    change nothing; the last one returns its result.
-
-    Args:
-        env: The task's environment.
-        task: What it is.
-        imaginer: Whose imagination is shown: of each episode it sees the first frame, then keys alone.
-        seed: Of the first episode, and of what the imagination draws.
+    change nothing; the last one returns its result. An ``imaginer`` sees the first frame of each episode, then keys
+    alone. ``seed`` is of the first episode, and of what the imagination draws.
     """
+
+    render_mode = "rgb_array"
 
     def __init__(self, env: gymnasium.Env[Any, Any], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
         super().__init__(env)
@@ -87,9 +84,8 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
             low, high = wilson(self.solved, self.episodes)
             share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
             said = f"Solved {self.solved} of {self.episodes} episodes ({share})"
-        said += f"; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}."
-        foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates."
-        return said + (foreseen if self.imagined else "")
+        foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates." if self.imagined else ""
+        return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
 
     def _act(self, action: int) -> None:
         self._said = self._task.action_names[action]
@@ -106,24 +102,25 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
             yield self._window()
         self._frame, self._info = frame, info
         self.episodes += terminated or truncated
-        self.solved += bool(info["success"])
+        self.solved += bool(info["is_success"])
         if self._rollout is not None:
             self.imagined += 1
             self.foreseen += bool(np.array_equal(self._rollout.macrostates[-1], info["macrostate"]))
-        end = "solved" if info["success"] else "an illegal end" if terminated else "out of time" if truncated else ""
+        end = "solved" if info["is_success"] else "an illegal end" if terminated else "out of time" if truncated else ""
         self._said += f"\nreward {reward:+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:
         """The scene, the agent's frame, what is imagined of it, and words."""
-        named = zip(KEYS, self._task.action_names, strict=False)
-        keys = "\n".join(f"{key}  {name}" for key, name in named)
+        keys = "\n".join(f"{key}  {name}" for key, name in zip(KEYS, self._task.action_names, strict=False))
         said = f"{self._said}\n\nsolved {self.solved} of {self.episodes}\n\n{keys}"
         panels = [("what the agent sees", self._frame, said)]
         if self._imaginer is not None:
             panels.append(("what the model imagines", *self._imagination()))
         canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT), "white")
-        canvas.paste(Image.fromarray(np.asarray(self.env.render())).resize((_WIDTH, _HEIGHT)), (0, 0))
+        view = getattr(self._scene, "human_view", None)  # others' tasks may show the agent's frame alone
+        scene = Image.fromarray(self._frame if view is None else view(_WIDTH, _HEIGHT))
+        canvas.paste(scene.resize((_HEIGHT, _HEIGHT) if view is None else (_WIDTH, _HEIGHT)), (0, 0))
         draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(14)
         for column, (title, image, words) in enumerate(panels):
             left = _WIDTH + 8 + column * _PANEL
@@ -150,33 +147,23 @@ def play(
     task: str | None, *, model: Path | None = None, seed: int = 0, execution: str | None = None,
     appearance: str | None = None, encoder: str | None = None,
 ) -> str:  # fmt: skip
-    """Open a window in which a person plays until it is closed.
+    """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
-    Args:
-        task: Registered task; None takes the model's.
-        model: A run's folder, ``runs/<task>/<bench>/<agent>/seed_<n>``, whose agent imagines beside the person.
-        seed: Of the first episode.
-        execution: None takes the model's, else ``"physics"``.
-        appearance: None takes the model's, else ``"clean"``.
-        encoder: As of :func:`imagine_bench.store.trained.load_trained`.
-
-    Returns:
-        The person's success rate beside chance and optimum.
+    ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
+    environment does. ``encoder`` is as of :func:`imagine_bench.store.trained.load_trained`.
 
     Raises:
-        UnknownNameError: No such task, execution or appearance.
-        InvalidValueError: Neither task nor model, a model of another task, or one that does not imagine.
-        ArtefactError: As of ``load_trained``.
-        SetupError: There is no pygame, or no desktop.
+        ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what
+            ``load_trained`` raises, or neither pygame nor desktop.
     """
-    chosen: dict[str, Any] = {"execution": "physics", "appearance": "clean"}
+    chosen: dict[str, Any] = {}
     imaginer = None
     if model is not None:
         trained = load_trained(model, encoder=encoder)
         if task not in (None, trained.task.id):
             raise InvalidValueError(f"{model} was trained on {trained.task.id!r}, not on {task!r}; leave the task out.")
         task, imaginer, protocol = trained.task.id, trained.imaginer, trained.spec.protocol
-        chosen = {"execution": protocol.execution, "appearance": protocol.appearance}
+        chosen = {**protocol.world, "appearance": protocol.appearance}
     if task is None:
         raise InvalidValueError("There is nothing to play; give a task or --model.")
     spec = registry.task(task)
@@ -187,7 +174,7 @@ def play(
         from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
     if "matplotlib" in sys.modules:
         sys.modules["matplotlib"].use("agg")
-    env = gymnasium.make(spec.env_id, render_mode="rgb_array", disable_env_checker=True, **chosen)
+    env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
     keys = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)

@@ -10,6 +10,7 @@ import operator
 import subprocess
 import sys
 import time
+import timeit
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -31,6 +32,8 @@ TURNS = 2_000
 _BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 _BLOCK = 50
 """Macro-actions of one speed reading: noise on a shared machine only ever adds, so the best block is quoted."""
+_LANES = (1, 4, 16, 64)
+"""Of the vector environment; the third is quoted first."""
 _SIGNS = {"<": operator.lt, "<=": operator.le, ">=": operator.ge}
 _START_UP = """
 import json, sys, time
@@ -52,6 +55,17 @@ for i in range(1000): env.reset(seed=i)  # allocators settle
 before = rss_mb()
 for i in range(2000): env.reset(seed=i)
 print(json.dumps({"rss": rss_mb(), "growth": rss_mb() - before}))
+"""
+
+
+_LANES_MEMORY = """
+import json, gymnasium, imagine_bench, numpy, sys
+from imagine_bench.registry import vector_id
+env = gymnasium.make_vec(vector_id(sys.argv[1]), num_envs=64)
+env.reset(seed=0)
+for action in range(3): env.step(numpy.full(64, action))
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(json.dumps({"rss": int(status["VmRSS"].split()[0]) / 1024}))
 """
 
 
@@ -79,7 +93,7 @@ def measure(turns: int = TURNS) -> Iterator[Figure]:
     yield from _model_updates()
     specs = [registry.task(name) for name in registry.TASKS]
     measured = [(spec, spec.targets) for spec in specs if spec.targets is not None]
-    for part in (_kinematic, _encoders):
+    for part in (_kinematic, _encoders, _vector):
         for spec, targets in measured:
             yield from part(spec, targets)
     for spec, targets in measured:
@@ -145,6 +159,7 @@ def _fresh_interpreters() -> Iterator[Figure]:
         memory = _child(_MEMORY)
         yield figure_of("memory of one env, MB", memory["rss"], "<=", 300, ".0f")
         yield figure_of("its growth over 2,000 resets, MB", memory["growth"], "<=", 2, ".1f")
+        yield figure_of("memory of 64 lanes of a vector env, MB", _child(_LANES_MEMORY)["rss"], "<=", 1300, ".0f")
 
 
 def _weight_samples() -> Iterator[Figure]:
@@ -191,6 +206,49 @@ def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
     frame_ms = _best_cpu_s(lambda: [scene.agent_view() for _ in range(1_000)], 9)
     env.close()
     yield figure_of(f"{spec.id}: 64x64 frame, hot, CPU ms", frame_ms, "<=", 0.15, ".3f")
+
+
+def _vector(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
+    """Lanes beside one environment, by wall time, which needs quiet cores: block by block in turn, median of ratios."""
+    del targets
+    for execution, required, turns in (("physics", 1.4, 64), ("kinematic", 1.5, 512)):
+        ratios = {lanes: lanes_ratio(spec, execution, lanes, turns, blocks=5) for lanes in _LANES}
+        curve = ", ".join(f"{ratio:.2f} at {lanes}" for lanes, ratio in ratios.items())
+        what = f"{spec.id}: {_LANES[2]} lanes, {execution}, times as fast as one environment"
+        yield figure_of(what, ratios[_LANES[2]], ">=", required, ".2f", f" ({curve})")
+
+
+def lanes_ratio(spec: TaskSpec, execution: str, lanes: int, turns: int, *, blocks: int) -> float:
+    """How many times as fast as one environment so many lanes are, at random actions; ends reset at once.
+
+    Args:
+        spec: The task.
+        execution: ``"physics"`` or ``"kinematic"``.
+        lanes: Of the vector environment.
+        turns: Macro-actions of a block, at least.
+        blocks: Pairs of blocks; the median of their ratios is returned.
+    """
+    one = gymnasium.make(spec.env_id, execution=execution)
+    many = gymnasium.make_vec(registry.vector_id(spec.env_id), num_envs=lanes, execution=execution)
+    rng, rounds = SeedTree(0).child("speed", "lanes").generator(), -(-turns // lanes)
+    one.reset(seed=0)
+    many.reset(seed=0)
+
+    def alone() -> None:
+        for action in rng.integers(spec.n_actions, size=rounds * lanes).tolist():
+            *_, terminated, truncated, _ = one.step(action)
+            if terminated or truncated:
+                one.reset()
+
+    def together() -> None:
+        for _ in range(rounds):
+            many.step(rng.integers(spec.n_actions, size=lanes))
+
+    together()
+    times = [[timeit.timeit(each, number=1) for each in (alone, together)] for _ in range(blocks)]
+    one.close()
+    many.close()
+    return float(np.median([alone_s / together_s for alone_s, together_s in times]))
 
 
 def _encoders(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:

@@ -18,6 +18,7 @@ import pytest
 from small_datasets import FORMATS, collected, written
 
 from imagine_bench.data.collect import describe
+from imagine_bench.data.episodes import joined
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 
@@ -123,6 +124,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("npz", bytes_of("card.json", lambda old: b"[]"), "is not a dataset's card"),
     ("npz", bytes_of("privileged.npz", flipped), "privileged.npz is not a part of a dataset"),
     ("npz", lambda folder: (folder / "privileged.npz").unlink(), "There is no"),
+    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "it is not what the card says"),
     ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "the last frames of episodes"),
     ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "is not a LeRobot dataset of macro-actions"),
     ("lerobot", bytes_of(_DATA, lambda old: old[:-200]), "is not a LeRobot dataset of macro-actions"),
@@ -180,6 +182,21 @@ def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
-def test_no_episodes_and_no_numbers_are_refused_before_writing() -> None:
+def test_no_value_changes_with_its_type() -> None:
+    """Others may keep actions as floats and rewards as integers; what is no action is refused."""
+    episodes = collected()[0]
+    steps, frames = episodes.steps(0)
+    part = {name: getattr(episodes, name)[steps] for name in ("actions", "rewards", "terminated", "truncated")}
+    part |= {"frames": episodes.frames[frames], "action_masks": episodes.action_masks[frames].astype(np.bool_)}
+    part["success"] = episodes.success[0]
+    floats = joined([{**part, "actions": part["actions"].astype(np.float32)}])
+    assert floats.hash == joined([part]).hash
+    with pytest.raises(InvalidValueError, match="actions holds float64, not int64"):
+        joined([{**part, "actions": part["actions"] + 0.5}])
+    with pytest.raises(InvalidValueError, match="there is no episode"):
+        joined([])
+
+
+def test_lists_are_no_arrays() -> None:
     with pytest.raises(InvalidValueError, match="lengths holds list, not int64"):
         dataclasses.replace(collected()[0], lengths=[1, 2])
