@@ -15,11 +15,13 @@ import gymnasium
 
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import (
+    EXTRAS,
     ImagineBenchError,
     InvalidValueError,
     SetupError,
     UnknownNameError,
     brief,
+    lacking,
     plain,
     require_known,
 )
@@ -258,9 +260,17 @@ OBSERVERS = tuple(
 
 
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
+
+    SetupError if it needs an extra of this package that is not installed.
+    """
     module, _, attribute = target.partition(":")
-    found = importlib.import_module(module)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        raise lacking(error.name) from error
     return getattr(found, attribute) if attribute else found
 
 
