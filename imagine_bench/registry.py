@@ -284,6 +284,11 @@ def agents() -> dict[str, AgentEntry]:
     return {**AGENTS, **usable(AGENT_GROUP)}
 
 
+def is_own(task: str) -> bool:
+    """Whether a task is this suite's, which needs no check and has its encoders."""
+    return task in TASKS and TASKS[task].spec.startswith("imagine_bench.")
+
+
 def regressions() -> dict[str, Any]:
     """All regression tasks by name, likewise."""
     return {**REGRESSIONS, **usable(REGRESSION_GROUP)}

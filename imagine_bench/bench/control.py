@@ -41,7 +41,7 @@ def plan_control(
         require_of_task(found, registry.task(task))
         changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
     wanted = protocol(task, preset, **changes)
-    if task not in registry.TASKS:
+    if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":
