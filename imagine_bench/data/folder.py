@@ -120,7 +120,7 @@ def read_apart(dataset: Dataset) -> dict[str, dict[str, NDArray[Any]]]:
 
 def require_of_task(dataset: Dataset, spec: TaskSpec) -> None:
     """Raise InvalidValueError for a dataset that is of another task, by its card or by its number of actions."""
-    task = spec.id if dataset.card is None else dataset.card.get("task")
-    if (task, dataset.episodes.n_actions) != (spec.id, spec.n_actions):
-        of = f"{task}, of {dataset.episodes.n_actions} macro-actions"
-        raise InvalidValueError(f"{dataset.folder} is of {of}, not of {spec.id}; give a dataset of {spec.id}.")
+    task = None if dataset.card is None else dataset.card.get("task")
+    if task not in (None, spec.id) or dataset.episodes.n_actions != spec.n_actions:
+        given, wanted = f"{dataset.episodes.n_actions} macro-actions", f"{spec.id}, which has {spec.n_actions}"
+        raise InvalidValueError(f"{dataset.folder} is of {task or 'a task'} with {given}; give one of {wanted}.")
