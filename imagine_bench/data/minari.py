@@ -76,7 +76,9 @@ def read(path: Path) -> Episodes:
         except FileNotFoundError as error:
             raise InvalidValueError(f"a file of it is missing ({error})") from error
         if len(parts) != found.total_episodes or sum(len(part["actions"]) for part in parts) != found.total_steps:
-            raise InvalidValueError(f"{found.total_episodes} episodes are said to be in it and {len(parts)} are")
+            raise InvalidValueError(
+                f"{found.total_episodes} episodes of {found.total_steps} steps are not what it holds"
+            )
         return joined(parts)
 
 

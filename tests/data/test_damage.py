@@ -93,6 +93,11 @@ def with_image(content: bytes) -> Callable[[pa.Table], pa.Table]:
     return change
 
 
+def steps_less_one(content: bytes) -> bytes:
+    values = json.loads(content)
+    return json.dumps({**values, "total_steps": values["total_steps"] - 1}).encode()
+
+
 def png(size: tuple[int, int], mode: str = "RGB") -> bytes:
     with io.BytesIO() as stream:
         PIL.Image.new(mode, size).save(stream, "PNG")
@@ -150,6 +155,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: old.replace(b"0.5", b"9.5")), "is not a Minari dataset"),
+    ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not what it holds"),
     ("minari", bytes_of("*/data/2/*.parquet", lambda old: old[:-200]), "is not a Minari dataset of macro-actions"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
 ]  # fmt: skip
