@@ -15,11 +15,13 @@ import gymnasium
 
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import (
+    EXTRAS,
     ImagineBenchError,
     InvalidValueError,
     SetupError,
     UnknownNameError,
     brief,
+    lacking,
     plain,
     require_known,
 )
@@ -258,9 +260,17 @@ OBSERVERS = tuple(
 
 
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
+
+    SetupError if it needs an extra of this package that is not installed.
+    """
     module, _, attribute = target.partition(":")
-    found = importlib.import_module(module)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        raise lacking(error.name) from error
     return getattr(found, attribute) if attribute else found
 
 
@@ -272,6 +282,11 @@ def tasks() -> dict[str, TaskEntry]:
 def agents() -> dict[str, AgentEntry]:
     """All agents by name, also those of installed packages, without those that cannot be loaded."""
     return {**AGENTS, **usable(AGENT_GROUP)}
+
+
+def is_own(task: str) -> bool:
+    """Whether a task is this suite's, which needs no check and has its encoders."""
+    return task in TASKS and TASKS[task].spec.startswith("imagine_bench.")
 
 
 def regressions() -> dict[str, Any]:

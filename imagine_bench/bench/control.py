@@ -42,7 +42,7 @@ def plan_control(
     wanted = protocol(task, preset, **changes)
     if found is not None:
         require_fits(found, registry.task(task), wanted.appearance)
-    if task not in registry.TASKS:
+    if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
     if wanted.device != "cpu":

@@ -15,18 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import minari
 import numpy as np
+from minari.data_collector import EpisodeBuffer
 
 from imagine_bench import registry
 from imagine_bench.data.episodes import Episodes, joined
-from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.store.files import reading
-
-try:
-    import minari
-    from minari.data_collector import EpisodeBuffer
-except ImportError as error:
-    raise SetupError("minari is missing: run \"pip install 'imagine-bench[data]'\", or take --format npz.") from error
 
 _ROOT = "MINARI_DATASETS_PATH"
 
