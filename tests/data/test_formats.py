@@ -170,7 +170,7 @@ def test_large_sets_lie_in_several_files(tmp_path: Path, monkeypatch: pytest.Mon
     written(tmp_path / "set", "lerobot")
     listed = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     places = {(row["data/chunk_index"], row["data/file_index"]) for row in listed}
-    assert len(places) > 2 and max(places)[0] > 0
+    assert len(places) > 2 and max(places)[0] > 0 and max(file for _, file in places) == 1
     for row in listed:
         chunk, file = row["data/chunk_index"], row["data/file_index"]
         there = pq.read_table(tmp_path / f"set/data/chunk-{chunk:03d}/file-{file:03d}.parquet")
