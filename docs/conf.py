@@ -11,7 +11,7 @@ release = metadata.version("imagine-bench")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 4
-exclude_patterns = ["results/**/report"]
+exclude_patterns = ["results/**/report", "**/*.ipynb"]
 
 os.environ["MUJOCO_GL"] = "off"  # the site builds where there is no OpenGL
 autodoc_member_order = "bysource"

@@ -1,6 +1,6 @@
-"""Entrants of a bench: an agent as it is, ``dqn``, or with settings of its own, ``dqn:controller.discount=0.99``.
+"""What can be registered; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
-The text is the entrant's name in protocols, tables and files; one agent may enter a bench with several settings.
+The text is an entrant's name in protocols, tables and files; one agent may enter a bench with several settings.
 """
 
 from __future__ import annotations
@@ -9,12 +9,60 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from imagine_bench.errors import InvalidValueError
 
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
 _LONGEST = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskEntry:
+    """A registered task."""
+
+    spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
+    env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
+    env: str  #: ``"module:attr"`` of the environment's constructor
+    horizon: int  #: Macro-actions before truncation
+    #: Keyword arguments of both, which say which member of a family it is.
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentEntry:
+    """A registered agent."""
+
+    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
+    learns: bool = True  #: Whether training changes it; others are only evaluated
+    needs_encoder: bool = True  #: Whether it sees what an encoder gives
+    encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
+    #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
+    #: group)``.
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
+    privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
+    #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
+    external_training_loop: bool = False
+    title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
+    description: str = "A registered agent."  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorEntry:
+    """A registered regressor."""
+
+    make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
+    title: str  #: For headings, legends and tables
+    description: str  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderEntry:
+    """An encoder that an installed package offers, for any task."""
+
+    make: str  #: ``"module:attr"`` of a function without arguments to a :class:`.interfaces.FrameEncoder`
+    description: str = "An encoder."  #: One sentence for a reader who knows none of this
 
 
 class Entrant(NamedTuple):

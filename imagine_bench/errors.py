@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import re
 import reprlib
 from collections.abc import Iterable
@@ -78,6 +79,25 @@ class RunFailedError(ImagineBenchError):
     """At least one run of a bench failed; the message names its log."""
 
     exit_code = 1
+
+
+EXTRAS = {
+    "torch": "agents", "matplotlib": "report", "PIL": "report", "rerun": "rerun", "ray": "ray", "pygame": "play",
+    "minari": "data", "pyarrow": "data", "stable_baselines3": "peers", "sb3_contrib": "peers",
+}  # fmt: skip
+"""The extra of this package that brings a module."""
+
+
+def lacking(module: str) -> SetupError:
+    """What to say where a module of an extra is not installed."""
+    return SetupError(f"This needs {module}, which is not installed: pip install 'imagine-bench[{EXTRAS[module]}]'.")
+
+
+def require_modules(*modules: str) -> None:
+    """Raise SetupError if one of these modules, of extras, is not installed."""
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            raise lacking(module)
 
 
 def require_known(kind: str, given: str, known: Iterable[str]) -> str:

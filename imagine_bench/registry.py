@@ -7,55 +7,29 @@ import functools
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple
 
 import gymnasium
 
+from imagine_bench.entrants import AgentEntry as AgentEntry  # noqa: PLC0414 - users find it here
+from imagine_bench.entrants import EncoderEntry as EncoderEntry  # noqa: PLC0414 - users find it here
+from imagine_bench.entrants import RegressorEntry as RegressorEntry  # noqa: PLC0414 - users find it here
+from imagine_bench.entrants import TaskEntry as TaskEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import (
+    EXTRAS,
     ImagineBenchError,
     InvalidValueError,
     SetupError,
     UnknownNameError,
     brief,
+    lacking,
     plain,
     require_known,
 )
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskEntry:
-    """A registered task."""
-
-    spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
-    env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
-    env: str  #: ``"module:attr"`` of the environment's constructor
-    horizon: int  #: Macro-actions before truncation
-    #: Keyword arguments of both, which say which member of a family it is.
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AgentEntry:
-    """A registered agent."""
-
-    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
-    learns: bool = True  #: Whether training changes it; others are only evaluated
-    needs_encoder: bool = True  #: Whether it sees what an encoder gives
-    encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
-    #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
-    #: group)``.
-    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
-    privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
-    #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
-    external_training_loop: bool = False
-    title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
-    description: str = "A registered agent."  #: One sentence for a reader who knows none of this
-
 
 TASKS: dict[str, TaskEntry] = {
     **{
@@ -183,23 +157,6 @@ DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegressorEntry:
-    """A registered regressor."""
-
-    make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
-    title: str  #: For headings, legends and tables
-    description: str  #: One sentence for a reader who knows none of this
-
-
-@dataclass(frozen=True, kw_only=True)
-class EncoderEntry:
-    """An encoder that an installed package offers, for any task."""
-
-    make: str  #: ``"module:attr"`` of a function without arguments to a :class:`.interfaces.FrameEncoder`
-    description: str = "An encoder."  #: One sentence for a reader who knows none of this
-
-
 REGRESSIONS = {
     "toy_regression": "imagine_bench.tasks.toy_regression:SPEC",
     "robot_ik": "imagine_bench.tasks.robot_ik.spec:SPEC",
@@ -258,9 +215,17 @@ OBSERVERS = tuple(
 
 
 def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names, or the module that ``"module"`` names."""
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
+
+    SetupError if it needs an extra of this package that is not installed.
+    """
     module, _, attribute = target.partition(":")
-    found = importlib.import_module(module)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        raise lacking(error.name) from error
     return getattr(found, attribute) if attribute else found
 
 
@@ -272,6 +237,11 @@ def tasks() -> dict[str, TaskEntry]:
 def agents() -> dict[str, AgentEntry]:
     """All agents by name, also those of installed packages, without those that cannot be loaded."""
     return {**AGENTS, **usable(AGENT_GROUP)}
+
+
+def is_own(task: str) -> bool:
+    """Whether a task is this suite's, which needs no check and has its encoders."""
+    return task in TASKS and TASKS[task].spec.startswith("imagine_bench.")
 
 
 def regressions() -> dict[str, Any]:

@@ -14,6 +14,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from imagine_bench.errors import EXTRAS
+
 _TOP = Path(__file__).parent.parent
 _PROJECT = tomllib.loads((_TOP / "pyproject.toml").read_text())
 _LOCK = (_TOP / ".ci/requirements.lock").read_text()
@@ -101,8 +103,11 @@ def locked(python: str) -> dict[str, Version]:
 def test_the_lock_meets_every_requirement(python: str) -> None:
     extras = _PROJECT["project"]["optional-dependencies"]
     versions = locked(python) | {"torch": Version(torch_version())}
-    for text in [*_PROJECT["project"]["dependencies"], *extras["dev"], *extras["docs"]]:
+    of_all = [text for name in ("agents", "report", "rerun", "dev", "docs") for text in extras[name]]
+    for text in [*_PROJECT["project"]["dependencies"], *of_all]:
         wanted = Requirement(text)
+        if wanted.name == "imagine-bench":
+            continue
         if wanted.marker is None or wanted.marker.evaluate({"python_version": python}):
             assert wanted.name in versions, f"{wanted.name} is not in the lock; run 'make lock'"
             assert versions[wanted.name] in wanted.specifier, f"the lock has another {wanted.name}; run 'make lock'"
@@ -122,15 +127,14 @@ def test_the_lock_has_a_hash_for_everything_and_names_no_host() -> None:
 
 
 def torch_version() -> str:
-    """The version of torch in pyproject.toml, the only package that is not in the lock."""
-    (pin,) = (text for text in _PROJECT["project"]["dependencies"] if text.startswith("torch=="))
-    return pin.removeprefix("torch==")
+    """The version of torch that setup installs, the only package that is not in the lock."""
+    (described,) = tomllib.loads((_TOP / ".ci/lock.toml").read_text())["dependency-metadata"]
+    return str(described["version"])
 
 
 def test_torch_is_pinned_alike_and_its_needs_are_locked() -> None:
     (described,) = tomllib.loads((_TOP / ".ci/lock.toml").read_text())["dependency-metadata"]
     assert "torch" not in locked("3.11")
-    assert described["version"] == torch_version()
     assert f"readonly torch={torch_version()}\n" in (_TOP / ".ci/setup.sh").read_text()
     for needed in map(Requirement, metadata.requires("torch") or []):
         of_gpus = needed.name.startswith(("nvidia-", "cuda-")) or needed.name == "triton"
@@ -139,7 +143,54 @@ def test_torch_is_pinned_alike_and_its_needs_are_locked() -> None:
             assert locked("3.11")[needed.name] in needed.specifier
 
 
+def test_environments_alone_need_no_torch_rerun_or_matplotlib() -> None:
+    """In a process that finds no module of an extra: an episode, the lists, the rules; and what a bench says."""
+    code = f"""
+import sys
+from importlib.machinery import PathFinder
+class Without(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *rest):
+        return None if name.partition(".")[0] in {sorted(EXTRAS)} else super().find_spec(name, *rest)
+sys.meta_path = [Without if finder is PathFinder else finder for finder in sys.meta_path]
+import gymnasium, imagine_bench
+from imagine_bench.cli import main
+env = gymnasium.make("imagine_bench/PickPlace-v0", execution="kinematic")
+env.reset(seed=0)
+env.step(0)
+env.close()
+assert main(["list"]) == 0
+assert main(["doctor"]) == 0
+assert main(["check", "--task", "pick_place"]) == 0
+assert main(["bench", "--task", "arrow_puzzle", "--preset", "smoke"]) == 2
+assert main(["view"]) == 2
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "This needs matplotlib, which is not installed: pip install 'imagine-bench[report]'." in done.stderr
+    assert "This needs rerun, which is not installed: pip install 'imagine-bench[rerun]'." in done.stderr
+
+
+def test_every_module_of_an_extra_is_brought_by_it() -> None:
+    brought = {"PIL": "pillow", "rerun": "rerun-sdk", "pygame": "pygame-ce"}
+    for module, extra in EXTRAS.items():
+        named = [Requirement(text).name for text in _PROJECT["project"]["optional-dependencies"][extra]]
+        assert brought.get(module, module.replace("_", "-")) in named
+
+
 def test_python_versions_agree() -> None:
     wanted = Requirement(f"python{_PROJECT['project']['requires-python']}").specifier
     assert [minor for minor in range(30) if f"3.{minor}.1" in wanted] == [int(python[2:]) for python in _PYTHONS]
     assert f'readonly versions="{" ".join(_PYTHONS)}"' in (_TOP / ".ci/setup.sh").read_text()
+
+
+def test_the_container_does_what_a_newcomer_does() -> None:
+    """Its steps are the README's two commands on a bare Debian; no builder of images runs here."""
+    steps = (_TOP / ".ci/Dockerfile").read_text()
+    gl_packages = re.search(r'gl_packages="([^"]+)"', (_TOP / ".ci/setup.sh").read_text())
+    assert gl_packages is not None
+    (installs,) = re.findall(r"apt-get install (.*)", steps)
+    assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
+    assert re.search(r"^RUN make setup$", steps, re.MULTILINE) and 'CMD ["make", "test"]' in steps
+    python = re.search(r"^FROM python:(3\.\d+)-slim$", steps, re.MULTILINE)
+    assert python is not None and python[1] in _PYTHONS

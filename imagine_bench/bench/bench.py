@@ -11,7 +11,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.bench.launchers import Failure, Job, Launcher
 from imagine_bench.bench.progress import ProgressBars
-from imagine_bench.errors import RunFailedError, SetupError
+from imagine_bench.errors import RunFailedError, SetupError, require_modules
 from imagine_bench.machine import describe_environment, gl_renderer
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
@@ -45,9 +45,10 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
     Raises:
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
         BusyError: Another bench works in the same folder.
-        SetupError: The folder cannot be written, or there is no GL.
+        SetupError: The folder cannot be written, there is no GL, or an extra of this package is not installed.
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
+    require_modules("matplotlib", "PIL", "rerun")  # torch only where an agent is made of it
     store = BenchStore(bench_folder(root, wanted), wanted)
     store.open()
     with store.lock():

@@ -18,7 +18,7 @@ from imagine_bench.cli.analysis import Generalise, Plan, Policy
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, brief, plain
+from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
 from imagine_bench.store.files import reason
 
 _LONGEST_WORD = 1000
@@ -79,8 +79,8 @@ def main(words: Sequence[str] | None = None) -> int:
     except OSError as error:
         where = error.filename or "standard output"
         return _say(f"{where} cannot be read or written: {reason(error)}.")
-    except (MemoryError, RecursionError, UnicodeError) as error:
-        return _say(f"{type(error).__name__}: {error}")
+    except (ModuleNotFoundError, MemoryError, RecursionError, UnicodeError) as error:
+        return _say(_words(error))
     except KeyboardInterrupt:
         resumes = isinstance(command, Bench | Study)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
@@ -96,6 +96,15 @@ def _readable(word: str) -> str:
             "control character or outside Unicode."
         )
     return re.sub(r"^(--[a-z-]+=)?~(?=/|$)", lambda found: f"{found[1] or ''}{Path.home()}", word)
+
+
+def _words(error: Exception) -> object:
+    """What to say of an error of Python's own; one that nobody foresaw is raised again."""
+    if not isinstance(error, ModuleNotFoundError):
+        return f"{type(error).__name__}: {error}"
+    if error.name not in EXTRAS:
+        raise error
+    return lacking(error.name)
 
 
 def _say(error: object, exit_code: int = 2) -> int:

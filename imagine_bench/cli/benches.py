@@ -210,4 +210,4 @@ def _show(folder: Path, result: Result | None = None) -> None:
     print(f"\nReport:     {page}")
     recordings = [run.recording for run in result.runs if run.recording is not None]
     if recordings:
-        print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (make view opens the newest)")
+        print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (imagine-bench view opens the newest)")

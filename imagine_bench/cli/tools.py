@@ -108,9 +108,9 @@ class Play:
     """Task to play."""
     model: Annotated[Path | None, shown("PATH", "(default: none)")] = None
     """A run's folder, whose agent imagines the same keys beside the real scene."""
-    execution: Annotated[str | None, shown("STR", "(default: the model's, else physics)")] = None
+    execution: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
     """physics or kinematic."""
-    appearance: Annotated[str | None, shown("STR", "(default: the model's, else clean)")] = None
+    appearance: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
     """Appearance level."""
     encoder: Annotated[str | None, shown("STR", "(default: the bundled one)")] = None
     """Name or file of the encoder that the model used."""

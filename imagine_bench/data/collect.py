@@ -177,6 +177,7 @@ def describe(dataset: Dataset) -> str:
             "episodes": lines["episodes"],
             "success": f"{lines['success']}; chance {card['chance_level']:.1%}, optimum {card['optimum']:.1%}",
             "return": f"{lines['return']}; optimum {card['optimal_return']:.2f}",
+            "faults": f"{card['faults']} macro-actions whose physics disagreed with the rules",
             "apart": f"{', '.join(apart)}: never given to a learner",
             "commit": str(card["commit"]),
             "command": str(card["command"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +22,10 @@ _HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's pa
 
 
 def study_table(study: Study, lines: Sequence[Line]) -> str:
-    """Success (%) of every variant at every budget, and its difference in points from what it is compared with."""
+    """Success (%) of every variant at every budget, and its difference in points from what it is compared with.
+
+    With what a model imagines right of one macro-action, at the last budget (%).
+    """
     budgets = [f"{budget:,}" for budget in study.budgets]
     rows = []
     for line in lines:
@@ -29,8 +33,11 @@ def study_table(study: Study, lines: Sequence[Line]) -> str:
         moved = [estimate_text(one) for one in line.difference] if line.difference else ["–"] * len(budgets)
         one = line.variant
         head = (one.factor, one.name, one.agent)
-        rows.append([*head, *reached, one.against or "–", *moved, f"{line.train_cpu_s:.0f}"])
-    return "\n".join(markdown(["factor", "variant", "agent", *budgets, "against", *budgets, "CPU s"], rows))
+        right = line.imagined_right[:, -1].mean()
+        foreseen = "–" if np.isnan(right) else percent(right)
+        rows.append([*head, *reached, one.against or "–", *moved, foreseen, f"{line.train_cpu_s:.0f}"])
+    columns = ["factor", "variant", "agent", *budgets, "against", *budgets, "imagined right", "CPU s"]
+    return "\n".join(markdown(columns, rows))
 
 
 def write_study(folder: Path, study: Study, lines: Sequence[Line]) -> None:
@@ -69,12 +76,16 @@ def _origin(line: Line) -> dict[str, Any]:
 
 
 def _seeds(study: Study, lines: Sequence[Line]) -> str:
-    rows: list[list[Any]] = [["factor", "variant", "agent", "protocol", "seed", "episodes", "success"]]
+    head = "factor,variant,agent,against,protocol,seed,episodes,success,imagined_right,cpu_s"
+    rows: list[list[Any]] = [head.split(",")]
     for line in lines:
-        for seed, row in zip(study.seeds, line.success, strict=True):
-            for budget, success in zip(study.budgets, row, strict=True):
-                variant, protocol = line.variant, line.folder.name.rpartition("-")[2]
-                rows.append([variant.factor, variant.name, variant.agent, protocol, seed, budget, f"{success:.6g}"])
+        one = line.variant
+        named = [one.factor, one.name, one.agent, one.against or "", line.folder.name.rpartition("-")[2]]
+        for (seed, budget), success, right in zip(
+            itertools.product(study.seeds, study.budgets), line.success.flat, line.imagined_right.flat, strict=True
+        ):
+            foreseen = "" if np.isnan(right) else f"{right:.4f}"
+            rows.append([*named, seed, budget, f"{success:.6g}", foreseen, f"{line.train_cpu_s:.1f}"])
     return csv_text(rows)
 
 

@@ -108,7 +108,7 @@ def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
 
     Raises as :func:`resolve`, and BusyError: another process trains it.
     """
-    if spec.id not in registry.TASKS and bundled_name(spec.encoder, appearance, kind) not in bundled():
+    if not registry.is_own(spec.id) and bundled_name(spec.encoder, appearance, kind) not in bundled():
         path, recipe = cached(spec, appearance, kind), "codes" if kind == "codes" else "default"
         settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
         what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"

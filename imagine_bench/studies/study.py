@@ -10,7 +10,7 @@ import dataclasses
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import tasks
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
-from imagine_bench.store.results import BenchResult
+from imagine_bench.store.results import BenchResult, RunResult
 
 BASE = "base"
 """Name of the factor of what the other variants are compared with."""
@@ -114,6 +114,9 @@ class Line:
 
     variant: Variant  #: Which
     success: NDArray[np.float64]  #: Success shares. Shape (seeds, budgets).
+    #: Share of the futures one macro-action ahead that are imagined as the rules have them, over all macrostates and
+    #: macro-actions; NaN where none were sampled. Shape (seeds, budgets).
+    imagined_right: NDArray[np.float64]
     train_cpu_s: float  #: Mean CPU seconds of training a run
     #: Against the variant it is compared with, one a budget; None where it is compared with nothing.
     difference: tuple[Estimate, ...] | None
@@ -173,6 +176,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
         Line(
             variant=variant,
             success=success[variant.name],
+            imagined_right=_imagined_right(results[variant.name].of(variant.agent)),
             train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in results[variant.name].runs])),
             difference=None if variant.against is None else _differences(study, variant, success),
             folder=results[variant.name].folder,
@@ -180,6 +184,13 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
         )
         for variant in study.variants
     )
+
+
+def _imagined_right(runs: Sequence[RunResult]) -> NDArray[np.float64]:
+    futures = [[checkpoint.futures for checkpoint in run.checkpoints] for run in runs]
+    return np.array([
+        [np.nan if each is None else 1.0 - each.total_variation[0].mean() for each in row] for row in futures
+    ])  # fmt: skip
 
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:

@@ -21,6 +21,8 @@ from imagine_bench.machine import commit, gl_renderer, installed, machine, versi
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
 _FRAMES = 200
 _NEEDED_DISK_GIB = 1.0
+EXTRAS_OF_A_BENCH = ("agents", "report", "rerun")
+"""Extras that make an installation of environments one of benches; ``all`` is all of them."""
 _LOCK = Path(imagine_bench.__file__).parents[1] / ".ci" / "requirements.lock"
 _REASONS = {
     "mujoco": " MuJoCo 4.0 breaks dm-control 1.0.50: 'MjModel' has no 'flex_vertedge'.",
@@ -69,12 +71,12 @@ def examine() -> Examination:
         "64x64 frame": frame,
         "free disk": f"{free_gib:.1f} GiB",
     }
-    notes = _notes(here["gpu"], gl) + unlocked_versions()
+    notes = _notes(here["gpu"], gl) + unlocked_versions() + missing_extras()
     return Examination(facts=tuple(facts.items()), complaints=tuple(complaints), notes=tuple(notes))
 
 
 def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str]:
-    """A sentence for each package that is missing or not of a version that works; extras are not looked for.
+    """A sentence for each package that is missing or not of a version that works; an extra's may be missing.
 
     Args:
         version_of: The installed version of a package, ``"missing"`` where there is none.
@@ -82,16 +84,38 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
     complaints = []
     for text in metadata.requires("imagine-bench") or []:
         wanted = Requirement(text)
-        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
-            continue
+        extra = _extra_of(wanted)
         version = version_of(wanted.name)
+        if extra is None or (extra and version == "missing"):
+            continue
         if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
             state = "is missing" if version == "missing" else f"{version} is installed"
             complaints.append(
-                f"{wanted.name} {state}, but {wanted.specifier} is needed.{_REASONS.get(wanted.name, '')} "
-                "Run 'make setup' in a fresh .venv."
+                f"{wanted.name} {state}, but {wanted.specifier} is needed.{_REASONS.get(wanted.name, '')} {_repair()}"
             )
     return complaints
+
+
+def _repair() -> str:
+    if _LOCK.exists():
+        return "Run 'make setup' in a fresh .venv."
+    return "Run pip install --upgrade imagine-bench."
+
+
+def _extra_of(wanted: Requirement) -> str | None:
+    """Which of the extras of a bench brings a package; ``""`` where it always comes, None where it never does."""
+    marker = wanted.marker
+    return next((extra for extra in ("", *EXTRAS_OF_A_BENCH) if not marker or marker.evaluate({"extra": extra})), None)
+
+
+def missing_extras(version_of: Callable[[str], str] = installed) -> list[str]:
+    """A sentence that names the extras of a bench that are not installed, or none; ``version_of`` as above."""
+    wanted = [Requirement(text) for text in metadata.requires("imagine-bench") or []]
+    lacks = {_extra_of(each) for each in wanted if version_of(each.name) == "missing"} - {"", None}
+    if not lacks:
+        return []
+    names = ",".join(sorted(str(extra) for extra in lacks))
+    return [f"Environments work. A bench needs more: pip install 'imagine-bench[{names}]'."]
 
 
 def unlocked_versions(lock: Path = _LOCK, version_of: Callable[[str], str] = installed) -> list[str]:

@@ -30,12 +30,14 @@ _WIDTH, _HEIGHT, _PANEL, _FRAME, _TOP = 640, 480, 284, 192, 36
 
 
 class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A task, made with ``render_mode="rgb_array"``, for ``gymnasium.utils.play``: a step is one image of a window.
+    """A task for ``gymnasium.utils.play``: a step is one image of a window.
 
     Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
     change nothing; the last one returns its result. An ``imaginer`` sees the first frame of each episode, then keys
     alone. ``seed`` is of the first episode, and of what the imagination draws.
     """
+
+    render_mode = "rgb_array"
 
     def __init__(self, env: gymnasium.Env[Any, Any], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
         super().__init__(env)
@@ -100,11 +102,11 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
             yield self._window()
         self._frame, self._info = frame, info
         self.episodes += terminated or truncated
-        self.solved += bool(info["success"])
+        self.solved += bool(info["is_success"])
         if self._rollout is not None:
             self.imagined += 1
             self.foreseen += bool(np.array_equal(self._rollout.macrostates[-1], info["macrostate"]))
-        end = "solved" if info["success"] else "an illegal end" if terminated else "out of time" if truncated else ""
+        end = "solved" if info["is_success"] else "an illegal end" if terminated else "out of time" if truncated else ""
         self._said += f"\nreward {reward:+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)
 
@@ -116,7 +118,9 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._imaginer is not None:
             panels.append(("what the model imagines", *self._imagination()))
         canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT), "white")
-        canvas.paste(Image.fromarray(np.asarray(self.env.render())).resize((_WIDTH, _HEIGHT)), (0, 0))
+        view = getattr(self._scene, "human_view", None)  # others' tasks may show the agent's frame alone
+        scene = Image.fromarray(self._frame if view is None else view(_WIDTH, _HEIGHT))
+        canvas.paste(scene.resize((_HEIGHT, _HEIGHT) if view is None else (_WIDTH, _HEIGHT)), (0, 0))
         draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(14)
         for column, (title, image, words) in enumerate(panels):
             left = _WIDTH + 8 + column * _PANEL
@@ -145,14 +149,14 @@ def play(
 ) -> str:  # fmt: skip
     """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
-    ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else contact physics
-    and clean frames. ``encoder`` is as of :func:`imagine_bench.store.trained.load_trained`.
+    ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
+    environment does. ``encoder`` is as of :func:`imagine_bench.store.trained.load_trained`.
 
     Raises:
         ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what
             ``load_trained`` raises, or neither pygame nor desktop.
     """
-    chosen: dict[str, Any] = {"execution": "physics", "appearance": "clean"}
+    chosen: dict[str, Any] = {}
     imaginer = None
     if model is not None:
         trained = load_trained(model, encoder=encoder)
@@ -170,7 +174,7 @@ def play(
         from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
     if "matplotlib" in sys.modules:
         sys.modules["matplotlib"].use("agg")
-    env = gymnasium.make(spec.env_id, render_mode="rgb_array", disable_env_checker=True, **chosen)
+    env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
     keys = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)

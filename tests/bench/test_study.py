@@ -8,6 +8,8 @@ import json
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import bench_fakes  # noqa: F401 - registers its agents
 import numpy as np
@@ -25,7 +27,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
 from imagine_bench.studies.catalogue import STUDIES
-from imagine_bench.studies.study import BASE, Line, Study, Variant, load_study, run_study
+from imagine_bench.studies.study import BASE, Line, Study, Variant, _imagined_right, load_study, run_study
 
 STUDY = Study(
     name="fakes",
@@ -218,21 +220,38 @@ def test_the_settings_of_every_study_exist(name: str) -> None:
         assert (changed == settings.resolve("fast", {}, "chapter_5")) == (not variant.settings)
 
 
-def test_the_table_says_what_helps() -> None:
+def test_the_table_says_what_helps(tmp_path: Path) -> None:
     success = {name: np.array([[value, 0.9], [value, 0.9]]) for name, value in (("table", 0.25), ("mild", 0.5))}
     from imagine_bench.statistics import Estimate
 
     lines = [
         Line(
             variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, folder=Path("a-b"), environment={},
-            difference=None,
+            difference=None, imagined_right=np.full((2, 2), np.nan),
         ),
         Line(
             variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"), environment={},
             difference=(Estimate(0.25, 0.1, 0.4), Estimate(0.0, -0.1, 0.1)),
+            imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]),
         ),
     ]  # fmt: skip
-    assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in study_table(STUDY, lines)
+    without, with_model = study_table(STUDY, lines).splitlines()[-2:]
+    assert without.endswith("| – | 1 |")
+    assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in with_model
+    assert with_model.endswith("| 30.0 | 2 |"), "right at the last budget, mean of seeds"
+    write_study(tmp_path, STUDY, lines)
+    rows = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
+    assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
+
+
+def test_what_is_imagined_right_is_what_the_rules_have_too() -> None:
+    def run(*distances: list[list[float]] | None) -> Any:
+        given = [None if each is None else SimpleNamespace(total_variation=np.array(each)) for each in distances]
+        return SimpleNamespace(checkpoints=[SimpleNamespace(futures=futures) for futures in given])
+
+    one_ahead_then_two = [[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]]
+    right = _imagined_right([run(None, one_ahead_then_two), run(one_ahead_then_two, None)])
+    assert np.array_equal(right, [[np.nan, 0.5], [0.5, np.nan]], equal_nan=True)
 
 
 UNSTUDIED = {

@@ -18,6 +18,7 @@ import pytest
 from small_datasets import FORMATS, collected, written
 
 from imagine_bench.data.collect import describe
+from imagine_bench.data.episodes import joined
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 
@@ -77,14 +78,24 @@ def info(**values: Any) -> Callable[[Path], None]:
     return bytes_of("meta/info.json", lambda old: json.dumps({**json.loads(old), **values}).encode())
 
 
+def replaced(old: pa.Table, name: str, values: Any) -> pa.Table:
+    field = old.schema.field(name)
+    column = values if isinstance(values, pa.ChunkedArray) else pa.array(values, field.type)
+    return old.set_column(old.schema.get_field_index(name), field, column)
+
+
 def with_image(content: bytes) -> Callable[[pa.Table], pa.Table]:
     def change(old: pa.Table) -> pa.Table:
         images = old["observation.image"].to_pylist()
         images[3] = {"bytes": content, "path": None}
-        column = old.schema.get_field_index("observation.image")
-        return old.set_column(column, "observation.image", pa.array(images, old.schema.field(column).type))
+        return replaced(old, "observation.image", images)
 
     return change
+
+
+def steps_less_one(content: bytes) -> bytes:
+    values = json.loads(content)
+    return json.dumps({**values, "total_steps": values["total_steps"] - 1}).encode()
 
 
 def png(size: tuple[int, int], mode: str = "RGB") -> bytes:
@@ -123,12 +134,16 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("npz", bytes_of("card.json", lambda old: b"[]"), "is not a dataset's card"),
     ("npz", bytes_of("privileged.npz", flipped), "privileged.npz is not a part of a dataset"),
     ("npz", lambda folder: (folder / "privileged.npz").unlink(), "There is no"),
+    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "it is not what the card says"),
     ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "the last frames of episodes"),
     ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "is not a LeRobot dataset of macro-actions"),
     ("lerobot", bytes_of(_DATA, lambda old: old[:-200]), "is not a LeRobot dataset of macro-actions"),
     ("lerobot", table(lambda old: old[:-1]), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old[:-1], "final_frames.parquet"), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old.take(list(range(len(old)))[::-1])), "its rows are not in order"),
+    ("lerobot", table(lambda old: replaced(old, "episode_index", old["episode_index"][::-1])), "rows are not in order"),
+    ("lerobot", table(lambda old: replaced(old, "action", [0.5] * len(old))), "an action is no integer"),
+    ("lerobot", table(lambda old: replaced(old, "next.reward", [np.nan] * len(old))), "reward 0 is not finite"),
     ("lerobot", table(lambda old: old.drop_columns(["next.reward"])), "next.reward"),
     ("lerobot", table(with_image(b"not a PNG")), "cannot identify image"),
     ("lerobot", table(with_image(png((64, 64))[:60])), "image file is truncated"),
@@ -140,6 +155,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: old.replace(b"0.5", b"9.5")), "is not a Minari dataset"),
+    ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not what it holds"),
     ("minari", bytes_of("*/data/2/*.parquet", lambda old: old[:-200]), "is not a Minari dataset of macro-actions"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
 ]  # fmt: skip
@@ -180,6 +196,21 @@ def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
-def test_no_episodes_and_no_numbers_are_refused_before_writing() -> None:
+def test_no_value_changes_with_its_type() -> None:
+    """Others may keep actions as floats and rewards as integers; what is no action is refused."""
+    episodes = collected()[0]
+    steps, frames = episodes.steps(0)
+    part = {name: getattr(episodes, name)[steps] for name in ("actions", "rewards", "terminated", "truncated")}
+    part |= {"frames": episodes.frames[frames], "action_masks": episodes.action_masks[frames].astype(np.bool_)}
+    part["success"] = episodes.success[0]
+    floats = joined([{**part, "actions": part["actions"].astype(np.float32)}])
+    assert floats.hash == joined([part]).hash
+    with pytest.raises(InvalidValueError, match="actions holds float64, not int64"):
+        joined([{**part, "actions": part["actions"] + 0.5}])
+    with pytest.raises(InvalidValueError, match="there is no episode"):
+        joined([])
+
+
+def test_lists_are_no_arrays() -> None:
     with pytest.raises(InvalidValueError, match="lengths holds list, not int64"):
         dataclasses.replace(collected()[0], lengths=[1, 2])

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import gymnasium
@@ -97,6 +98,15 @@ def test_the_twelve_lines_bench_an_agent(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "my agent" in done.stdout and "DQN" in done.stdout
     assert list(tmp_path.glob("runs/arrow_puzzle/*/my_agent/seed_1/DONE"))
+
+
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
+    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    code = f"import matplotlib\nmatplotlib.use('agg')\nif __name__ == '__main__':\n{textwrap.indent(code, '    ')}\n"
+    code = code.replace("--agents random dqn factored", "--agents random")
+    (tmp_path / "notebook.py").write_text(code + "    assert exit_code == 0\n")
+    subprocess.run([sys.executable, "notebook.py"], cwd=tmp_path, check=True, capture_output=True, timeout=240)
 
 
 def test_pages_are_short() -> None:

@@ -201,7 +201,7 @@ def command(rng: np.random.Generator, root: Path) -> str:
     """A command line; it must say no in one sentence, or in tyro's own box, or come as far as to begin a bench."""
     flags = [
         "preset", "agents", "seeds", "budgets", "evaluation-episodes", "execution", "appearance", "encoder", "after",
-        "demonstrations", "queries", "dataset", "set", "device", "launcher",
+        "demonstrations", "queries", "dataset", "set", "device", "launcher", "test-appearance", "physics",
     ]  # fmt: skip
     word = as_word(hostile(rng))
     words = ["bench", "--task", "arrow_puzzle", "--out", str(root), f"--{rng.choice(flags)}", word]

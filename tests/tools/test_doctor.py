@@ -70,10 +70,19 @@ def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> N
     assert environment.command() == "imagine-bench list"
 
 
-@pytest.mark.parametrize("package", ["mink", "jinja2", "matplotlib"])
+@pytest.mark.parametrize("package", ["mink", "jinja2", "safetensors"])
 def test_a_missing_package_is_named(package: str) -> None:
     (complaint,) = doctor.unmet_requirements(with_version(**{package: "missing"}))
     assert complaint.startswith(f"{package} is missing, but")
+
+
+def test_extras_of_a_bench_may_be_missing_and_are_named() -> None:
+    without = with_version(torch="missing", matplotlib="missing")
+    assert doctor.unmet_requirements(without) == [] and doctor.missing_extras() == []
+    (note,) = doctor.missing_extras(without)
+    assert note.endswith("pip install 'imagine-bench[agents,report]'.")
+    (complaint,) = doctor.unmet_requirements(with_version(torch="1.0"))
+    assert complaint.startswith("torch 1.0 is installed, but")
 
 
 def test_versions_of_this_machine_satisfy_every_requirement() -> None:

@@ -196,6 +196,30 @@ def test_keyboard_events_play_the_task(keyboard, capsys):
     twin.close()
 
 
+def test_a_task_of_others_shows_the_agent_s_frame():
+    class Bare(gymnasium.Env):
+        """What the contract asks for, and no more."""
+
+        inner = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic").unwrapped
+
+        def reset(self, *, seed=None, options=None):
+            return self.told(*self.inner.reset(seed=seed, options=options))
+
+        def step(self, action):
+            return self.told(*self.inner.step(action))
+
+        def told(self, *result):
+            return *result[:-1], {key: result[-1][key] for key in ("macrostate", "is_success", "legal", "fault")}
+
+    game = KeyboardGame(Bare(), registry.task("arrow_puzzle"), None, 0)
+    frame, _ = game.reset()
+    assert np.abs(game.render()[:480, :480][::15, ::15].astype(int) - frame[::2, ::2]).mean() < 8
+    seen, _ = until_done(game, 3)
+    assert not np.array_equal(seen[-1][0], frame)
+    np.testing.assert_array_equal(game.render()[36 : 36 + 192 : 3, 648 : 648 + 192 : 3], seen[-1][0])
+    Bare.inner.close()
+
+
 def trained(agent, task="arrow_puzzle"):
     protocol = SimpleNamespace(world={"execution": "kinematic"}, appearance="mild")
     spec = registry.task(task)
