@@ -1,0 +1,115 @@
+"""Our tasks in stable-worldmodel's ``World``: a policy scores what it deserves, and episodes are ours to the bit.
+
+The tests of the real library are skipped without it (``pip install stable-worldmodel imageio opencv-python-headless``).
+"""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.adapters.stable_worldmodel import SuccessTerminates
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.rules import facts
+
+KINEMATIC = {"execution": "kinematic"}
+
+
+def entry(task):
+    return registry.TASKS[task]
+
+
+def chance(task):
+    return facts(registry.task(task).rules, entry(task).horizon).chance_level
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_only_success_terminates_and_all_else_is_as_before(task):
+    plain = gymnasium.make(entry(task).env_id, **KINEMATIC)
+    wrapped = SuccessTerminates(gymnasium.make(entry(task).env_id, **KINEMATIC))
+    rng, ends = np.random.default_rng(0), {"success": 0, "illegal": 0, "limit": 0}
+    for seed in range(40):
+        one, other = plain.reset(seed=seed), wrapped.reset(seed=seed)
+        over, steps = False, 0
+        while not over:
+            assert np.array_equal(one[0], other[0]) and one[-1].keys() == other[-1].keys()
+            wrapped.unwrapped.np_random.integers(9)  # as the library does
+            action, steps = (rng.integers(plain.action_space.n) if seed % 3 else steps % 2), steps + 1
+            one, other = plain.step(action), wrapped.step(action)
+            _, reward, terminated, truncated, info = one
+            over = terminated or truncated
+            assert other[1] == reward and (other[2] or other[3]) == over and not (other[2] and other[3])
+            assert other[2] is bool(info["success"])
+            assert all(not isinstance(value, np.bool_) for value in other[-1].values())
+        ends["success" if other[2] else "illegal" if terminated else "limit"] += 1
+    assert ends["success"] and ends["illegal"], "non-vacuous"
+    plain.close()
+    wrapped.close()
+
+
+def test_a_recorded_macrostate_is_where_an_episode_begins():
+    env = SuccessTerminates(gymnasium.make(entry("arrow_puzzle").env_id, render_mode="rgb_array", **KINEMATIC))
+    for state in registry.task("arrow_puzzle").rules.start_states[:5]:
+        env.reset(seed=0)
+        env.unwrapped.start_at(np.array([state]))
+        np.testing.assert_array_equal(env.env.unwrapped.world.read().macrostate, state)
+        seen, *_ = env.step(0)
+        assert np.array_equal(env.render(), seen)
+    env.close()
+
+
+def test_another_environment_is_one_clear_error():
+    with pytest.raises(InvalidValueError, match="no task of imagine_bench"):
+        SuccessTerminates(gymnasium.make("CartPole-v1"))
+
+
+def world(task, n=4, *, wrapped=True, **options):
+    swm = pytest.importorskip("stable_worldmodel")
+    made = swm.World(
+        entry(task).env_id, num_envs=n, image_shape=(64, 64), max_episode_steps=entry(task).horizon,
+        pre_wrappers=[SuccessTerminates] if wrapped else None, **KINEMATIC, **options,
+    )  # fmt: skip
+    made.set_policy(swm.policy.RandomPolicy(seed=0))
+    return made
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_a_random_policy_scores_chance(task):
+    made, n = world(task), 1000
+    result, level = made.evaluate(episodes=n, seed=0), chance(task)
+    assert result["success_rate"] / 100 == pytest.approx(level, abs=3 * np.sqrt(level * (1 - level) / n))
+    made.close()
+
+
+def test_without_the_wrapper_it_scores_nearly_100_percent():
+    made = world("arrow_puzzle", wrapped=False, width=32, height=24)
+    assert made.evaluate(episodes=100, seed=0)["success_rate"] > 95
+    made.close()
+
+
+def test_what_is_collected_is_evaluated_from(tmp_path):
+    """Starts of recorded episodes; where the success is one macro-action away, a policy that repeats it succeeds."""
+    made = world("pick_place", n=2, observation="proprio")
+    swm = pytest.importorskip("stable_worldmodel")
+    made.collect(tmp_path / "data.lance", episodes=200, seed=0, progress=False)
+    data = swm.data.LanceDataset(path=tmp_path / "data.lance")
+    assert {"pixels", "macrostate", "success", "legal", "action"} <= set(data.column_names)
+    lengths = np.asarray(data.lengths)
+    episodes = [data.load_episode(i) for i in range(200)]
+    won = [i for i in range(200) if bool(np.asarray(episodes[i]["success"]).reshape(-1)[-1]) and lengths[i] > 1][:2]
+    begins = [int(lengths[i]) - 2 for i in won]
+    actions = [int(np.asarray(episodes[i]["action"]).reshape(-1)[-2]) for i in won]
+
+    class Repeats(swm.policy.BasePolicy):
+        def get_action(self, info_dict, **kwargs):
+            return np.array(actions)
+
+    made.set_policy(Repeats())
+    starts = [{"method": "start_at", "args": {"macrostate": {"value": "macrostate"}}}]
+    result = made.evaluate(
+        dataset=data, episodes_idx=won, start_steps=begins, goal_offset=1, eval_budget=1, callables=starts
+    )
+    assert result["episode_successes"].tolist() == [True, True]
+    made.close()
