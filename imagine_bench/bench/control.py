@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.bench import runner
 from imagine_bench.bench.queries import require_able
 from imagine_bench.bench.run_state import make_env
-from imagine_bench.data.folder import read_dataset, require_of_task
+from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, UnknownNameError, plain
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
@@ -38,9 +38,10 @@ def plan_control(
     """
     found = None if dataset is None else read_dataset(Path(dataset))
     if found is not None:
-        require_of_task(found, registry.task(task))
         changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
     wanted = protocol(task, preset, **changes)
+    if found is not None:
+        require_fits(found, registry.task(task), wanted.appearance)
     if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}

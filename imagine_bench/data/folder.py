@@ -118,9 +118,16 @@ def read_apart(dataset: Dataset) -> dict[str, dict[str, NDArray[Any]]]:
     return found
 
 
-def require_of_task(dataset: Dataset, spec: TaskSpec) -> None:
-    """Raise InvalidValueError for a dataset that is of another task, by its card or by its number of actions."""
-    task = spec.id if dataset.card is None else dataset.card.get("task")
-    if (task, dataset.episodes.n_actions) != (spec.id, spec.n_actions):
-        of = f"{task}, of {dataset.episodes.n_actions} macro-actions"
-        raise InvalidValueError(f"{dataset.folder} is of {of}, not of {spec.id}; give a dataset of {spec.id}.")
+def require_fits(dataset: Dataset, spec: TaskSpec, appearance: str) -> None:
+    """Raise InvalidValueError for a dataset of another task, or of frames that an encoder does not expect.
+
+    What it is of is said by its card, and by its number of actions.
+    """
+    task = None if dataset.card is None else dataset.card.get("task")
+    if task not in (None, spec.id) or dataset.episodes.n_actions != spec.n_actions:
+        given, wanted = f"{dataset.episodes.n_actions} macro-actions", f"{spec.id}, which has {spec.n_actions}"
+        raise InvalidValueError(f"{dataset.folder} is of {task or 'a task'} with {given}; give one of {wanted}.")
+    looks = appearance if dataset.card is None else dataset.card.get("appearance")
+    if looks != appearance:
+        how = f"--appearance {looks}, and --test-appearance for tests at another"
+        raise InvalidValueError(f"{dataset.folder} has frames of appearance {looks}, not {appearance}; give {how}.")

@@ -16,18 +16,14 @@ from typing import Any
 
 import numpy as np
 import PIL.Image
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from imagine_bench.data.episodes import FRAME_SHAPE, Episodes
-from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
-
-try:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-except ImportError as error:
-    raise SetupError("pyarrow is missing: run \"pip install 'imagine-bench[data]'\", or take --format npz.") from error
 
 _VERSION, _INFO, _FINAL = "v3.0", "meta/info.json", "final_frames.parquet"
 _PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

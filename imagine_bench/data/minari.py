@@ -15,18 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import minari
 import numpy as np
+from minari.data_collector import EpisodeBuffer
 
 from imagine_bench import registry
 from imagine_bench.data.episodes import Episodes, joined
-from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.store.files import reading
-
-try:
-    import minari
-    from minari.data_collector import EpisodeBuffer
-except ImportError as error:
-    raise SetupError("minari is missing: run \"pip install 'imagine-bench[data]'\", or take --format npz.") from error
 
 _ROOT = "MINARI_DATASETS_PATH"
 
@@ -76,7 +72,9 @@ def read(path: Path) -> Episodes:
         except FileNotFoundError as error:
             raise InvalidValueError(f"a file of it is missing ({error})") from error
         if len(parts) != found.total_episodes or sum(len(part["actions"]) for part in parts) != found.total_steps:
-            raise InvalidValueError(f"{found.total_episodes} episodes are said to be in it and {len(parts)} are")
+            raise InvalidValueError(
+                f"{found.total_episodes} episodes of {found.total_steps} steps are not what it holds"
+            )
         return joined(parts)
 
 

@@ -26,7 +26,7 @@ from imagine_bench.store.results import RunResult
 
 _FEW: dict[str, Any] = {
     "seeds": (0,), "evaluation_episodes": 2, "execution": "kinematic", "open_loop_starts": 0, "sampled_futures": 0,
-    "recorded_episodes": 0,
+    "recorded_episodes": 0, "appearance": "mild",
 }  # fmt: skip
 
 
@@ -160,9 +160,21 @@ def test_a_dataset_of_another_task_is_refused(tmp_path: Path, capsys: pytest.Cap
     folder = written(tmp_path / "set").folder
     for task in ("pick_place", "arrow_puzzle_hard"):
         assert main(["bench", "--task", task, "--dataset", str(folder)]) == 2
-        assert f"is of arrow_puzzle, of 6 macro-actions, not of {task}; give a dataset of" in capsys.readouterr().err
+        assert f"is of arrow_puzzle with 6 macro-actions; give one of {task}, which has" in capsys.readouterr().err
+    (folder / "card.json").unlink()
+    assert main(["bench", "--task", "pick_place", "--dataset", str(folder)]) == 2
+    assert "is of a task with 6 macro-actions; give one of pick_place, which has" in capsys.readouterr().err
     assert main(["bench", "--task", "toy_regression", "--dataset", str(folder)]) == 2
     assert "toy_regression takes no --dataset" in capsys.readouterr().err
+
+
+def test_frames_that_look_otherwise_are_refused(tmp_path: Path) -> None:
+    """An encoder for clean frames would make nothing of them; tests may look otherwise."""
+    folder = written(tmp_path / "set").folder
+    with pytest.raises(InvalidValueError, match="frames of appearance mild, not clean; give --appearance mild, and"):
+        plan("arrow_puzzle", "smoke", dataset=folder, **{**_FEW, "appearance": "clean"})
+    wanted, _ = plan("arrow_puzzle", "smoke", dataset=folder, **_FEW, test_appearance="clean")
+    assert (wanted.appearance, wanted.test_appearance) == ("mild", "clean")  # type: ignore[attr-defined]
 
 
 def test_a_bench_of_a_dataset_stands_beside_the_fixed_agents(tmp_path: Path) -> None:

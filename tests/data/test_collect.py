@@ -86,12 +86,12 @@ def test_a_trained_agent_acts_greedily(tmp_path: Path, monkeypatch: pytest.Monke
     act = TableAgent.act
 
     def noted(self: TableAgent, observation: Observation, *, explore: bool) -> int:
-        explored.append(explore)
+        explored.append((explore, observation.macrostate))
         return act(self, observation, explore=explore)
 
     monkeypatch.setattr(TableAgent, "act", noted)
     episodes, _, card = collect(TASK, policy, episodes=3, seed=0, execution="kinematic", appearance="clean")
-    assert explored == [False] * len(episodes.actions)
+    assert explored == [(False, None)] * len(episodes.actions), "greedy, and shown no macrostate"
     wanted = [act(agent, Observation(frame=frame), explore=False) for frame in episodes.frames[episodes.rows[0]]]
     assert wanted == episodes.actions.tolist()
     assert card["policy"] == "table" and card["played"] == "greedy after 9 episodes of seed 0"

@@ -78,14 +78,24 @@ def info(**values: Any) -> Callable[[Path], None]:
     return bytes_of("meta/info.json", lambda old: json.dumps({**json.loads(old), **values}).encode())
 
 
+def replaced(old: pa.Table, name: str, values: Any) -> pa.Table:
+    field = old.schema.field(name)
+    column = values if isinstance(values, pa.ChunkedArray) else pa.array(values, field.type)
+    return old.set_column(old.schema.get_field_index(name), field, column)
+
+
 def with_image(content: bytes) -> Callable[[pa.Table], pa.Table]:
     def change(old: pa.Table) -> pa.Table:
         images = old["observation.image"].to_pylist()
         images[3] = {"bytes": content, "path": None}
-        column = old.schema.get_field_index("observation.image")
-        return old.set_column(column, "observation.image", pa.array(images, old.schema.field(column).type))
+        return replaced(old, "observation.image", images)
 
     return change
+
+
+def steps_less_one(content: bytes) -> bytes:
+    values = json.loads(content)
+    return json.dumps({**values, "total_steps": values["total_steps"] - 1}).encode()
 
 
 def png(size: tuple[int, int], mode: str = "RGB") -> bytes:
@@ -131,6 +141,9 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", table(lambda old: old[:-1]), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old[:-1], "final_frames.parquet"), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old.take(list(range(len(old)))[::-1])), "its rows are not in order"),
+    ("lerobot", table(lambda old: replaced(old, "episode_index", old["episode_index"][::-1])), "rows are not in order"),
+    ("lerobot", table(lambda old: replaced(old, "action", [0.5] * len(old))), "an action is no integer"),
+    ("lerobot", table(lambda old: replaced(old, "next.reward", [np.nan] * len(old))), "reward 0 is not finite"),
     ("lerobot", table(lambda old: old.drop_columns(["next.reward"])), "next.reward"),
     ("lerobot", table(with_image(b"not a PNG")), "cannot identify image"),
     ("lerobot", table(with_image(png((64, 64))[:60])), "image file is truncated"),
@@ -142,6 +155,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: old.replace(b"0.5", b"9.5")), "is not a Minari dataset"),
+    ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not what it holds"),
     ("minari", bytes_of("*/data/2/*.parquet", lambda old: old[:-200]), "is not a Minari dataset of macro-actions"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
 ]  # fmt: skip

@@ -1,0 +1,140 @@
+"""The vector environment as Stable-Baselines3's ``VecEnv``, beside its own ``DummyVecEnv`` of single environments."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from imagine_bench import registry
+from imagine_bench.adapters.sb3 import as_sb3
+from imagine_bench.errors import InvalidValueError
+
+ARROWS = "imagine_bench/ArrowPuzzle-vector-v0"
+KINEMATIC = {"execution": "kinematic"}
+
+
+def assert_same(ours, theirs):
+    """Observations and infos, equal to the bit and of the same types."""
+    assert type(ours) is type(theirs)
+    if isinstance(ours, dict):
+        assert set(ours) == set(theirs)
+        for key in ours:
+            assert_same(ours[key], theirs[key])
+    elif isinstance(ours, list):
+        for one, other in zip(ours, theirs, strict=True):
+            assert_same(one, other)
+    else:
+        assert np.asarray(ours).dtype == np.asarray(theirs).dtype
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def both(task="arrow_puzzle", n=3, **options):
+    env_id = registry.TASKS[task].env_id
+    ours = as_sb3(registry.vector_id(env_id), num_envs=n, **options)
+    return ours, DummyVecEnv([lambda: gymnasium.make(env_id, **options)] * n)
+
+
+@pytest.mark.parametrize(
+    ("task", "steps", "options"),
+    [
+        ("arrow_puzzle", 40, KINEMATIC),
+        ("pick_place", 20, KINEMATIC),
+        ("arrow_puzzle", 8, {"execution": "physics"}),
+        ("arrow_puzzle", 20, {**KINEMATIC, "observation": "frame,state"}),
+    ],
+)
+def test_equals_their_own_step_for_step(task, steps, options):
+    ours, theirs = both(task, **options)
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+    assert ours.seed(7) == theirs.seed(7)
+    assert_same(ours.reset(), dict(theirs.reset()) if "observation" in options else theirs.reset())
+    assert_same(ours.reset_infos, theirs.reset_infos)
+    rng, ended, cut = np.random.default_rng(0), 0, 0
+    for step in range(steps):
+        actions = np.full(3, step % 2) if step >= steps // 2 else rng.integers(ours.action_space.n, size=3)
+        own, its = ours.step(actions), theirs.step(actions)
+        for one, other in zip(own, its, strict=True):
+            assert_same(one, dict(other) if isinstance(other, dict) else other)
+        assert_same(ours.reset_infos, theirs.reset_infos)
+        cut += sum(info["TimeLimit.truncated"] for info in own[3])
+        ended += sum("terminal_observation" in info for info in own[3])
+    assert ended > cut and (cut > 0 or options != KINEMATIC or task != "arrow_puzzle"), "non-vacuous"
+    ours.close()
+    theirs.close()
+
+
+def test_options_of_each_lane_and_seeds_are_taken_once():
+    ours, theirs = both()
+    starts = [{"macrostate": state} for state in registry.task("arrow_puzzle").rules.start_states[:3]]
+    for options in (starts, starts[0], None, starts):
+        for env in (ours, theirs):
+            env.seed(3)
+            env.set_options(options)
+        assert_same(ours.reset(), theirs.reset())
+        assert_same(ours.reset_infos, theirs.reset_infos)
+    assert_same(ours.reset(), theirs.reset())
+    ours.close()
+    theirs.close()
+
+
+def test_attributes_methods_and_images_are_the_lanes():
+    ours, theirs = both(render_mode="rgb_array", width=32, height=24, **KINEMATIC)
+    ours.seed(0), theirs.seed(0)
+    assert_same(ours.reset(), theirs.reset())
+    assert ours.get_attr("execution", [0, 2]) == theirs.get_attr("execution", [0, 2]) == ["kinematic"] * 2
+    ours.set_attr("capture_motion_hz", 5.0, 1)
+    assert ours.get_attr("capture_motion_hz") == [0.0, 5.0, 0.0]
+    assert_same(ours.env_method("action_masks"), theirs.env_method("action_masks"))
+    assert ours.env_is_wrapped(gymnasium.wrappers.TimeLimit) == [False] * 3
+    assert ours.has_attr("action_masks") and not ours.has_attr("no_such_thing")
+    assert_same(ours.render(), theirs.render())
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [
+        (PPO, {"n_steps": 16, "batch_size": 16, "n_epochs": 1}),
+        pytest.param(DQN, {"learning_starts": 20, "buffer_size": 200, "batch_size": 8}, marks=pytest.mark.slow),
+    ],
+)
+def test_algorithms_learn_the_same_as_on_their_own(algorithm, settings):
+    """To the bit: weights after training are those of training on single environments."""
+    weights = []
+    for env in both(n=2, observation="state", **KINEMATIC):
+        watched = VecMonitor(env)
+        learner = algorithm("MlpPolicy", watched, seed=1, **settings).learn(64)
+        assert len(learner.ep_info_buffer) > 3
+        evaluate_policy(learner, watched, n_eval_episodes=2, warn=False)
+        weights.append(learner.policy.state_dict())
+        env.close()
+    assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_what_cannot_be_is_one_clear_error():
+    with pytest.raises(InvalidValueError, match=r"give an environment with AutoresetMode\.SAME_STEP"):
+        as_sb3(ARROWS, num_envs=1, autoreset_mode=AutoresetMode.NEXT_STEP)
+    env = gymnasium.make_vec(ARROWS, num_envs=1, **KINEMATIC)
+    with pytest.raises(InvalidValueError, match="belong to gymnasium"):
+        as_sb3(env, execution="physics")
+    env.close()
+
+
+def test_missing_library_is_one_clear_error():
+    code = (
+        "import sys; sys.modules['stable_baselines3'] = None\n"
+        "from imagine_bench.errors import SetupError\n"
+        "try:\n    import imagine_bench.adapters.sb3\n"
+        "except SetupError as error:\n    print(error)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
+    assert "pip install 'imagine-bench[peers]'" in said
