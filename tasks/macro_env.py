@@ -223,7 +223,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
-        self._begun, self._latest = False, None
+        self._latest = None
         return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:

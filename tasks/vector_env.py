@@ -211,8 +211,6 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             collected = _columns(final, self.num_envs)
         infos.update(self._restart(again, [None] * self.num_envs, {}))
         collected.update(_columns(infos, self.num_envs))
-        if mode == AutoresetMode.SAME_STEP:
-            self._over[lanes] = False
         return self._stacked(lanes), rewards, ends[0], ends[1], collected
 
     def _conclude(self, lane: int, acting: _Acting) -> tuple[float, bool, bool, dict[str, Any]]:
