@@ -87,7 +87,7 @@ def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Fai
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
     )(_work)
-    running = {work.remote(_absolute(job), board): job for job in jobs}
+    running = {work.remote(absolute(job), board): job for job in jobs}
     failures = []
     while running:
         ended, _ = ray.wait(list(running), timeout=_POLL_S)
@@ -103,7 +103,7 @@ def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Fai
     return tuple(failures)
 
 
-def _absolute(job: Job) -> Job:
+def absolute(job: Job) -> Job:
     """The job with paths that mean the same in every process."""
     paths = {name: getattr(job.spec, name) for name in ("encoder", "dataset")}
     spec = replace(job.spec, **{name: path.resolve() for name, path in paths.items() if path is not None})

@@ -3,13 +3,15 @@
 A row is a macro-action: the frame before it, the action, and what came of it (``next.reward``, ``next.done``, ...). The
 layout has no row for the frame that an episode ends with; it lies in ``final_frames.parquet``, which only we read.
 
-Source: https://github.com/huggingface/lerobot, ``src/lerobot/datasets``, version 0.4.4.
+Source: https://github.com/huggingface/lerobot, ``src/lerobot/datasets``, versions 0.4.4 and 0.6.1.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import json
+import operator
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -43,20 +45,18 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     firsts, (before, last) = np.cumsum(episodes.lengths) - episodes.lengths, episodes.rows
     columns, frames, masks = _columns(episodes, firsts), episodes.frames[before], episodes.action_masks.astype(np.bool_)
     table, text = _table({**columns, _MASK: masks[before]}, frames), [str(card["description"])]
-    places = [{"chunk_index": file // _FILES, "file_index": file % _FILES} for file in (firsts // _ROWS).tolist()]
-    spans = [
-        slice(first, first + length) for first, length in zip(firsts.tolist(), episodes.lengths.tolist(), strict=True)
-    ]
-    for place in (dict(found) for found in dict.fromkeys(tuple(place.items()) for place in places)):
-        with pq.ParquetWriter(_file(folder / "data", **place), table.schema) as writer:
-            for span in (span for span, where in zip(spans, places, strict=True) if where == place):
+    places = [divmod(file, _FILES) for file in (firsts // _ROWS).tolist()]
+    spans = [slice(*span) for span in zip(firsts.tolist(), (firsts + episodes.lengths).tolist(), strict=True)]
+    for place, there in itertools.groupby(zip(places, spans, strict=True), key=operator.itemgetter(0)):
+        with pq.ParquetWriter(_file(folder / "data", *place), table.schema) as writer:
+            for _, span in there:
                 writer.write_table(table[span])
     rows = []
-    for index, (span, place) in enumerate(zip(spans, places, strict=True)):
-        stats = _statistics({name: column[span] for name, column in columns.items()}, frames[span])
+    for index, (span, (chunk, file)) in enumerate(zip(spans, places, strict=True)):
         row = {_EPISODE: index, "tasks": text, "length": span.stop - span.start, "dataset_from_index": span.start}
-        row |= {"dataset_to_index": span.stop, **{f"data/{name}": number for name, number in place.items()}}
-        row |= {f"meta/episodes/{name}": 0 for name in place}
+        row |= {"dataset_to_index": span.stop, "data/chunk_index": chunk, "data/file_index": file}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        stats = _statistics({name: column[span] for name, column in columns.items()}, frames[span])
         rows.append(row | {f"stats/{name}/{each}": value for name, of in stats.items() for each, value in of.items()})
     pq.write_table(pa.Table.from_pylist(rows), _file(folder / "meta/episodes", 0, 0))
     pq.write_table(_tasks(text), folder / "meta/tasks.parquet")

@@ -15,7 +15,7 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.bench.launchers import LAUNCHERS, Job, launcher
 from imagine_bench.bench.local import LocalPool
-from imagine_bench.bench.ray import RayCluster
+from imagine_bench.bench.ray import RayCluster, absolute
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import Progress, RunSpec
@@ -144,3 +144,13 @@ def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(SetupError, match=rf"No Ray cluster answers at RAY_ADDRESS={scheme}127\.0\.0\.1:1 "):
         RayCluster(1).launch(jobs(tmp_path, (0,), 10), lambda _: None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_paths_of_a_job_mean_the_same_on_every_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    wanted = protocol("arrow_puzzle", "smoke", agents=("dqn",))
+    spec = RunSpec(protocol=wanted, agent="dqn", seed=0, encoder=Path("e.safetensors"), dataset=Path("datasets/mixed"))
+    job = absolute(Job(spec=spec, folder=Path("runs/dqn/seed_0")))
+    assert (job.spec.encoder, job.spec.dataset) == (tmp_path / "e.safetensors", tmp_path / "datasets/mixed")
+    assert job.folder == tmp_path / "runs/dqn/seed_0"
+    assert absolute(dataclasses.replace(job, spec=dataclasses.replace(spec, dataset=None))).spec.dataset is None
