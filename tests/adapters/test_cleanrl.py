@@ -1,0 +1,106 @@
+"""A loop like CleanRL's on our vector environment: what it reads at the end of an episode is what happened."""
+
+from __future__ import annotations
+
+import random
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from imagine_bench import registry
+from imagine_bench.adapters.cleanrl import as_cleanrl
+
+ARROWS = "imagine_bench/ArrowPuzzle-v0"
+LANES = 3
+
+
+def collected(envs, total_timesteps, seed=1):
+    """The acting half of ``cleanrl/dqn.py``, line by line: its buffer, and the episodes that it would print."""
+    random.seed(seed)
+    assert isinstance(envs.single_action_space, gym.spaces.Discrete), "only discrete action space is supported"
+    rb = ReplayBuffer(
+        total_timesteps * envs.num_envs, envs.single_observation_space, envs.single_action_space, "cpu",
+        n_envs=envs.num_envs, handle_timeout_termination=False,
+    )  # fmt: skip
+    printed = []
+    envs.single_action_space.seed(seed)
+    obs, _ = envs.reset(seed=seed)
+    for global_step in range(total_timesteps):
+        if random.random() < 0.8:
+            actions = np.array([envs.single_action_space.sample() for _ in range(envs.num_envs)])
+        else:
+            actions = np.full(envs.num_envs, global_step % 2)
+        next_obs, rewards, terminations, truncations, infos = envs.step(actions)
+        if "final_info" in infos:
+            for info in infos["final_info"]:
+                if info and "episode" in info:
+                    printed.append((global_step, info["episode"]["r"].item(), info["episode"]["l"].item()))
+        real_next_obs = next_obs.copy()
+        for idx, trunc in enumerate(truncations):
+            if trunc:
+                real_next_obs[idx] = infos["final_observation"][idx]
+        rb.add(obs, real_next_obs, actions, rewards, terminations, infos)
+        obs = next_obs
+    envs.close()
+    return rb, printed
+
+
+class _Numbered(gym.Wrapper):
+    """Cut after three steps; every observation says how many steps the episode has had."""
+
+    def reset(self, **kwargs):
+        self.at = 0
+        return self.seen(self.env.reset(**kwargs)[0]), {"at": np.int64(0)}
+
+    def step(self, action):
+        self.at += 1
+        return self.seen(self.env.step(action)[0]), 1.0, False, self.at == 3, {"at": np.int64(self.at)}
+
+    def seen(self, frame):
+        return np.full_like(frame, self.at)
+
+
+def test_equals_single_environments_with_gymnasiums_statistics():
+    def thunk():
+        return gym.wrappers.RecordEpisodeStatistics(gym.make(ARROWS, execution="kinematic"))
+
+    sync = gym.vector.SyncVectorEnv([thunk] * LANES, autoreset_mode=AutoresetMode.SAME_STEP)
+    own = as_cleanrl(registry.vector_id(ARROWS), num_envs=LANES, execution="kinematic")
+    (ours, printed), (theirs, _) = collected(own, 40), collected(as_cleanrl(sync), 40)
+    for name in ("observations", "next_observations", "actions", "rewards", "dones"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    assert len(printed) > 10 and sum(length for *_, length in printed) > 100
+
+
+def test_statistics_are_those_that_gymnasium_counts():
+    def thunk():
+        return gym.wrappers.RecordEpisodeStatistics(gym.make(ARROWS, execution="kinematic"))
+
+    env = gym.vector.SyncVectorEnv([thunk] * LANES, autoreset_mode=AutoresetMode.SAME_STEP)
+    envs, seen = as_cleanrl(env), 0
+    envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        *_, terminated, truncated, infos = envs.step(rng.integers(6, size=LANES))
+        over = terminated | truncated
+        assert np.array_equal(infos.get("_final_observation", np.zeros(LANES)), over)
+        assert [last is not None for last in infos.get("final_observation", [None] * LANES)] == over.tolist()
+        assert "final_obs" not in infos and "_final_obs" not in infos
+        for lane, info in enumerate(infos.get("final_info", [])):
+            if info is not None:
+                counted, lengths = (getattr(env.envs[lane], name)[-1] for name in ("return_queue", "length_queue"))
+                assert info["episode"]["r"] == np.float32(counted) and info["episode"]["l"] == lengths
+                seen += 1
+    assert seen > 5
+    envs.close()
+
+
+def test_what_a_truncated_episode_reached_is_stored_not_the_next_start():
+    lanes = [lambda: _Numbered(gym.make(ARROWS, execution="kinematic"))] * 2
+    sync = gym.vector.SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
+    rb, printed = collected(as_cleanrl(sync), 6)
+    assert rb.observations[:, 0].max(axis=(1, 2, 3)).tolist() == [0, 1, 2, 0, 1, 2]
+    assert rb.next_observations[:, 1].max(axis=(1, 2, 3)).tolist() == [1, 2, 3, 1, 2, 3]
+    assert printed == [(2, 3.0, 3), (2, 3.0, 3), (5, 3.0, 3), (5, 3.0, 3)]
