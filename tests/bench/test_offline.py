@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +142,11 @@ def test_a_dataset_that_changed_since_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"agents": ("sb3_dqn",)}, "Agent 'sb3_dqn' trains in a loop of its own and cannot learn from a dataset"),
+        pytest.param(
+            {"agents": ("sb3_dqn",)},
+            "Agent 'sb3_dqn' trains in a loop of its own and cannot learn from a dataset",
+            marks=pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="the extra peers"),
+        ),
         ({"agents": ("q_learning_macrostate",)}, "is shown true macrostates and cannot learn from a dataset"),
         ({"demonstrations": 2}, "Both a dataset and demonstrations would come first; give one of them"),
     ],
