@@ -21,5 +21,5 @@ def _multiplies_bfloat16(device: str) -> bool:
     """Whether the device has instructions for bfloat16 products; without them they are emulated, and slower."""
     if device == "cuda":
         return torch.cuda.is_bf16_supported()
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # older torch cannot tell
+    capabilities: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # older torch cannot tell
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))

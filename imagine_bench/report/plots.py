@@ -57,6 +57,7 @@ _THESIS_LINE: dict[str, Any] = {
 _LEADER: dict[str, Any] = {
     "arrowstyle": "-", "linewidth": 0.6, "color": "#8c8c8c", "shrinkA": 2, "shrinkB": 0, "relpos": (0, 0.5),
 }  # fmt: skip
+_LONG = 32  # letters of a title that stand in one line beside a plot
 _THESIS_REACH = 2.0  # its points beyond so many times the last budget would leave the run's own no room
 _REFERENCE_LINE: dict[str, Any] = {"color": _INK, "linewidth": 1.0, "linestyle": (0, (4, 3)), "alpha": 0.7}
 
@@ -285,10 +286,13 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     names = sorted(last, key=lambda agent: last[agent])
+    titles = {agent: agent_words(agent).title for agent in names}
+    words = {agent: title if len(title) <= _LONG else title.replace(" (", "\n(") for agent, title in titles.items()}
+    step *= 2 if any("\n" in each for each in words.values()) else 1
     places = spread_labels([last[agent] for agent in names], step, top=high)
     for agent, y in zip(names, places, strict=True):
         axes.annotate(
-            agent_words(agent).title, xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
+            words[agent], xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
             textcoords=axes.get_yaxis_transform(), color=color(agent), fontweight="bold", va="center", fontsize=9.5,
             arrowprops=_LEADER,
         )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +97,8 @@ def test_own_episodes_start_where_they_would_without(tmp_path: Path) -> None:
     assert episode_seed("training", 0, 6) not in collected()[1]["privileged"]["seeds"].tolist()
 
 
-@pytest.mark.parametrize("agent", ["dqn", "table"])
-def test_three_formats_train_to_the_same_bits(tmp_path: Path, agent: str) -> None:
-    results, specs = {}, {}
+def test_three_formats_train_to_the_same_bits(tmp_path: Path) -> None:
+    agent, results, specs = "dqn", {}, {}
     for format in FORMATS:
         specs[format] = spec_of(written(tmp_path / format, format).folder, agent)
         results[format] = run(tmp_path / f"run-{format}", specs[format])
@@ -111,17 +111,14 @@ def test_three_formats_train_to_the_same_bits(tmp_path: Path, agent: str) -> Non
     assert specs["npz"].protocol.hash != spec_of(None, agent, budgets=(6,)).protocol.hash
 
 
-@pytest.mark.parametrize("killed_after", [2, 7])
-def test_a_kill_within_a_dataset_changes_no_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_after: int
-) -> None:
+def test_a_kill_within_a_dataset_changes_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_state, "_REPORT_EVERY_S", 0.0)
     told = 0
 
     def killing(progress: Any) -> None:
         nonlocal told
         told += progress.phase == "training"
-        if told == killed_after:
+        if told == 3:
             told += 1
             raise KeyboardInterrupt
 
@@ -145,7 +142,11 @@ def test_a_dataset_that_changed_since_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"agents": ("sb3_dqn",)}, "Agent 'sb3_dqn' trains in a loop of its own and cannot learn from a dataset"),
+        pytest.param(
+            {"agents": ("sb3_dqn",)},
+            "Agent 'sb3_dqn' trains in a loop of its own and cannot learn from a dataset",
+            marks=pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="the extra peers"),
+        ),
         ({"agents": ("q_learning_macrostate",)}, "is shown true macrostates and cannot learn from a dataset"),
         ({"demonstrations": 2}, "Both a dataset and demonstrations would come first; give one of them"),
     ],

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.tools.speed import figure_of, speed_report
+from imagine_bench.tools.speed import figure_of, lanes_ratio, speed_report
 
 
 @pytest.mark.slow
@@ -17,6 +17,7 @@ def test_figures_are_measured_and_kept(tmp_path):
     assert len(lines) == len(figures) + 1 and kept["environment"]["versions"]["mujoco"]
     assert all_met == all(figure["met"] for figure in figures.values())
     assert any(name.startswith("a model update") for name in figures)
+    assert sum("lanes, physics, times as fast as one environment" in name for name in figures) == 2
     measured = [spec for spec in map(registry.task, registry.TASKS) if spec.targets is not None]
     assert {spec.id for spec in measured} >= {"arrow_puzzle", "pick_place"}
     for spec in measured:
@@ -26,6 +27,11 @@ def test_figures_are_measured_and_kept(tmp_path):
         assert len(exact) == 2 + len(errors) + 2 * len(spec.targets.encoders)
         for name in exact:
             assert figures[name]["met"], figures[name]
+
+
+def test_lanes_are_timed_beside_one_environment() -> None:
+    ratio = lanes_ratio(registry.task("arrow_puzzle"), "kinematic", 3, 12, blocks=1)
+    assert 0.05 < ratio < 20
 
 
 @pytest.mark.parametrize(
