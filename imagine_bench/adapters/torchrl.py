@@ -1,0 +1,36 @@
+"""Our environments in TorchRL 0.14, whose reader of infos takes numbers only.
+
+A single one, with its infos::
+
+    env = GymWrapper(NumericInfo(gymnasium.make("imagine_bench/ArrowPuzzle-v0"))).auto_register_info_dict()
+
+A vector environment is wrapped as it is, in the mode that leaves resets to TorchRL, and without infos::
+
+    env = GymWrapper(gymnasium.make_vec("imagine_bench/ArrowPuzzle-vector-v0", num_envs=4, autoreset_mode="Disabled"))
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+
+import imagine_bench  # noqa: F401  (registers the Gymnasium ids)
+
+
+class NumericInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The environment without the texts of its infos, such as ``fault_reason``."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        seen, info = self.env.reset(seed=seed, options=options)
+        return seen, _numbers(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Carry out one macro-action."""
+        *step, info = self.env.step(action)
+        return (*step, _numbers(info))
+
+
+def _numbers(info: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in info.items() if not isinstance(value, str)}
