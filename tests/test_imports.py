@@ -28,10 +28,10 @@ ARROWS: dict[str, set[str]] = {
     "studies": {*_DATA, "bench", "statistics"},
     "report": {*_DATA, "bench", "judge", "studies", "machine", "statistics", "reference"},
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
-    "adapters": {"registry"},
+    "adapters": {"registry", "store"},
     "tools": {"registry", "machine", "store", "statistics", "bench", "data"},
     "testing": {"registry", "tools"},
-    "cli": {*_DATA, "data", "bench", "judge", "recording", "studies", "report", "tools"},
+    "cli": {*_DATA, "adapters", "data", "bench", "judge", "recording", "studies", "report", "tools"},
     "__init__": {"registry"},
     "__main__": {"cli"},
 }

@@ -115,6 +115,8 @@ class Report:
     merge: Annotated[tyro.conf.UseAppendAction[tuple[tuple[Path, ...], ...]], listed("PATH", "(default: none)")] = ()
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
     whose seeds; all else in their protocols must be the same."""
+    track: Annotated[str | None, shown("STR", "(default: no tool)")] = None
+    """Write the metrics so far for a tool instead: tensorboard or wandb (offline)."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
@@ -122,6 +124,11 @@ class Report:
         """Load and write."""
         tasks = only(self.task, self.folder)
         folder = self.folder or newest_bench(self.out, tasks)
+        if self.track is not None:
+            from imagine_bench.adapters.tracking import track  # noqa: PLC0415 - an extra
+
+            print(f"Metrics: {track(folder, self.track)}")
+            return
         others = added_up("merge", self.merge)
         _show(folder, merge([_load_control(each) for each in (folder, *others)], self.out) if others else None)
 

@@ -1,0 +1,77 @@
+"""A bench's metrics for TensorBoard, or for Weights & Biases without a network; extra ``tracking``.
+
+Read from the ``metrics.csv`` of each run, which has a row for every budget tested so far: also while the bench runs.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from imagine_bench.errors import InvalidValueError, lacking, require_known
+from imagine_bench.store.codec import table_rows
+
+_METRICS = "metrics.csv"
+Rows = list[dict[str, float]]
+
+
+def track(folder: Path, tool: str) -> Path:
+    """Write the metrics of every run of a bench anew, by real training episodes.
+
+    Args:
+        folder: The bench's.
+        tool: A name in :data:`TOOLS`.
+
+    Returns:
+        The folder inside it to open: ``tensorboard --logdir`` it, or ``wandb sync`` what is in it.
+
+    Raises:
+        UnknownNameError: Another tool.
+        InvalidValueError: No run there has been tested.
+        SetupError: The tool is not installed.
+    """
+    write = TOOLS[require_known("tracking tool", tool, TOOLS)]
+    runs = {path.parent.relative_to(folder): path for path in sorted(folder.glob(f"*/seed_*/{_METRICS}"))}
+    if not runs:
+        raise InvalidValueError(f"No run in {folder} has been tested yet; give the folder of a bench.")
+    out = folder / tool
+    shutil.rmtree(out, ignore_errors=True)
+    for run, path in runs.items():
+        write(out, run, [_scalars(row) for row in table_rows(path.read_text(), ("solved",))])
+    return out
+
+
+def _scalars(row: dict[str, float]) -> dict[str, float]:
+    """The numbers of a row and the success rate in [0, 1]."""
+    rate = row["successes"] / row["test_episodes"]
+    return {"success_rate": rate, **{name: float(value) for name, value in row.items() if name != "solved"}}
+
+
+def _tensorboard(out: Path, run: Path, rows: Rows) -> None:
+    try:
+        from tensorboard.summary import Writer  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise lacking("tensorboard") from error
+    writer = Writer(str(out / run))
+    for row in rows:
+        for name, value in row.items():
+            writer.add_scalar(name, value, int(row["episodes"]))
+    writer.close()
+
+
+def _wandb(out: Path, run: Path, rows: Rows) -> None:
+    try:
+        import wandb  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise lacking("wandb") from error
+    out.mkdir(parents=True, exist_ok=True)
+    tracked = wandb.init(
+        project="imagine_bench", dir=out, mode="offline", name=run.as_posix(), group=run.parts[0], reinit=True
+    )
+    for row in rows:
+        tracked.log(row, step=int(row["episodes"]))
+    tracked.finish()
+
+
+TOOLS: dict[str, Callable[[Path, Path, Rows], None]] = {"tensorboard": _tensorboard, "wandb": _wandb}

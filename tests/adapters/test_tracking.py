@@ -1,0 +1,69 @@
+"""Metrics of a bench in other tools, read back by these; skipped without them (extra ``tracking``)."""
+
+from __future__ import annotations
+
+import pytest
+
+from imagine_bench.adapters.tracking import track
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+
+ROWS = (
+    "episodes,test_episodes,successes,solved,mean_return,diagnostics/loss/bellman"
+ROWS += "\n2,20,1,0{n},-2.5,\n4,20,5,1{n},3,0.5"
+)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """A bench with a run of two agents each, one of which is not tested yet."""
+    for run in ("dqn/seed_0", "random/seed_3", "dqn/seed_1"):
+        (tmp_path / run).mkdir(parents=True)
+        if run != "dqn/seed_1":
+            (tmp_path / run / "metrics.csv").write_text(ROWS.format(n="0" * 1000))
+    return tmp_path
+
+
+def test_tensorboard_reads_the_scalars_back(bench, capsys):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    for _ in range(2):  # the second time it is written anew
+        assert main(["report", str(bench), "--track", "tensorboard"]) == 0
+        assert str(bench / "tensorboard") in capsys.readouterr().out
+    assert sorted(path.parent.name for path in bench.glob("tensorboard/*/*/*")) == ["seed_0", "seed_3"]
+    events = EventAccumulator(str(bench / "tensorboard/random/seed_3"))
+    events.Reload()
+
+    def values(tag):
+        found = events.Tensors(tag)
+        return [(each.step, pytest.approx(each.tensor_proto.float_val[0])) for each in found]
+
+    assert values("success_rate") == [(2, 0.05), (4, 0.25)]
+    assert values("mean_return") == [(2, -2.5), (4, 3.0)]
+    assert values("diagnostics/loss/bellman") == [(4, 0.5)]
+    assert "solved" not in events.Tags()["tensors"]
+
+
+def test_wandb_keeps_every_run_offline(bench, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    out = track(bench, "wandb")
+    files = sorted(out.glob("wandb/offline-run-*/*.wandb"))
+    assert len(files) == 2
+    for file in files:
+        kept = file.read_bytes()
+        assert all(word in kept for word in (b"success_rate", b"0.05", b"0.25", b"bellman")) and b"solved" not in kept
+
+
+def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
+    with pytest.raises(UnknownNameError, match="tensorboard, wandb"):
+        track(bench, "mlflow")
+    with pytest.raises(InvalidValueError, match="has been tested yet"):
+        track(tmp_path / "elsewhere", "tensorboard")
+
+
+def test_a_missing_tool_is_one_clear_error(bench, monkeypatch, capsys):
+    monkeypatch.setitem(__import__("sys").modules, "tensorboard.summary", None)
+    assert main(["report", str(bench), "--track", "tensorboard"]) == 2
+    assert "pip install 'imagine-bench[tracking]'" in capsys.readouterr().err
