@@ -28,13 +28,15 @@ def track(folder: Path, tool: str) -> Path:
 
     Raises:
         UnknownNameError: Another tool.
-        InvalidValueError: No run there has been tested.
+        InvalidValueError: No run there has been tested, or it is a bench of regressors.
         SetupError: The tool is not installed.
     """
     write = TOOLS[require_known("tracking tool", tool, TOOLS)]
     runs = {path.parent.relative_to(folder): path for path in sorted(folder.glob(f"*/seed_*/{_METRICS}"))}
     if not runs:
         raise InvalidValueError(f"No run in {folder} has been tested yet; give the folder of a bench.")
+    if not all(path.read_text().startswith("episodes,") for path in runs.values()):
+        raise InvalidValueError(f"{folder} compares no agents by training episodes; give the folder of such a bench.")
     out = folder / tool
     shutil.rmtree(out, ignore_errors=True)
     for run, path in runs.items():

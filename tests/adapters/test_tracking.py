@@ -9,8 +9,7 @@ from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 
 ROWS = (
-    "episodes,test_episodes,successes,solved,mean_return,diagnostics/loss/bellman"
-ROWS += "\n2,20,1,0{n},-2.5,\n4,20,5,1{n},3,0.5"
+    "episodes,test_episodes,successes,solved,mean_return,diagnostics/loss/bellman\n2,20,1,0{n},-2.5,\n4,20,5,1{n},3,0.5"
 )
 
 
@@ -61,6 +60,9 @@ def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
         track(bench, "mlflow")
     with pytest.raises(InvalidValueError, match="has been tested yet"):
         track(tmp_path / "elsewhere", "tensorboard")
+    (bench / "dqn/seed_0/metrics.csv").write_text("examples,error\n1,0.5")
+    with pytest.raises(InvalidValueError, match="compares no agents"):
+        track(bench, "tensorboard")
 
 
 def test_a_missing_tool_is_one_clear_error(bench, monkeypatch, capsys):
