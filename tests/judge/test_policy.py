@@ -47,7 +47,7 @@ PICK = registry.task("pick_place")
 
 def bench(root: Path, launcher: Inline, **changes: Any) -> BenchResult:
     wanted = small(**{"budgets": (2, 9), "agents": ("table", "imaginer"), "seeds": (0, 1), **changes})
-    result: BenchResult = benches.bench(wanted, None, root=root, launcher=launcher)
+    result: BenchResult = benches.bench(wanted, {}, root=root, launcher=launcher)
     return result
 
 
