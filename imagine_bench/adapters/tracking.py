@@ -1,4 +1,4 @@
-"""A bench's metrics for TensorBoard, or for Weights & Biases without a network; extra ``tracking``.
+"""A bench's metrics for TensorBoard; extra ``tracking``.
 
 Read from the ``metrics.csv`` of each run, which has a row for every budget tested so far: also while the bench runs.
 """
@@ -24,7 +24,7 @@ def track(folder: Path, tool: str) -> Path:
         tool: A name in :data:`TOOLS`.
 
     Returns:
-        The folder inside it to open: ``tensorboard --logdir`` it, or ``wandb sync`` what is in it.
+        The folder inside it to open: ``tensorboard --logdir`` it.
 
     Raises:
         UnknownNameError: Another tool.
@@ -62,18 +62,4 @@ def _tensorboard(out: Path, run: Path, rows: Rows) -> None:
     writer.close()
 
 
-def _wandb(out: Path, run: Path, rows: Rows) -> None:
-    try:
-        import wandb  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise lacking("wandb") from error
-    out.mkdir(parents=True, exist_ok=True)
-    tracked = wandb.init(
-        project="imagine_bench", dir=out, mode="offline", name=run.as_posix(), group=run.parts[0], reinit=True
-    )
-    for row in rows:
-        tracked.log(row, step=int(row["episodes"]))
-    tracked.finish()
-
-
-TOOLS: dict[str, Callable[[Path, Path, Rows], None]] = {"tensorboard": _tensorboard, "wandb": _wandb}
+TOOLS: dict[str, Callable[[Path, Path, Rows], None]] = {"tensorboard": _tensorboard}
