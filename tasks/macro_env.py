@@ -125,6 +125,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self.world.set_physics(settings)
         self._kind = (spec.id, self._execution, appearance, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
+        self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
         self._agent_camera = agent_camera(self.world.model)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self._observing_camera)
         self.observation_space = self._observer.space
@@ -243,7 +244,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
-        return np.ones(int(self.action_space.n), dtype=np.bool_)  # type: ignore[attr-defined]
+        return self._all_actions.copy()
 
     def get_state(self) -> EnvState:
         """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
