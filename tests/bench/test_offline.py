@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import Pupil
-from small_datasets import FORMATS, collected, written
-from small_runs import Inline, final_arrays, measured
+from small_runs import FORMATS, Inline, collected, final_arrays, measured, written
 
 from imagine_bench.bench import run_state
 from imagine_bench.bench.bench import bench, plan

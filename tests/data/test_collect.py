@@ -8,8 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from small_datasets import collected, written
-from small_runs import Inline, do
+from small_runs import Inline, collected, do, written
 
 from imagine_bench import registry
 from imagine_bench.cli import main

@@ -15,7 +15,7 @@ import PIL.Image
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from small_datasets import FORMATS, collected, written
+from small_runs import FORMATS, collected, written
 
 from imagine_bench.data.collect import describe
 from imagine_bench.data.episodes import joined

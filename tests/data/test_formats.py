@@ -19,7 +19,7 @@ import PIL.Image
 import pyarrow.parquet as pq
 import pytest
 import rerun
-from small_datasets import FORMATS, collected, written
+from small_runs import FORMATS, collected, written
 
 from imagine_bench import registry
 from imagine_bench.data import lerobot

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
+from imagine_bench.agents.encoders.recipes import RECIPES
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Outcome, RuleFacts, TaskSpec
@@ -12,6 +14,13 @@ from imagine_bench.interfaces import Frame, Outcome, RuleFacts, TaskSpec
 JITTER = {"clean": 0.1, "mild": 1.0, "strong": 2.0, "photo": 1.0, "photo_held_out": 1.0}
 """Pixels; turns and light scale with it."""
 _YX = np.mgrid[0:64, 0:64].astype(np.float32)
+CHAPTER_5 = RECIPES["chapter_5"]
+TINY = replace(
+    CHAPTER_5["default"], name="tiny", widths=(32,), frames=300, held_out_frames=200, steps=40, batch=32, probe_steps=60
+)
+TINY_CONV = replace(
+    CHAPTER_5["thesis"], name="tiny_conv", frames=40, held_out_frames=20, steps=2, batch=8, probe_steps=5
+)
 
 
 class ArrowRules:

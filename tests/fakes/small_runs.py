@@ -1,8 +1,9 @@
-"""Small runs and benches in this process, and what their results are compared by."""
+"""Small runs, benches and datasets, made in this process, and what their results are compared by."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,12 @@ import bench_fakes  # noqa: F401 - registers its agents
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench import registry
 from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.data.collect import collect, policy_of
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.data.folder import Apart, Dataset, write_dataset
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.runs import OnProgress, RunSpec
@@ -99,3 +104,17 @@ class Inline:
             except RuntimeError as error:
                 failures.append(Failure(job=job, reason=str(error)))
         return tuple(failures)
+
+
+FORMATS = ("npz", "lerobot", "minari")
+
+
+@functools.cache
+def collected(policy: str = "mixed", episodes: int = 6, seed: int = 0) -> tuple[Episodes, Apart, dict[str, Any]]:
+    spec = registry.task("arrow_puzzle")
+    chosen = policy_of(policy, spec, seed)
+    return collect(spec, chosen, episodes=episodes, seed=seed, execution="kinematic", appearance="mild")
+
+
+def written(folder: Path, format: str = "npz", **which: Any) -> Dataset:
+    return write_dataset(folder, *collected(**which), format)

@@ -11,30 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from encoder_frames import arrow_spec
+from encoder_frames import CHAPTER_5, TINY, TINY_CONV, arrow_spec
 from imagine_bench.agents.encoders import training as encoder_training
 from imagine_bench.agents.encoders import unfinished
-from imagine_bench.agents.encoders.cli import compare, retrain
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard, empty_vae, view
 from imagine_bench.agents.encoders.probe import Latents, Probe, accuracy, train_probe
-from imagine_bench.agents.encoders.recipes import RECIPES, Recipe, recipe_named
+from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
 from imagine_bench.agents.encoders.training import beta_at, draw_frames, learning_rate_at, train_encoder
 from imagine_bench.agents.encoders.vae import Elbo, Vae, kl_from_standard_normal, standardise
 from imagine_bench.agents.networks.weights import initialise
-from PIL import Image
 from safetensors.torch import save_file
 from torch import Tensor
 
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, UnknownNameError
 from imagine_bench.preprocessing import gray_strips
-
-CHAPTER_5 = RECIPES["chapter_5"]
-TINY = replace(
-    CHAPTER_5["default"], name="tiny", widths=(32,), frames=300, held_out_frames=200, steps=40, batch=32, probe_steps=60
-)
-TINY_CONV = replace(
-    CHAPTER_5["thesis"], name="tiny_conv", frames=40, held_out_frames=20, steps=2, batch=8, probe_steps=5
-)
 
 
 def made_vae(recipe: Recipe, seed: int = 0) -> Vae:
@@ -460,47 +450,3 @@ def test_view_joins_strips_and_keeps_colors() -> None:
     assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
     colors = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
     assert np.array_equal(view(colors, "small_rgb")[1, 5, 7], colors[1, :, 5, 7])
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
-def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path) -> None:
-    text = retrain(arrow_spec(), recipe=TINY, appearance="mild", seed=1, out=tmp_path / "new")
-    path = tmp_path / "new" / "drawn_arrows-mild.safetensors"
-    card = Encoder.load(path).card
-    assert f"Wrote {path}" in text and f"{card.probe['mlp']:.2%}" in text
-    assert card.command == "imagine-bench encoder --task drawn_arrows --appearance mild --recipe tiny --seed 1"
-    assert card.cpu_s["total"] == pytest.approx(sum(card.cpu_s[k] for k in ("frames", "training", "probe")), abs=0.2)
-    with Image.open(path.with_suffix(".png")) as sheet:
-        colors = np.asarray(sheet)
-    assert colors.std() > 20 and colors.shape[1] > 1000
-    written = {file: file.read_bytes() for file in path.parent.iterdir()}
-    assert len(written) == 3
-    with pytest.raises(ArtefactError, match="exists already and is never overwritten"):
-        retrain(arrow_spec(), recipe=TINY, appearance="mild", seed=2, out=tmp_path / "new")
-    assert {file: file.read_bytes() for file in path.parent.iterdir()} == written
-
-
-def test_retrain_names_wrong_choices_before_working(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match=r"No encoder recipe 'defualt'. Did you mean 'default'"):
-        retrain(arrow_spec(), recipe="defualt", appearance="mild", seed=0, out=tmp_path / "new")
-    with pytest.raises(UnknownNameError, match="Known: clean, mild, strong"):
-        retrain(arrow_spec(), recipe=TINY, appearance="x", seed=0, out=tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-
-
-def test_retrain_with_fewer_steps_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unfinished, "_SAVE_EVERY_S", 0.0)
-    monkeypatch.setitem(CHAPTER_5, "tiny_conv", TINY_CONV)
-    retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path, steps=1)
-    card = Encoder.load(tmp_path / "drawn_arrows-mild.safetensors").card
-    assert card.recipe.steps == 1 and card.command.endswith("--recipe tiny_conv --seed 1 --steps 1")
-    assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_comparison_shows_both_cards(tiny: Encoder) -> None:
-    better = replace(tiny.card, probe={"linear": 0.5, "mlp": 0.9987, "mlp_sampled": 0.75}, seed=77)
-    text = compare(better, tiny.card)
-    assert "new" in text and "bundled" in text and "99.87%" in text and "77" in text
-    assert f"{tiny.card.probe['mlp']:.2%}" in text
