@@ -1,10 +1,12 @@
-"""Rollouts by TorchRL are those of the environments themselves; skipped without it (``pip install torchrl``)."""
+"""Rollouts by TorchRL are those of the environments themselves."""
 
 from __future__ import annotations
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
+from torchrl import envs
 
 from imagine_bench import registry
 from imagine_bench.adapters.torchrl import NumericInfo
@@ -24,9 +26,8 @@ def test_infos_are_numbers_and_all_else_is_as_before():
 
 
 def test_a_rollout_with_infos_is_our_episodes():
-    libs = pytest.importorskip("torchrl.envs")
-    env = libs.GymWrapper(NumericInfo(gymnasium.make(ARROWS, **KINEMATIC))).auto_register_info_dict()
-    libs.check_env_specs(env)
+    env = envs.GymWrapper(NumericInfo(gymnasium.make(ARROWS, **KINEMATIC))).auto_register_info_dict()
+    envs.check_env_specs(env)
     env.set_seed(0)
     walked = env.rollout(60, break_when_any_done=False)
     rules, ended = registry.task("arrow_puzzle").rules, 0
@@ -44,11 +45,9 @@ def test_a_rollout_with_infos_is_our_episodes():
 
 
 def test_a_vector_environment_is_rolled_out_as_single_ones():
-    libs = pytest.importorskip("torchrl.envs")
-    torch = pytest.importorskip("torch")
     make = registry.vector_id(ARROWS)
-    env = libs.GymWrapper(gymnasium.make_vec(make, num_envs=3, autoreset_mode="Disabled", **KINEMATIC))
-    libs.check_env_specs(env)
+    env = envs.GymWrapper(gymnasium.make_vec(make, num_envs=3, autoreset_mode="Disabled", **KINEMATIC))
+    envs.check_env_specs(env)
     walked = env.rollout(40, break_when_any_done=False)
     assert walked.batch_size == (3, 40) and walked["next", "done"].sum() > 10
     goes_on = ~walked["next", "done"][:, :-1, 0]

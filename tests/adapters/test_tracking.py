@@ -1,4 +1,4 @@
-"""Metrics of a bench in TensorBoard, read back by it; skipped without it (extra ``tracking``)."""
+"""Metrics of a bench in TensorBoard, read back by it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ def bench(tmp_path):
 
 
 def test_tensorboard_reads_the_scalars_back(bench, capsys):
-    pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     for _ in range(2):  # the second time it is written anew
