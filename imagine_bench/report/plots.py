@@ -47,6 +47,7 @@ STYLE: dict[Any, Any] = {
     "grid.alpha": 0.25,
     "grid.linewidth": 0.6,
     "lines.linewidth": 2.0,
+    "figure.constrained_layout.w_pad": 0.1,  # in inches; letters are wider in the file than in the layout
 }
 
 
