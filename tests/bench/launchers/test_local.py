@@ -14,8 +14,8 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.bench.launchers import Job
-from imagine_bench.bench.local import LocalPool
+from imagine_bench.bench.launchers.jobs import Job
+from imagine_bench.bench.launchers.local import LocalPool
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.runs import Progress
 from imagine_bench.store import run_folder
