@@ -144,6 +144,20 @@ class Rules(Protocol):
         """An action of an optimal policy (the lowest index among equals)."""
 
 
+class Sight(Protocol):
+    """What frames show of the macrostates of a task, exactly."""
+
+    @property
+    def lag(self) -> int:
+        """Macro-actions that a frame is old, at least 0: after t of them the agent sees that of max(0, t - lag)."""
+
+    def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
+        """What a frame of ``macrostate`` may show, with probabilities that sum to 1; -1 for a hidden coordinate.
+
+        ``step`` macro-actions of the episode were done when the frame was taken; it is delivered ``lag`` later.
+        """
+
+
 @dataclass(frozen=True, kw_only=True)
 class RuleFacts:
     """What the rules alone say about a task, computed by enumeration."""
@@ -203,6 +217,7 @@ class TaskSpec:
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned
     #: what ``make speed`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
+    sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
 
     @property
     def n_actions(self) -> int:
