@@ -20,7 +20,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.runs import Progress
 from imagine_bench.store import run_folder
 
-_HERE = Path(__file__).parents[1] / "fakes"
+_HERE = Path(__file__).parents[2] / "fakes"
 
 
 def job(root: Path, agent: str, seed: int, **changes: object) -> Job:
