@@ -3,6 +3,7 @@
 While one lane is planned, the contact physics of those before it runs on other threads, each lane's on its own data and
 for as long as its own motion takes. So the lanes are equal to single environments, bit for bit. One
 ``mujoco.batch.Batch`` called for each distinct end gives the same bits as fast, but needs every lane's data twice.
+Kinematic lanes have nothing to simulate: a second process draws some of them.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
             ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
             resets, by ``reset(options={"reset_mask": ...})``), or Gymnasium's enum.
-        threads: Simulations at once; one a core if None.
+        threads: Simulations at once; one a core if None. From 2 on, a second process draws for four and more kinematic
+            lanes, as :mod:`.second_process` says.
 
     Raises:
         UnknownNameError: Another mode.
