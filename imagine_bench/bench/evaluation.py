@@ -13,7 +13,7 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
-from imagine_bench.store.counters import EvaluationCounts
+from imagine_bench.store.counters import EvaluationCounts, Played
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
@@ -70,15 +70,16 @@ def _require_sound(env: Env, frame: Any, reward: Any) -> None:
 
 def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
     """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-    start_s = time.process_time()
-    seed, success = episode_seed(purpose, 0, counts.episodes), False
-    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
-        counts.env_steps += 1
-        counts.return_sum += transition.reward
-        counts.faults += bool(info["fault"])
-        success = bool(info["is_success"])
-    counts.episodes += 1
-    counts.solved += "1" if success else "0"
+    start_s, begun = time.process_time(), list[Played]()
+
+    def begin(observation: Observation, info: Info) -> None:
+        if not begun:
+            begun.append(Played.begun(env, info))
+
+    seed = episode_seed(purpose, 0, counts.episodes)
+    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged, before_acting=begin):
+        begun[0].add(transition.action, transition.reward, info)
+    counts.add(begun[0])
     counts.cpu_s += time.process_time() - start_s
 
 

@@ -2,34 +2,90 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import AgentState
 from imagine_bench.store.checkpoints import Snapshot
 from imagine_bench.store.codec import pack, unpack
-from imagine_bench.store.results import Checkpoint
+from imagine_bench.store.results import Checkpoint, KeptEpisodes
+
+
+@dataclass
+class Played:
+    """What is kept of a test episode, while it is played; see :class:`.KeptEpisodes`."""
+
+    start: list[int]
+    fingerprint: int
+    actions: list[int] = field(default_factory=list)
+    total: float = 0.0
+    faults: int = 0
+    success: bool = False
+
+    @classmethod
+    def begun(cls, env: gymnasium.Env[Any, Any], info: Mapping[str, Any]) -> Played:
+        """One that has just been reset."""
+        start = [int(value) for value in info["macrostate"]]
+        return cls(start, zlib.crc32(f"{start} {env.unwrapped.np_random.bit_generator.state}".encode()))
+
+    def add(self, action: int, reward: float, info: Mapping[str, Any]) -> None:
+        """Take in one macro-action."""
+        self.actions.append(int(action))
+        self.total += reward
+        self.faults += bool(info["fault"])
+        self.success = bool(info["is_success"])
+        happened = np.array([*info["macrostate"], reward], dtype=np.float64)
+        self.fingerprint = zlib.crc32(happened.tobytes(), self.fingerprint)
 
 
 @dataclass
 class EvaluationCounts:
-    """Counts over test episodes; a checkpoint may carry them half way."""
+    """Test episodes, in their order, as :class:`.KeptEpisodes` has them; a checkpoint may carry them half way."""
 
-    episodes: int = 0  #: Test episodes done
-    solved: str = ""  #: ``1`` for each of them that ended in success, ``0`` for each other, in their order
-    env_steps: int = 0  #: Macro-actions in them
-    return_sum: float = 0.0  #: Sum of their undiscounted returns
-    faults: int = 0  #: Macro-actions whose physics disagreed with the rules
+    starts: list[list[int]] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    actions: list[int] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+    solved: str = ""  #: ``1`` for each that ended in success, ``0`` for each other
+    faults: list[int] = field(default_factory=list)
+    fingerprints: list[int] = field(default_factory=list)
     cpu_s: float = 0.0  #: CPU seconds spent
     diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
 
     @property
+    def episodes(self) -> int:
+        """Test episodes done."""
+        return len(self.solved)
+
+    @property
     def successes(self) -> int:
-        """Test episodes that ended in success."""
+        """Those that ended in success."""
         return self.solved.count("1")
+
+    def add(self, played: Played) -> None:
+        """Count one that is over."""
+        self.starts.append(played.start)
+        self.lengths.append(len(played.actions))
+        self.actions += played.actions
+        self.returns.append(played.total)
+        self.solved += "1" if played.success else "0"
+        self.faults.append(played.faults)
+        self.fingerprints.append(played.fingerprint)
+
+    def kept(self) -> KeptEpisodes:
+        """All of them as arrays."""
+        return KeptEpisodes(
+            starts=np.array(self.starts, dtype=np.int64), lengths=np.array(self.lengths, dtype=np.int64),
+            actions=np.array(self.actions, dtype=np.int64), returns=np.array(self.returns, dtype=np.float64),
+            success=np.array([each == "1" for each in self.solved]), faults=np.array(self.faults, dtype=np.int64),
+            fingerprints=np.array(self.fingerprints, dtype=np.int64),
+        )  # fmt: skip
 
 
 @dataclass
