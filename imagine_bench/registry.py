@@ -34,7 +34,7 @@ from imagine_bench.regression.interfaces import RegressionSpec, Regressor, Regre
 TASKS: dict[str, TaskEntry] = {
     **{
         name: TaskEntry(
-            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of", env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
+            spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_env",
             env_id=f"imagine_bench/{gymnasium_name}-v0", horizon=10, options={"goal": goal},
         )
         for name, gymnasium_name, goal in (
