@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -81,6 +81,19 @@ def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privi
         begun[0].add(transition.action, transition.reward, info)
     counts.add(begun[0])
     counts.cpu_s += time.process_time() - start_s
+
+
+def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
+    """Play the macro-actions of an episode again, as far as it goes, and whether it ends with the last of them."""
+    _, info = env.reset(seed=seed)
+    played, over = Played.begun(env, info), False
+    for action in actions:
+        if over or action not in env.action_space:
+            return played, False
+        _, reward, terminated, truncated, info = env.step(action)
+        played.add(action, float(reward), info)
+        over = terminated or truncated
+    return played, bool(over)
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):

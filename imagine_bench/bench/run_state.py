@@ -30,12 +30,13 @@ _RECENT = 100
 _REPORT_EVERY_S = 0.25
 
 
-def make_env(protocol: Protocol, task: str, *, testing: bool = False) -> Env:
-    """The environment of a task as a protocol has it, for training or for tests."""
+def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
+    """The environment of a task as a protocol has it, for training or for tests; ``options`` are more of its own."""
     return gymnasium.make(
         registry.task_entry(task).env_id,
         **protocol.world,
         appearance=protocol.appearance_in_tests if testing else protocol.appearance,
+        **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
 
