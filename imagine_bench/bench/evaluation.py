@@ -13,7 +13,7 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
-from imagine_bench.store.counters import EvaluationCounts, Played
+from imagine_bench.store.counters import Counters, EvaluationCounts, Played
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
@@ -94,6 +94,28 @@ def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
         played.add(action, float(reward), info)
         over = terminated or truncated
     return played, bool(over)
+
+
+class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
+
+    def __init__(self, env: Env, counters: Counters) -> None:
+        super().__init__(env)
+        self._counters, self._at = counters, list[int]()
+
+    def reset(self, **options: Any) -> tuple[Any, Info]:
+        """As the environment's."""
+        seen, info = self.env.reset(**options)
+        self._at = np.asarray(info["macrostate"]).tolist()
+        self._counters.starts.append(self._at)
+        return seen, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
+        """As the environment's."""
+        after = self.env.step(action)
+        self._counters.try_out(self._at, int(action))
+        self._at = np.asarray(after[4]["macrostate"]).tolist()
+        return after
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -42,13 +42,13 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options:
 
 
 @contextmanager
-def environments(protocol: Protocol) -> Iterator[tuple[Env, Env]]:
+def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]]:
     """The environments of training and of tests; one and the same unless tests have looks of their own."""
-    with closing(make_env(protocol, protocol.task)) as env:
+    with closing(make_env(protocol, protocol.task, **options)) as env:
         if protocol.appearance_in_tests == protocol.appearance:
             yield env, env
             return
-        with closing(make_env(protocol, protocol.task, testing=True)) as test_env:
+        with closing(make_env(protocol, protocol.task, testing=True, **options)) as test_env:
             yield env, test_env
 
 

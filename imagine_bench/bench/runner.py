@@ -110,16 +110,11 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
     return Checkpoint(
         episodes=budget,
         env_steps=run.counters.env_steps,
-        test_episodes=test.episodes,
-        successes=test.successes,
-        solved=test.solved,
-        mean_return=sum(test.returns) / test.episodes,
-        mean_length=len(test.actions) / test.episodes,
-        faults=sum(test.faults),
+        **test.figures(),
+        kept=test.kept(),
         train_cpu_s=run.counters.train_cpu_s,
         eval_cpu_s=test.cpu_s + time.process_time() - start_s,
         diagnostics=test.diagnostics,
         open_loop=measured.get("open_loop"),
         futures=measured.get("futures"),
-        kept=test.kept(),
     )

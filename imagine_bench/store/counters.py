@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,6 +78,14 @@ class EvaluationCounts:
         self.faults.append(played.faults)
         self.fingerprints.append(played.fingerprint)
 
+    def figures(self) -> dict[str, Any]:
+        """The fields of a :class:`.Checkpoint` that follow from the episodes."""
+        return {
+            "test_episodes": self.episodes, "successes": self.successes, "solved": self.solved,
+            "mean_return": sum(self.returns) / self.episodes, "mean_length": len(self.actions) / self.episodes,
+            "faults": sum(self.faults),
+        }  # fmt: skip
+
     def kept(self) -> KeptEpisodes:
         """All of them as arrays."""
         return KeptEpisodes(
@@ -100,6 +108,9 @@ class Counters:
     success: list[bool] = field(default_factory=list)  #: Whether each training episode succeeded
     length: list[int] = field(default_factory=list)  #: Macro-actions of each training episode
     queries: list[int] = field(default_factory=list)  #: Oracle queries in each training episode
+    starts: list[list[int]] = field(default_factory=list)  #: Where training episodes began, but those of a dataset
+    #: The episode in which each macro-action was first tried in a macrostate, by both, separated by blanks
+    tried: dict[str, int] = field(default_factory=dict)
     test: EvaluationCounts | None = None  #: The test that is going on, if one is
 
     def add_episode(self, success: bool, length: int, queries: int = 0) -> None:
@@ -110,12 +121,23 @@ class Counters:
         self.length.append(length)
         self.queries.append(queries)
 
+    def try_out(self, macrostate: Sequence[int], action: int) -> None:
+        """Count a macro-action of the training episode that goes on."""
+        self.tried.setdefault(" ".join(map(str, (*macrostate, action))), self.episode)
+
     def training(self) -> dict[str, NDArray[Any]]:
-        """``success``, ``length`` and ``queries`` of every training episode. Each of shape (episodes,)."""
+        """What ``training.npz`` holds.
+
+        ``success``, ``length`` and ``queries`` of every training episode, shape (episodes,); ``starts`` of those that
+        were played, (played, M); and ``tried``, a row a macrostate, macro-action and first episode, (pairs, M + 2).
+        """
+        pairs = [[*map(int, pair.split()), episode] for pair, episode in self.tried.items()]
         return {
             "success": np.array(self.success, dtype=np.bool_),
             "length": np.array(self.length, dtype=np.int64),
             "queries": np.array(self.queries, dtype=np.int64),
+            "starts": np.array(self.starts[: self.episode], dtype=np.int16),  # a library begins one more at its end
+            "tried": np.array(pairs, dtype=np.int32),
         }
 
     def snapshot(self, agent: AgentState) -> Snapshot:
@@ -126,4 +148,4 @@ class Counters:
     @classmethod
     def of(cls, snapshot: Snapshot) -> Counters:
         """The inverse of :meth:`snapshot`."""
-        return unpack(cls, snapshot.values, snapshot.arrays)
+        return unpack(cls, {**pack(cls())[0], **snapshot.values}, snapshot.arrays)  # an older one has fewer fields

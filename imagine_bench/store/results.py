@@ -133,6 +133,10 @@ class RunResult:
     training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
     training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
     folder: Path  #: Where the run's files lie
+    #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
+    training_starts: NDArray[np.int16] | None = None
+    #: Macrostate, macro-action and the first episode in which it was tried there. Shape (pairs, M + 2). None likewise.
+    tried: NDArray[np.int32] | None = None
     recording: Path | None = None  #: Its Rerun recording, or None
     imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
     #: Several from one beginning at the last budget, where the rules leave something to chance.

@@ -168,6 +168,8 @@ def load_run(folder: Path) -> RunResult:
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
+        training_starts=training.get("starts"),
+        tried=training.get("tried"),
         imagined=unpack(tuple[ComparedRollout, ...], None, rollouts, "imagined"),
         sampled_rollouts=unpack(tuple[ComparedRollout, ...], None, rollouts, "sampled_rollouts"),
         folder=folder,
