@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
+from imagine_bench.rules import states_of
 
 from .motion.executor import MacroResult, finish
 from .motion.executor import Motion as Acting
@@ -119,7 +120,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
-        self._known = frozenset(spec.rules.states)
+        self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         self._make_world, self.world = make_world, make_world(appearance_level(appearance))
         self.world.set_physics(settings)

@@ -9,7 +9,7 @@ import tempfile
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
+from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.executor import REST_OPENING_M, MacroExecutor, finish
 from imagine_bench.tasks.motion.ik import ArmIK

@@ -7,9 +7,9 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
-from imagine_bench.tasks.arrow_puzzle.spec import spec_of
-from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+from imagine_bench.tasks.arrows.scene import compile_arrow_scene
+from imagine_bench.tasks.arrows.spec import spec_of
+from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.macro_env import agent_camera
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
