@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.bench.control import run_observed
-from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.bench.launchers.jobs import Failure, Job
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import Apart, Dataset, write_dataset
