@@ -51,6 +51,9 @@ def same_but_for_time(a: RunResult, b: RunResult) -> bool:
         return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
 
     arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
+    for one, other in zip(a.checkpoints, b.checkpoints, strict=True):
+        assert one.kept is not None and other.kept is not None
+        arrays += [(getattr(one.kept, name), getattr(other.kept, name)) for name in vars(one.kept)]
     return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
 
 
