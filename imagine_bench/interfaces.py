@@ -121,8 +121,8 @@ class Rules(Protocol):
         """Number of macro-actions A."""
 
     @property
-    def states(self) -> tuple[State, ...]:
-        """Every macrostate the machine knows, terminal ones included."""
+    def states(self) -> tuple[State, ...] | None:
+        """Every macrostate the machine knows, terminal ones included; None: those that are reached from the starts."""
 
     @property
     def start_states(self) -> tuple[State, ...]:

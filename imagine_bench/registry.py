@@ -35,7 +35,7 @@ from imagine_bench.regression.interfaces import RegressionSpec, Regressor, Regre
 TASKS: dict[str, TaskEntry] = {
     **{
         name: TaskEntry(
-            spec="imagine_bench.tasks.arrow_puzzle.spec:spec_of", env="imagine_bench.tasks.arrow_puzzle.spec:make_env",
+            spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_env",
             env_id=f"imagine_bench/{gymnasium_name}-v0", horizon=10, options={"goal": goal},
         )
         for name, gymnasium_name, goal in (
@@ -440,14 +440,15 @@ def task(name: str) -> TaskSpec:
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
             raise TypeError(f"it is {brief(spec)} and no TaskSpec")
-    counts = tuple(1 + max(values) for values in zip(*spec.rules.states, strict=True))
+    listed, values = getattr(spec.rules, "states", None), tuple(map(len, spec.macrostate_values))
+    counts = tuple(1 + max(column) for column in zip(*listed, strict=True)) if listed else values
     for what, ours, theirs in (
         ("id", name, spec.id),
         ("env_id", entry.env_id, spec.env_id),
         ("horizon", entry.horizon, spec.horizon),
         ("n_actions", spec.rules.n_actions, spec.n_actions),
-        ("number of macrostate_names", len(spec.rules.states[0]), len(spec.macrostate_names)),
-        ("numbers of macrostate_values", counts, tuple(map(len, spec.macrostate_values))),
+        ("number of macrostate_names", len(spec.rules.start_states[0]), len(spec.macrostate_names)),
+        ("numbers of macrostate_values", counts, values),
     ):
         if ours != theirs:
             raise InvalidValueError(

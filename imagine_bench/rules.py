@@ -39,43 +39,64 @@ def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray
     Raises:
         InvalidValueError: Another shape or type, or a row that is no macrostate of the machine.
     """
-    macrostates, known, width = np.asarray(macrostates), set(rules.states), len(rules.states[0])
+    macrostates, states = np.asarray(macrostates), states_of(rules)
+    known, width = set(states), len(states[0])
     if macrostates.ndim != 2 or macrostates.shape[1] != width or not np.issubdtype(macrostates.dtype, np.integer):
         given = f"{macrostates.dtype} of shape {macrostates.shape}"
         raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {given}.")
     for row in macrostates.tolist():
         if tuple(row) not in known:
-            raise InvalidValueError(f"No macrostate {tuple(row)}; give one of {len(known)}, such as {rules.states[0]}.")
+            raise InvalidValueError(f"No macrostate {tuple(row)}; give one of {len(known)}, such as {states[0]}.")
     return macrostates
 
 
+def states_of(rules: Rules) -> tuple[State, ...]:
+    """Every macrostate: those that the rules list, or where they list none, those reached from the starts."""
+    return getattr(rules, "states", None) or tuple(tabulate(rules).index)
+
+
 def tabulate(rules: Rules) -> RuleTables:
-    """Write the machine out as arrays.
+    """Write the machine out as arrays: what it lists, or what is reached from its starts, where ends have empty rows.
 
     Raises:
-        InvalidValueError: The outcome probabilities of some (macrostate, action) do not sum to 1.
+        InvalidValueError: The outcome probabilities of some (macrostate, action) do not sum to 1, or an outcome is a
+            macrostate that the rules do not list.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
 
-    index = {state: row for row, state in enumerate(rules.states)}
-    shape = (rules.n_actions, len(index))
-    reward, success = np.zeros(shape), np.zeros(shape)
-    goes_on: list[tuple[float, int, int]] = []
-    for state, row in index.items():
+    listed = getattr(rules, "states", None)
+    index = {state: row for row, state in enumerate(listed or rules.start_states)}
+    queue, queued = list(index), set(index)
+    pairs: list[tuple[int, int, float, float]] = []  # action, row, reward, success
+    goes_on: list[tuple[float, int, int, int]] = []  # probability, action, row, next row
+    for state in queue:  # grows
+        row = index[state]
         for action in range(rules.n_actions):
-            outcomes = rules.outcomes(state, action)
-            total = sum(outcome.probability for outcome in outcomes)
+            total = reward = success = 0.0
+            for outcome in rules.outcomes(state, action):
+                after, share = outcome.macrostate, outcome.probability
+                total, reward = total + share, reward + share * outcome.reward
+                success += share * outcome.success
+                if listed and after not in index:
+                    raise InvalidValueError(f"Action {action} in macrostate {state} leads to {after}; list it, too.")
+                column = index.setdefault(after, len(index))
+                if not outcome.terminated:
+                    goes_on.append((share, action, row, column))
+                    if after not in queued:
+                        queued.add(after)
+                        queue.append(after)
             if abs(total - 1.0) > _TIE_TOLERANCE:
                 raise InvalidValueError(f"Outcomes of action {action} in macrostate {state} sum to {total}, not 1.")
-            for outcome in outcomes:
-                reward[action, row] += outcome.probability * outcome.reward
-                success[action, row] += outcome.probability * outcome.success
-                if not outcome.terminated:
-                    goes_on.append((outcome.probability, action * len(index) + row, index[outcome.macrostate]))
+            pairs.append((action, row, reward, success))
+    shape = (rules.n_actions, len(index))
+    facts_of, shares = np.array(pairs).reshape(-1, 4), np.array(goes_on).reshape(-1, 4)
+    where = tuple(facts_of[:, :2].astype(np.int64).T)
+    reward_of, success_of = np.zeros(shape), np.zeros(shape)
+    reward_of[where], success_of[where] = facts_of[:, 2], facts_of[:, 3]
+    action_of, row_of, column_of = shares[:, 1:].astype(np.int64).T
+    alive = csr_array((shares[:, 0], (action_of * len(index) + row_of, column_of)), shape=(reward_of.size, len(index)))
     starts = np.array([index[state] for state in rules.start_states], dtype=np.int64)
-    shares, rows, columns = zip(*goes_on, strict=True) if goes_on else ((), (), ())
-    alive = csr_array((shares, (rows, columns)), shape=(reward.size, len(index)), dtype=np.float64)
-    return RuleTables(index=index, starts=starts, alive=alive, reward=reward, success=success)
+    return RuleTables(index=index, starts=starts, alive=alive, reward=reward_of, success=success_of)
 
 
 def optimal_values(tables: RuleTables) -> Floats:
@@ -107,6 +128,47 @@ def optimal_actions(tables: RuleTables) -> NDArray[np.bool_]:
 def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
     return np.asarray(optimal_actions(tables).argmax(axis=0), dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HorizonOptimum:
+    """The best that can be done in the macro-actions that are left, by backward induction.
+
+    More success comes first, then more return, then the action of the lowest index. Shapes: ``H`` the horizon.
+    """
+
+    success: Floats  #: largest success probability with H actions left. Shape (S,).
+    returns: Floats  #: expected undiscounted return of that policy. Shape (S,).
+    actions: NDArray[np.int16]  #: what to do with t + 1 actions left. Shape (H, S).
+
+
+def horizon_optimum(tables: RuleTables, horizon: int) -> HorizonOptimum:
+    """Solve a machine for a finite horizon of at least 1 action, exactly."""
+    shape = tables.reward.shape
+    success, returns = np.zeros(shape[1]), np.zeros(shape[1])
+    actions = np.empty((horizon, shape[1]), dtype=np.int16)
+    everywhere = np.arange(shape[1])
+    for left in range(horizon):
+        wins = tables.success + (tables.alive @ success).reshape(shape)
+        earns = tables.reward + (tables.alive @ returns).reshape(shape)
+        earns = np.where(wins >= wins.max(axis=0) - _TIE_TOLERANCE, earns, -np.inf)
+        best = (earns >= earns.max(axis=0) - _TIE_TOLERANCE).argmax(axis=0)
+        actions[left], success, returns = best, wins[best, everywhere], earns[best, everywhere]
+    return HorizonOptimum(success=success, returns=returns, actions=actions)
+
+
+def shortest_plans(tables: RuleTables) -> NDArray[np.int64]:
+    """The fewest macro-actions after which a success is possible from each macrostate, -1 where none is. Shape (S,)."""
+    n_states = tables.reward.shape[1]
+    links = tables.alive.tocoo()
+    before, after = links.row % n_states, links.col
+    lengths = np.where((tables.success > 0.0).any(axis=0), 1, -1)
+    steps = 1
+    while (lengths == steps).any():
+        reaches = before[lengths[after] == steps]
+        steps += 1
+        lengths[reaches[lengths[reaches] < 0]] = steps
+    return lengths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +231,9 @@ def by_macrostate(belief: Belief) -> dict[State, float]:
 
 def is_random(rules: Rules) -> bool:
     """Whether some macro-action may lead to one thing or another."""
-    return any(len(rules.outcomes(state, action)) > 1 for state in rules.states for action in range(rules.n_actions))
+    return any(
+        len(rules.outcomes(state, action)) > 1 for state in states_of(rules) for action in range(rules.n_actions)
+    )
 
 
 def fewest_actions(rules: Rules, start: State) -> int:

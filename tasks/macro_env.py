@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
+from imagine_bench.rules import states_of
 
 from .motion.executor import MacroResult, finish
 from .motion.executor import Motion as Acting
@@ -119,7 +120,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts = spec.rules.start_states
-        self._known = frozenset(spec.rules.states)
+        self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         self._make_world, self.world = make_world, make_world(appearance_level(appearance))
         self.world.set_physics(settings)
@@ -221,6 +222,10 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
     def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
         """What :meth:`reset` and :meth:`step` return of environments like this as they stand, by its cameras."""
         return self._observer.observe([(env._observer, env._macrostate) for env in envs])
+
+    def share(self, envs: Sequence[MacroEnv]) -> Callable[[mujoco.MjData], None]:
+        """Have a second process draw for :meth:`observe`, as :meth:`.Observer.share` says."""
+        return self._observer.share([env._observer for env in envs])
 
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""

@@ -22,6 +22,7 @@ from torch import Tensor
 from imagine_bench.errors import DivergedError, require_known
 from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 
 from ..networks.weights import initialise
@@ -58,7 +59,7 @@ class FrameSet:
 
 def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
     """Frames of macrostates drawn uniformly from all that the rules know. Shapes (n, 64, 64, 3) and (n, M)."""
-    states = np.array(spec.rules.states, dtype=np.int64)
+    states = np.array(states_of(spec.rules), dtype=np.int64)
     macrostates = states[rng.integers(len(states), size=n)]
     return spec.render_macrostates(macrostates, appearance, rng), macrostates
 

@@ -20,6 +20,7 @@ from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.protocols.task_types import Encoders, TaskType
+from imagine_bench.rules import states_of
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import BenchResult, RunResult
@@ -64,7 +65,9 @@ def _require_sound(wanted: Protocol) -> None:
     spec = registry.task(wanted.task)
     try:
         spec.facts()
-        frame = spec.render_macrostates(np.array(spec.rules.states[:1]), wanted.appearance, np.random.default_rng(0))
+        frame = spec.render_macrostates(
+            np.array(states_of(spec.rules)[:1]), wanted.appearance, np.random.default_rng(0)
+        )
         seen = [("render_macrostates", frame[0])]
         with closing(make_env(wanted, wanted.task)) as env:
             seen.append(("its environment", env.reset(seed=0)[0]))

@@ -20,6 +20,7 @@ from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, Observation, TaskSpec
 from imagine_bench.machine import describe_environment
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
 from imagine_bench.store.trained import load_trained
 
@@ -87,7 +88,7 @@ def collect(
         allowed = f"1 to {MOST_EPISODES:,} episodes and a seed from 0 to {SEEDS - 1}"
         raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
     starts = SeedTree(seed).child("dataset", "starts").generator()
-    open_states = [state for state in spec.rules.states if not spec.rules.is_terminal(state)]
+    open_states = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
     seeds = [episode_seed("dataset", seed, index) for index in range(episodes)]
     parts, motion = [], list[ArmMotion]()
     env_id = registry.task_entry(spec.id).env_id

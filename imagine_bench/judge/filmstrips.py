@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench.interfaces import Macrostate, Rules, TaskSpec
+from imagine_bench.rules import states_of
 from imagine_bench.store.results import ComparedRollout
 
 _CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is made up
@@ -138,7 +139,7 @@ def changes(before: Macrostate, now: Macrostate, spec: TaskSpec) -> str:
 def is_possible(rules: Rules, before: Macrostate, action: int, now: Macrostate) -> bool:
     """Whether the rules allow ``now`` after ``action`` in ``before``."""
     state, reached = tuple(before.tolist()), tuple(now.tolist())
-    known = state in rules.states and not rules.is_terminal(state)
+    known = state in states_of(rules) and not rules.is_terminal(state)
     return known and any(outcome.macrostate == reached for outcome in rules.outcomes(state, action))
 
 

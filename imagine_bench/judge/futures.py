@@ -14,7 +14,7 @@ import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench.capabilities import FutureSampler, SampledFutures
 from imagine_bench.interfaces import Floats, Macrostate, Rules, State, TaskSpec
-from imagine_bench.rules import Belief, advance, by_macrostate
+from imagine_bench.rules import Belief, advance, by_macrostate, states_of
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import Futures
 
@@ -35,7 +35,7 @@ def imagined_futures(
     imagines with the generator of ``seeds``, is not changed.
     """
     rules = spec.rules
-    alive = [state for state in rules.states if not rules.is_terminal(state)]
+    alive = [state for state in states_of(rules) if not rules.is_terminal(state)]
     pairs = [(state, action) for state in alive for action in range(rules.n_actions)]
     frames = min(FRAMES, samples)
     states = np.array([state for state, _ in pairs for _ in range(frames)], dtype=np.int64)  # [P F, M]
@@ -53,7 +53,7 @@ def imagined_futures(
 
 def follow_optimum(rules: Rules, macrostates: Macrostate) -> Macrostate:
     """The rules' optimal macro-action in each macrostate (N, M), or -1 where no episode goes on. Shape (N,)."""
-    known = {state: rules.optimal_action(state) for state in rules.states if not rules.is_terminal(state)}
+    known = {state: rules.optimal_action(state) for state in states_of(rules) if not rules.is_terminal(state)}
     return np.array([known.get(state, -1) for state in map(tuple, macrostates.tolist())], dtype=np.int64)
 
 

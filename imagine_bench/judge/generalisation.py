@@ -19,6 +19,7 @@ from imagine_bench.capabilities import ImaginedRollout, Imaginer, MapPredictor, 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame, Outcome, TaskSpec
 from imagine_bench.judge.calibration import auroc
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, SeedTree
 
 Mask = NDArray[np.bool_]
@@ -113,7 +114,7 @@ def transition_set(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evalu
         InvalidValueError: The rules list no terminal macrostate, so that there is nothing a model could not have seen.
     """
     rules = spec.rules
-    pairs = [(state, action) for state in rules.states for action in range(rules.n_actions)]
+    pairs = [(state, action) for state in states_of(rules) for action in range(rules.n_actions)]
     terminal = np.array([rules.is_terminal(state) for state, _ in pairs])
     if terminal.all() or not terminal.any():
         raise InvalidValueError(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, TaskSpec
-from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
+from imagine_bench.rules import evaluate, greedy, optimal_policy, states_of, tabulate
 from imagine_bench.seeding import Purpose, SeedTree
 
 FRAMES = 16  # frames of a macrostate, F
@@ -50,7 +50,9 @@ class Terminations:
 
 def eval_states(spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> EvalStates:
     """All macrostates that an agent may act in, each in :data:`FRAMES` frames, the same for every agent."""
-    macrostates = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)], dtype=np.int64)
+    macrostates = np.array(
+        [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)], dtype=np.int64
+    )
     rng = SeedTree(0).child(purpose, "policy", spec.id).generator()
     frames = spec.render_macrostates(np.repeat(macrostates, FRAMES, axis=0), appearance, rng)
     return EvalStates(macrostates=macrostates, frames=frames.reshape(len(macrostates), FRAMES, *frames.shape[1:]))

@@ -15,6 +15,7 @@ import platformdirs
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
+from imagine_bench.rules import states_of
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
@@ -36,7 +37,7 @@ def cache_folder() -> Path:
 
 def cached(spec: TaskSpec, appearance: str, kind: str) -> Path:
     """Where the trained encoder of a task's looks belongs, be it there or not; other looks are another folder."""
-    frames = spec.render_macrostates(np.array(spec.rules.states[:8]), appearance, np.random.default_rng(0))
+    frames = spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
     looks = hashlib.sha256(f"{spec.preprocessing}/{spec.config_group}/".encode() + frames.tobytes()).hexdigest()[:12]
     return cache_folder() / "encoders" / looks / f"{bundled_name(spec.encoder, appearance, kind)}{_SUFFIX}"
 
@@ -50,7 +51,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
         BusyError: Another process makes it.
     """
     entry = registry.offered(name, {}, registry.ENCODER_GROUP)
-    frames = spec.render_macrostates(np.array(spec.rules.states[:8]), appearance, np.random.default_rng(0))
+    frames = spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
     try:
         features = np.asarray(registry.load(entry.make)().encode(frames), dtype=np.float64)
         shape_is_right = features.ndim == 2 and len(features) == len(frames) and np.isfinite(features).all()

@@ -19,7 +19,7 @@ from imagine_bench import registry
 from imagine_bench.bench.evaluation import play
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
-from imagine_bench.rules import facts
+from imagine_bench.rules import facts, states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 
@@ -105,7 +105,7 @@ def _rules(spec: TaskSpec) -> None:
 
 
 def _frames(spec: TaskSpec) -> None:
-    states = np.array(spec.rules.states[:_MOST])
+    states = np.array(states_of(spec.rules)[:_MOST])
     one, other = (spec.render_macrostates(states, "clean", np.random.default_rng(0)) for _ in range(2))
     given = f"{one.dtype} of shape {one.shape}"
     _require(one.dtype == np.uint8 and one.shape == (len(states), 64, 64, 3), f"{len(states)} frames are {given}")
@@ -119,7 +119,7 @@ def _gymnasium(spec: TaskSpec) -> None:
 
 def _starts(spec: TaskSpec) -> None:
     with closing(_env(spec)) as env:
-        states = spec.rules.states
+        states = states_of(spec.rules)
         for start in (*spec.rules.start_states[:_MOST], *states[:: 1 + len(states) // _MOST]):
             _, info = env.reset(seed=0, options={"macrostate": start})
             _require(info.keys() >= _KEYS, f"info lacks {sorted(_KEYS - info.keys())}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
-from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, tabulate
+from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
 from imagine_bench.store.encoders import bundled
 
 _MOST = 10
@@ -22,7 +22,7 @@ def describe(name: str) -> str:
         rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
         return _page(data.title, data.description, rows)
     spec = registry.task(name)
-    facts, states = spec.facts(), spec.rules.states
+    facts, states = spec.facts(), states_of(spec.rules)
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
     chance = "some macro-actions have several outcomes" if is_random(spec.rules) else "none: each has one outcome"
     rows = {

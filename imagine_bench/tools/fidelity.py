@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import PerformanceTargets, TaskSpec
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree, episode_seed
 
 _ACTIONS_A_WALK = 200
@@ -48,7 +49,7 @@ def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int) 
         for execution in ("physics", "kinematic")
     )
     found, rng = Fidelity(), SeedTree(0).child("speed", "physics", spec.id).generator()
-    play = [state for state in spec.rules.states if not spec.rules.is_terminal(state)]
+    play = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
     real.reset(seed=episode_seed("tuning", 0, actions))
     standing_m = _poses(real, targets)[:, 2]  # every start has all objects on the table
     fresh = True

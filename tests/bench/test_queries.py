@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import Pupil
-from imagine_bench.tasks.arrow_puzzle.rules import ArrowPuzzleRules
+from imagine_bench.tasks.arrows.rules import ArrowPuzzleRules
 from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry

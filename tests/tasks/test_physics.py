@@ -6,7 +6,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.scene import compile_arrow_scene
+from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.ik import ArmIK
 from imagine_bench.tasks.pick_place.scene import compile_pick_scene

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks import rendering
-from imagine_bench.tasks.arrow_puzzle.spec import spec_of
-from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+from imagine_bench.tasks.arrows.spec import spec_of
+from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.graphics import choose_platform
 from imagine_bench.tasks.macro_env import agent_camera, human_camera_view
 from imagine_bench.tasks.rendering import Renderer, View
@@ -252,9 +252,9 @@ def test_scenes_of_several_threads_end_in_silence():
     script = """
         from concurrent.futures import ThreadPoolExecutor
         import numpy as np
-        from imagine_bench.tasks.arrow_puzzle.spec import spec_of
+        from imagine_bench.tasks.arrows.spec import spec_of
         from imagine_bench.tasks.macro_env import agent_camera
-        from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+        from imagine_bench.tasks.arrows.world import ArrowWorld
         from imagine_bench.tasks.scenes.appearance import appearance
         states, world = np.array([[0, 1, 2, 1]]), ArrowWorld(appearance("clean"))
         world.place((0, 1, 2, 1), np.random.default_rng(0))

@@ -32,7 +32,7 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("mutants_that_may_live.json")
-_RULES = ("tests/tasks/arrow_puzzle/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
+_RULES = ("tests/tasks/arrows/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
 _FACTORED = (
     "tests/agents/factored/test_factored_formulas.py", "tests/agents/factored/test_factored.py",
     "tests/agents/test_transfer.py",
@@ -40,7 +40,7 @@ _FACTORED = (
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
 ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "rules": {
-        "tasks/arrow_puzzle/rules.py": _RULES[:1],
+        "tasks/arrows/rules.py": _RULES[:1],
         "tasks/pick_place/rules.py": _RULES[1:],
         "imagine_bench/rules.py": _RULES,
     },

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.rules import ArrowPuzzleRules
+from imagine_bench.tasks.arrows.rules import ArrowPuzzleRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry

@@ -8,7 +8,7 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.world import ArrowWorld
+from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.fragments import Photographer, fragments
 

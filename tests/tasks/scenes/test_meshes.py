@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.cubes import arrow_outline
+from imagine_bench.tasks.arrows.cubes import arrow_outline
 from imagine_bench.tasks.pick_place import open_hand
 from imagine_bench.tasks.scenes import hand, objects
 from imagine_bench.tasks.scenes.meshes import Mesh, arch, box, ellipsoid, limb, merge, prism, turned_profile

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrow_puzzle.rules import GOALS, LEFT, TOWARD_AGENT, TOWARD_HUMAN, ArrowPuzzleRules
-from imagine_bench.tasks.arrow_puzzle.spec import make_env, spec_of
+from imagine_bench.tasks.arrows.rules import GOALS, LEFT, TOWARD_AGENT, TOWARD_HUMAN, ArrowPuzzleRules
+from imagine_bench.tasks.arrows.spec import make_env, spec_of
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Outcome

@@ -1,1 +1,0 @@
-"""The arrow puzzle (thesis, chapter 5)."""

@@ -1,0 +1,1 @@
+"""Arrow puzzles: that of the thesis (chapter 5) and its family."""
