@@ -185,6 +185,22 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         make=f"{_WORLD_MODELS}.convolutional:make", title="convolutional",
         description="A convolutional network from the latest frame and the action to the next frame, in plain torch.",
     ),
+    "gaussian": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_gaussian", title="VAE + one Gaussian", encoder_kind="latents",
+        description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
+    ),
+    "mdn_dropout": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_dropout", title="VAE + MDN, MC dropout", encoder_kind="latents",
+        description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
+    ),
+    "mdn_ensemble": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
+        description="Three mixture density networks between latents, uncertain where they disagree.",
+    ),
+    "structured": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.structured:make", title="structured", encoder_kind="codes",
+        description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
+    ),
     "exact": WorldModelEntry(
         make="imagine_bench.judge.models.ends:make_exact", title="exact", privileged=True,
         description="The rules and the renderer (privileged): the other end of the scale.",

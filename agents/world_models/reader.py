@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imagine_bench.interfaces import State, TaskSpec, appearance_of_tests
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 
 from ..encoders.perception import prepare_torch
@@ -105,7 +106,7 @@ def train_reader(spec: TaskSpec, appearance: str, *, frames: int = FRAMES, steps
     rng, generator = seeds.generator(), torch.Generator().manual_seed(seeds.child("torch").integer())
     reader = Reader(tuple(len(values) for values in spec.macrostate_values))
     initialise(reader.network, generator)
-    states = spec.rules.states
+    states = states_of(spec.rules)
     shown = rng.integers(len(states), size=frames)
     macrostates = np.array(states, dtype=np.int64)[shown]
     images = images_of(spec.render_macrostates(macrostates, appearance, rng))
@@ -140,18 +141,16 @@ class _Partners:
     """Frames of other macrostates: often of one that differs in a single coordinate, since such blends are hardest."""
 
     def __init__(self, states: tuple[State, ...], shown: NDArray[np.int64]) -> None:
-        self._shown = shown
-        array = np.array(states)
-        apart = (array[:, None] != array[None]).sum(axis=2)
-        self._near = [np.flatnonzero(row == 1) for row in apart]
-        self._rows = [np.flatnonzero(shown == index) for index in range(len(states))]
+        self._states, self._shown = np.array(states), shown
+        order = np.argsort(shown, kind="stable")
+        self._rows = np.split(order, np.searchsorted(shown[order], np.arange(1, len(states))))
 
     def of(self, rows: NDArray[np.int64], rng: np.random.Generator) -> Tensor:
         """A partner of each row."""
         return torch.tensor([self._one(int(row), rng) for row in rows])
 
     def _one(self, row: int, rng: np.random.Generator) -> int:
-        near = self._near[self._shown[row]]
+        near = np.flatnonzero((self._states != self._states[self._shown[row]]).sum(axis=1) == 1)
         if len(near) and rng.random() < 0.7:
             frames = self._rows[int(rng.choice(near))]
             if len(frames):

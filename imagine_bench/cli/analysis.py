@@ -90,14 +90,14 @@ class Judge:
     def __call__(self) -> None:
         """Judge and report."""
         from imagine_bench.judge.models.study import Judgement, judge  # noqa: PLC0415 - as above
-        from imagine_bench.report.judge import judgement_table  # noqa: PLC0415 - as above
+        from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
 
         judgement = Judgement(
             task=self.task, models=self.models or tuple(registry.WORLD_MODELS), sizes=self.sizes, seeds=self.seeds,
             samples=self.samples, appearance=self.appearance, policy=self.policy,
         )  # fmt: skip
         folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
-        print(f"{judgement_table(folder, judgement)}\n\n{folder}")
+        print(judgement_report(folder, judgement))
         if failed:
             raise RunFailedError("\n".join(failed))
 

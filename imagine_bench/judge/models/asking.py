@@ -17,6 +17,7 @@ from imagine_bench.judge.models.truth import Questions, courses, lasting_actions
 from imagine_bench.seeding import SeedTree
 from imagine_bench.world_models import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 
+STATES = 400  # macrostates asked about at most; of more, values are not computed
 FRAMES = 2  # frames of each macrostate in the questions of one step
 DEPTH, HISTORY = 10, 2
 """Macro-actions of each rollout, and macro-actions before them that a model is shown."""
@@ -58,8 +59,8 @@ class Answers:
 
 def one_step(spec: TaskSpec, gallery: Gallery) -> Questions:
     """Every macro-action in every macrostate that an episode can be in, from :data:`FRAMES` frames each."""
-    pairs = [pair for pair in transitions(spec.rules) for _ in range(FRAMES)]
     rng = SeedTree(0).child("evaluation", "judge", "one_step", spec.id).generator()
+    pairs = [pair for pair in transitions(spec.rules, rng, STATES) for _ in range(FRAMES)]
     return _questions(spec, gallery, [((state,), (action,)) for state, action in pairs], rng)
 
 
@@ -124,7 +125,7 @@ def ask(
         imagined = call(name, "imagine", model.imagine, frames, actions, samples, rng)
         cpu_s += time.process_time() - begun_s
         require_imagined(imagined, name=name, rows=len(frames), depth=questions.depth, samples=samples)
-        parts.append((_read(imagined, reader, gallery, len(questions.states[0])), imagined))
+        parts.append((read_pictures(imagined, reader, gallery, len(questions.states[0])), imagined))
     offered = [each for each in UNCERTAINTIES if all(getattr(part, each) is not None for _, part in parts)]
     return Answers(
         states=_joined([states for states, _ in parts]),
@@ -147,7 +148,7 @@ def call(name: str, method: str, function: Any, *arguments: Any) -> Any:
         raise InvalidValueError(f"World model {name}: {method}() failed ({why}).") from error
 
 
-def _read(imagined: Imagined, reader: Reader, gallery: Gallery, coordinates: int) -> NDArray[np.int64]:
+def read_pictures(imagined: Imagined, reader: Reader, gallery: Gallery, coordinates: int) -> NDArray[np.int64]:
     """Macrostates (N, S, D, M) of what was imagined; equal pictures are read once."""
     shape = imagined.pictures.shape
     pictures = imagined.pictures.reshape(-1, *shape[3:])

@@ -55,9 +55,6 @@ def one_step_scores(
     pictured = [{state: share for state, share in each.items() if state[0] >= 0} for each in imagined]
     away = np.array([total_variation(*pair) for pair in zip(exact, imagined, strict=True)])
     calibrated = _outcome_calibration(exact, imagined)
-    machine, truth = imagined_machine(questions, answers, spec.rules), exact_machine(questions, spec.n_actions)
-    starts = tuple(state for state in spec.rules.start_states if state in truth.states)
-    losses = value_losses(truth, machine, starts, spec.horizon)
     seen = np.array([pair in visited for pair in zip(questions.states, questions.asked[:, 0].tolist(), strict=True)])
     return {
         "total_variation": float(away.mean()),
@@ -66,14 +63,23 @@ def one_step_scores(
         "nothing": float(np.mean([no_picture(each) for each in imagined])),
         **calibrated,
         **_reward_and_end(questions, answers),
-        "value_loss": float(losses.mean()),
-        "worst_value_loss": float(losses.max()),
-        "worth_of_refusing": worth_of_refusing(questions, answers, truth, machine, starts, spec.horizon),
+        **_values(spec, questions, answers),
         "where": _where(spec, questions, exact, imagined, away, seen),
         **_knows(exact, answers, away, seen),
         "by_question": away.round(6).tolist(),
         "worst": np.argsort(-away, kind="stable")[:10].tolist(),
     }
+
+
+def _values(spec: TaskSpec, questions: Questions, answers: Answers) -> dict[str, float]:
+    """Value losses; NaN where not every start was asked about."""
+    machine, truth = imagined_machine(questions, answers, spec.rules), exact_machine(questions, spec.n_actions)
+    starts = spec.rules.start_states
+    if not set(starts) <= set(truth.states):
+        return dict.fromkeys(("value_loss", "worst_value_loss", "worth_of_refusing"), math.nan)
+    losses = value_losses(truth, machine, starts, spec.horizon)
+    worth = worth_of_refusing(questions, answers, truth, machine, starts, spec.horizon)
+    return {"value_loss": float(losses.mean()), "worst_value_loss": float(losses.max()), "worth_of_refusing": worth}
 
 
 def ranking_scores(spec: TaskSpec, questions: Questions, answers: Answers) -> dict[str, float]:

@@ -29,8 +29,9 @@ from imagine_bench.judge.models import asking
 from imagine_bench.judge.models.asking import Answers, Reader, ask, call
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.scores import by_depth, one_step_scores, ranking_scores
-from imagine_bench.judge.models.truth import Questions
+from imagine_bench.judge.models.truth import Questions, shares
 from imagine_bench.machine import describe_environment
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.codec import write_arrays
@@ -251,7 +252,7 @@ def reader_errors(reader: Reader, spec: TaskSpec, appearance: str) -> dict[str, 
     picture of this world of black and gray fog, noise, and blends of two frames of different macrostates.
     """
     rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
-    states = np.array(spec.rules.states, dtype=np.int64)
+    states = np.array(states_of(spec.rules), dtype=np.int64)
     macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
     frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
     differ = (macrostates != others).any(axis=1)
@@ -268,21 +269,31 @@ def reader_errors(reader: Reader, spec: TaskSpec, appearance: str) -> dict[str, 
 
 
 def _pictures(model: WorldModel, world: _World, worst: list[int], seeds: SeedTree) -> dict[str, NDArray[Any]]:
-    """The worst transitions and one rollout, real beside imagined: before, real, imagined of each."""
+    """The worst transitions and one rollout, imagined once more: before, likeliest real outcome, imagined of each.
+
+    ``right`` says whether what is imagined, as read, may happen.
+    """
     rng = seeds.child("pictures").generator()
     found: dict[str, NDArray[Any]] = {}
     for name, questions, rows in (("worst", world.one_step, worst), ("futures", world.rollouts, [0])):
         imagined = model.imagine(questions.frames[rows], questions.actions[rows], 1, rng)
+        read = asking.read_pictures(imagined, world.reader, world.gallery, len(world.spec.macrostate_names))[:, 0]
         pictures = imagined.pictures[:, 0]
         if pictures.dtype != np.uint8:
             pictures = (np.asarray(pictures) * 255.0).round().astype(np.uint8)
-        real = [[world.gallery.frame(max(c, key=lambda k: c[k][0])[0]) for c in questions.truth[row]] for row in rows]
-        found |= {
-            f"{name}_before": questions.frames[rows, -1],
-            f"{name}_real": np.array(real),
-            f"{name}_imagined": pictures,
+        truth = [[shares(course) for course in questions.truth[row]] for row in rows]
+        real = [[world.gallery.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
+        right = [
+            [tuple(state) in each for state, each in zip(states, steps, strict=True)]
+            for states, steps in zip(read.tolist(), truth, strict=True)
+        ]
+        arrays: dict[str, NDArray[Any]] = {
+            "before": questions.frames[rows, -1],
+            "actions": questions.asked[rows],
+            "imagined": pictures,
         }
-        found |= {f"{name}_actions": questions.asked[rows], f"{name}_rows": np.array(rows)}
+        arrays |= {"real": np.array(real), "right": np.array(right)}
+        found |= {f"{name}_{each}": array for each, array in arrays.items()}
     return found
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Rules, State
+from imagine_bench.rules import states_of
 
 Course = dict[tuple[State, bool], tuple[float, float]]
 """By macrostate and whether the episode is over: probability, and the reward expected of the action that led there."""
@@ -73,9 +74,11 @@ def expected_reward(course: Course) -> float:
     return sum(share * reward for share, reward in course.values())
 
 
-def transitions(rules: Rules) -> list[tuple[State, int]]:
-    """Every macrostate that an episode can be in, with every macro-action."""
-    alive = (state for state in rules.states if not rules.is_terminal(state))
+def transitions(rules: Rules, rng: np.random.Generator, most: int) -> list[tuple[State, int]]:
+    """Every macro-action in every macrostate that an episode can be in; where there are too many, in ``most`` drawn."""
+    alive = [state for state in states_of(rules) if not rules.is_terminal(state)]
+    if len(alive) > most:
+        alive = [alive[index] for index in np.sort(rng.choice(len(alive), most, replace=False))]
     return list(itertools.product(alive, range(rules.n_actions)))
 
 
