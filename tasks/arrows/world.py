@@ -14,7 +14,7 @@ from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.layout import layout
 from ..world import MAX_SKEW_RAD, World
-from .rules import TURNS, Turn
+from .description import Arrows, Turn
 from .scene import compile_arrow_scene
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
     def __init__(self, level: Appearance, cubes: int = 3, turns: Sequence[tuple[Turn, ...]] = ()) -> None:
-        self._layout, self._turns = layout(cubes), turns or tuple((turn,) for turn in TURNS)
+        self._layout, self._turns = layout(cubes), turns or Arrows(cubes=cubes).turns
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         super().__init__(compile_arrow_scene(cubes), level, objects=objects, materials=materials)
@@ -46,12 +46,12 @@ class ArrowWorld(World):
         for turn in self._turns[action]:
             if not self._stays(turn.cube, intended):
                 self._put(turn.cube, intended[turn.cube])
-        self.update()
+        self._answer(intended)
 
     def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 
-        The human keeps pointing. A cube that shall stay where it is slips out of the fingers.
+        A cube that shall stay where it is slips out of the fingers. Then the human points where they shall.
         """
         turns, before = self._turns[action], self.object_poses()
         slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
@@ -62,11 +62,17 @@ class ArrowWorld(World):
                 capture_motion_hz=capture_motion_hz,
             )))  # fmt: skip
         self.executor.executor.rest(self.data)
-        self.update()
+        self._answer(intended)
         result = functools.reduce(MacroResult.then, results)
         turned = [turn.cube for turn in turns if turn.cube not in slipping]
         pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
+
+    def _answer(self, intended: tuple[int, ...]) -> None:
+        """A human who is to point at another cube does so."""
+        if self._read_gesture() != intended[-1]:
+            self._gesture(intended[-1])
+        self.update()
 
     def _stays(self, cube: int, intended: tuple[int, ...]) -> bool:
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""
