@@ -138,7 +138,7 @@ def test_a_task_unlike_its_registry_line_or_its_rules_is_named(field, monkeypatc
     spec = registry.task("arrow_puzzle")
     wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
     changed = dataclasses.replace(spec, **{field: wrong})
-    monkeypatch.setattr("imagine_bench.tasks.arrows.spec.spec_of", lambda goal: changed)
+    monkeypatch.setattr("imagine_bench.tasks.arrows.spec.spec_of", lambda **world: changed)
     numbers = {"action_names": "n_actions 5", "macrostate_names": "names 3", "macrostate_values": r"values \(4, 4, 4\)"}
     what = numbers.get(field, f"{field} {wrong!r}")
     with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
