@@ -12,6 +12,7 @@ takes_study := TASK VARIANTS LAUNCHER WORKERS ARGS
 takes_plan := TASK EXECUTION ENCODER ARGS
 takes_generalise := TASK ENCODER ARGS
 takes_policy := TASK ENCODER ARGS
+takes_verify := TASK ARGS
 takes_view := TASK ARGS
 takes_report := TASK ARGS
 takes_data := ARGS
@@ -40,7 +41,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan generalise policy study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan generalise policy verify study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -66,6 +67,9 @@ generalise: ready  ## Ask the newest bench's models for every transition, also t
 
 policy: ready  ## Follow the policies of the newest bench's learners from every start by the rules
 	@$(BIN)/imagine-bench policy $(options)
+
+verify: ready  ## Play every test episode of the newest bench again and say whether its tables follow from them
+	@$(BIN)/imagine-bench verify $(options)
 
 study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench study $(options)

@@ -12,8 +12,8 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
 
-from imagine_bench.bench.launchers import LAUNCHERS
-from imagine_bench.bench.local import LocalPool
+from imagine_bench.bench.launchers.jobs import LAUNCHERS
+from imagine_bench.bench.launchers.local import LocalPool
 from imagine_bench.cli import main
 from imagine_bench.entrants import parse_settings
 from imagine_bench.errors import InvalidValueError, SetupError

@@ -31,7 +31,8 @@ ARROWS: dict[str, set[str]] = {
     "adapters": {"registry", "store"},
     "tools": {"registry", "machine", "store", "statistics", "bench", "data"},
     "testing": {"registry", "tools"},
-    "cli": {*_DATA, "adapters", "data", "bench", "judge", "recording", "studies", "report", "tools"},
+    "audit": {*_DATA, "bench", "judge", "report"},
+    "cli": {*_DATA, "adapters", "audit", "data", "bench", "judge", "recording", "studies", "report", "tools"},
     "__init__": {"registry"},
     "__main__": {"cli"},
 }

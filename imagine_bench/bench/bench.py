@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.bench.launchers import Failure, Job, Launcher
+from imagine_bench.bench.launchers.jobs import Failure, Job, Launcher
 from imagine_bench.bench.progress import ProgressBars
 from imagine_bench.errors import RunFailedError, SetupError, require_modules
 from imagine_bench.machine import describe_environment, gl_renderer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -13,7 +13,7 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
-from imagine_bench.store.counters import EvaluationCounts
+from imagine_bench.store.counters import Counters, EvaluationCounts, Played
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
@@ -70,16 +70,52 @@ def _require_sound(env: Env, frame: Any, reward: Any) -> None:
 
 def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
     """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-    start_s = time.process_time()
-    seed, success = episode_seed(purpose, 0, counts.episodes), False
-    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged):
-        counts.env_steps += 1
-        counts.return_sum += transition.reward
-        counts.faults += bool(info["fault"])
-        success = bool(info["is_success"])
-    counts.episodes += 1
-    counts.solved += "1" if success else "0"
+    start_s, begun = time.process_time(), list[Played]()
+
+    def begin(observation: Observation, info: Info) -> None:
+        if not begun:
+            begun.append(Played.begun(env, info))
+
+    seed = episode_seed(purpose, 0, counts.episodes)
+    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged, before_acting=begin):
+        begun[0].add(transition.action, transition.reward, info)
+    counts.add(begun[0])
     counts.cpu_s += time.process_time() - start_s
+
+
+def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
+    """Play the macro-actions of an episode again, as far as it goes, and whether it ends with the last of them."""
+    _, info = env.reset(seed=seed)
+    played, over = Played.begun(env, info), False
+    for action in actions:
+        if over or action not in env.action_space:
+            return played, False
+        _, reward, terminated, truncated, info = env.step(action)
+        played.add(action, float(reward), info)
+        over = terminated or truncated
+    return played, bool(over)
+
+
+class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
+
+    def __init__(self, env: Env, counters: Counters) -> None:
+        super().__init__(env)
+        self._counters, self._at = counters, list[int]()
+
+    def reset(self, **options: Any) -> tuple[Any, Info]:
+        """As the environment's."""
+        seen, info = self.env.reset(**options)
+        self._at = np.asarray(info["macrostate"]).tolist()
+        self._counters.starts.append(self._at)
+        return seen, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
+        """As the environment's."""
+        after = self.env.step(action)
+        self._counters.try_out(self._at, int(action))
+        self._at = np.asarray(after[4]["macrostate"]).tolist()
+        return after
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 
-from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, play, play_test_episode
+from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
 from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen, demonstrator
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
@@ -72,7 +72,7 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
             watcher(observation, info)
 
     episode = play(
-        run.env,
+        Watched(run.env, counters),
         demonstrator(run.spec) if demonstrated else run.agent,
         seed=seed,
         explore=True,
@@ -115,7 +115,7 @@ def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], Non
         return run.counters.episode < budgets[-1]
 
     with closing(make_env(run.protocol, run.task.id)) as own:
-        starts = TrainingStarts(own, run.spec.seed)
+        starts = TrainingStarts(Watched(own, run.counters), run.spec.seed)
         agent.train(starts, episodes=budgets[-1], horizon=run.task.horizon, on_episode=on_episode)
 
 

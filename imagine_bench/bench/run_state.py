@@ -30,24 +30,25 @@ _RECENT = 100
 _REPORT_EVERY_S = 0.25
 
 
-def make_env(protocol: Protocol, task: str, *, testing: bool = False) -> Env:
-    """The environment of a task as a protocol has it, for training or for tests."""
+def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
+    """The environment of a task as a protocol has it, for training or for tests; ``options`` are more of its own."""
     return gymnasium.make(
         registry.task_entry(task).env_id,
         **protocol.world,
         appearance=protocol.appearance_in_tests if testing else protocol.appearance,
+        **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
 
 
 @contextmanager
-def environments(protocol: Protocol) -> Iterator[tuple[Env, Env]]:
+def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]]:
     """The environments of training and of tests; one and the same unless tests have looks of their own."""
-    with closing(make_env(protocol, protocol.task)) as env:
+    with closing(make_env(protocol, protocol.task, **options)) as env:
         if protocol.appearance_in_tests == protocol.appearance:
             yield env, env
             return
-        with closing(make_env(protocol, protocol.task, testing=True)) as test_env:
+        with closing(make_env(protocol, protocol.task, testing=True, **options)) as test_env:
             yield env, test_env
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -52,6 +53,28 @@ class Plan:
                 encoder=self.encoder,
             )
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Play every test episode of a bench again, and say in a line a run whether its tables follow from them."""
+
+    folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
+    """A bench's folder."""
+    task: Annotated[str | None, ANY] = None
+    """Task whose newest bench is taken."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def __call__(self) -> None:
+        """Play and compare."""
+        from imagine_bench.audit.verify import verify  # noqa: PLC0415 - as above
+        from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
+
+        verdicts = verify(chosen(self.folder, self.out, self.task))
+        print(*verdicts, sep="\n")
+        if any(verdict.complaint for verdict in verdicts):
+            sys.exit(1)
 
 
 @dataclass(frozen=True, kw_only=True)

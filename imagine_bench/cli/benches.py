@@ -10,7 +10,7 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers import LAUNCHERS, launcher
+from imagine_bench.bench.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
 from imagine_bench.entrants import file_name, parse_settings
 from imagine_bench.errors import InvalidValueError

@@ -21,12 +21,16 @@ from imagine_bench.store.results import BenchResult
 def write_report(result: BenchResult) -> Path:
     """Write ``result.folder / "report"``: index.html, report.md, the CSV files and the images.
 
-    Everything comes from ``result`` (and the bundled encoder's card), so writing it again gives the same report.
     Returns the path of index.html.
 
     Raises:
         SetupError: The folder cannot be written.
     """
+    return write_page(result.folder / "report", report_page(result))
+
+
+def report_page(result: BenchResult) -> Page:
+    """The report. Everything comes from ``result`` (and the bundled encoder's card), so it is the same every time."""
     data = collect(result)
     files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if data.open_loop:
@@ -34,7 +38,7 @@ def write_report(result: BenchResult) -> Path:
     if data.futures:
         files["futures.csv"] = futures_csv(data)
     protocol, agents = result.protocol, result.protocol.agents
-    page = Page(
+    return Page(
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
         f"{f'trained first on dataset {protocol.dataset} · ' if protocol.dataset else ''}"
@@ -46,7 +50,6 @@ def write_report(result: BenchResult) -> Path:
         colors={agent_words(agent).title: plots.color(agent) for agent in agents},
         **made(result, {agent: agent_words(agent).title for agent in agents}),
     )
-    return write_page(result.folder / "report", page)
 
 
 def _sections(data: ReportData) -> list[Section]:
@@ -64,19 +67,24 @@ def write_page(folder: Path, page: Page) -> Path:
     Raises:
         SetupError: The folder cannot be written.
     """
-    files = {name: content.encode() for name, content in page.files.items()}
+    files = {name: content.encode() for name, content in texts(page).items()}
     files |= {f"{image.name}.png": image.png for section in page.sections for image in section.images}
+    sweep(make_folder(folder), older_than_s=3600.0)  # another may write the same report
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+    return folder / "index.html"
+
+
+def texts(page: Page) -> dict[str, str]:
+    """The files of a report, by name, but for its images."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("imagine_bench.report"), autoescape=lambda name: str(name).endswith(".html.j2"),
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     environment.filters |= {"md": markdown_text, "code": markdown_code}
-    for name, template in (("report.md", "page.md.j2"), ("index.html", "page.html.j2")):
-        files[name] = environment.get_template(template).render(page=page).encode()
-    sweep(make_folder(folder), older_than_s=3600.0)  # another may write the same report
-    for name, content in files.items():
-        write_bytes(folder / name, content)
-    return folder / "index.html"
+    pages = {"report.md": "page.md.j2", "index.html": "page.html.j2"}
+    rendered = {name: environment.get_template(template).render(page=page) for name, template in pages.items()}
+    return {**page.files, **rendered}
 
 
 def markdown_text(value: object) -> str:

@@ -75,6 +75,25 @@ class ComparedRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
+class KeptEpisodes:
+    """K test episodes as they were played, N macro-actions in all, so that anyone can play them again."""
+
+    starts: NDArray[np.int64]  #: Where each began. Shape (K, M).
+    lengths: NDArray[np.int64]  #: Its macro-actions. Shape (K,).
+    actions: NDArray[np.int64]  #: Those of all episodes, one behind the other. Shape (N,).
+    returns: NDArray[np.float64]  #: Its undiscounted return. Shape (K,).
+    success: NDArray[np.bool_]  #: Whether it ended in success. Shape (K,).
+    faults: NDArray[np.int64]  #: Its macro-actions whose physics disagreed with the rules. Shape (K,).
+    #: CRC-32 of the environment's generator at its start and of every macrostate and reward that followed. Shape (K,).
+    fingerprints: NDArray[np.int64]
+
+    def actions_of(self, episode: int) -> list[int]:
+        """The macro-actions of one episode."""
+        end = int(self.lengths[: episode + 1].sum())
+        return self.actions[end - int(self.lengths[episode]) : end].tolist()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Checkpoint:
     """One evaluated budget of one run."""
 
@@ -94,6 +113,8 @@ class Checkpoint:
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
     futures: Futures | None = None  #: Sampled futures against the rules, for agents that can be asked for many
+    #: The test episodes themselves. None in results of before 2026-11-24.
+    kept: KeptEpisodes | None = field(default=None, compare=False)
 
     @property
     def success_rate(self) -> float:
@@ -112,6 +133,10 @@ class RunResult:
     training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
     training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
     folder: Path  #: Where the run's files lie
+    #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
+    training_starts: NDArray[np.int16] | None = None
+    #: Macrostate, macro-action and the first episode in which it was tried there. Shape (pairs, M + 2). None likewise.
+    tried: NDArray[np.int32] | None = None
     recording: Path | None = None  #: Its Rerun recording, or None
     imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
     #: Several from one beginning at the last budget, where the rules leave something to chance.

@@ -1,32 +1,37 @@
 """The files of one run: written once, when it is finished, and read back with every number the report needs.
 
-``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``measured.npz`` (what observers measured at the
-budgets), ``imagined.npz`` (rollouts of agents that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``,
-``checkpoints/``, and last ``DONE``, with the digests of the results.
+``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``episodes.npz`` (the test episodes; runs of before
+2026-11-24 have none), ``measured.npz`` (what observers measured at the budgets), ``imagined.npz`` (rollouts of agents
+that imagine), ``training.npz``, ``recording.rrd``, ``log.txt``, ``checkpoints/``, and last ``DONE``, with the digests
+of the results.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
+from imagine_bench.store.codec import Arrays, pack, read_arrays, table_rows, table_text, unpack, write_arrays
 from imagine_bench.store.counters import Counters
 from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
-from imagine_bench.store.results import Checkpoint, ComparedRollout, RunResult
+from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 
 FORMAT = "imagine_bench run 2"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
-_MEASURED, _IMAGINED, _TRAINING = "measured.npz", "imagined.npz", "training.npz"
+_MEASURED, _IMAGINED, _TRAINING, _EPISODES = "measured.npz", "imagined.npz", "training.npz", "episodes.npz"
 _DIAGNOSTIC = "diagnostics/"
-_APART = ("diagnostics", "open_loop", "futures")
+_APART = ("diagnostics", "open_loop", "futures", "kept")
 """Fields of a row that have columns or a file of their own."""
+_KEPT = tuple(field.name for field in dataclasses.fields(KeptEpisodes))
 
 
 def recording_path(folder: Path) -> Path:
@@ -114,7 +119,11 @@ def finish(
 ) -> None:
     """Write the results of a run and mark it as done, or raise SetupError and leave it unmarked."""
     write_metrics(folder, counters.rows)
-    write_arrays(folder / _MEASURED, pack(counters.rows)[1])
+    measured = [dataclasses.replace(row, kept=None) for row in counters.rows]
+    write_arrays(folder / _MEASURED, pack(measured)[1])
+    kept = [row.kept for row in counters.rows if row.kept is not None]
+    if len(kept) == len(counters.rows):  # else it was begun by a version that kept none
+        write_arrays(folder / _EPISODES, _side_by_side(kept))
     write_arrays(folder / _TRAINING, counters.training())
     rollouts = {"imagined": imagined, "sampled_rollouts": sampled_rollouts}
     write_arrays(folder / _IMAGINED, {n: a for name, each in rollouts.items() for n, a in pack(each, name)[1].items()})
@@ -126,7 +135,7 @@ def mark_done(folder: Path, names: Sequence[str]) -> None:
 
     Raises SetupError: the mark cannot be written.
     """
-    names = [*names, _RECORDING] if recording_path(folder).is_file() else names
+    names = [*names, *(name for name in (_EPISODES, _RECORDING) if (folder / name).is_file())]
     digests = {name: sha256(folder / name) for name in names}
     write_json(folder / _DONE, sealed({"format": FORMAT, "sha256": digests}))
 
@@ -159,6 +168,8 @@ def load_run(folder: Path) -> RunResult:
         settings=config["settings"],
         training_success=training["success"],
         training_length=training["length"],
+        training_starts=training.get("starts"),
+        tried=training.get("tried"),
         imagined=unpack(tuple[ComparedRollout, ...], None, rollouts, "imagined"),
         sampled_rollouts=unpack(tuple[ComparedRollout, ...], None, rollouts, "sampled_rollouts"),
         folder=folder,
@@ -192,4 +203,31 @@ def _read_checkpoints(folder: Path) -> tuple[Checkpoint, ...]:
     for row in table_rows((folder / _METRICS).read_text(), texts=("solved",)):
         diagnostics = {k.removeprefix(_DIAGNOSTIC): value for k, value in row.items() if k.startswith(_DIAGNOSTIC)}
         values.append({**row, "diagnostics": diagnostics})
-    return unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))
+    rows = unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))
+    if not (folder / _EPISODES).exists():
+        return rows
+    with reading(folder / _EPISODES, "the test episodes of a run"):
+        kept = _apart(read_arrays(folder / _EPISODES))
+        return tuple(dataclasses.replace(row, kept=each) for row, each in zip(rows, kept, strict=True))
+
+
+def _side_by_side(tests: Sequence[KeptEpisodes]) -> Arrays:
+    """B tests of K episodes as arrays (K, B, ...), so that what they have in common is compressed away.
+
+    ``actions`` are one test's behind another's. Integers are of the smallest type that holds them.
+    """
+    arrays: Arrays = {}
+    for name in _KEPT:
+        each = [getattr(test, name) for test in tests]
+        array = np.concatenate(each) if name == "actions" else np.stack(each, axis=1)
+        low, high = np.min_scalar_type(array.min(initial=0)), np.min_scalar_type(array.max(initial=0))
+        arrays[name] = array.astype(np.promote_types(low, high)) if array.dtype == np.int64 else array
+    return arrays
+
+
+def _apart(arrays: Arrays) -> list[KeptEpisodes]:
+    """The inverse of :func:`_side_by_side`."""
+    wide = {name: array.astype(np.int64) if array.dtype.kind in "iu" else array for name, array in arrays.items()}
+    ends = np.cumsum(wide["lengths"].sum(axis=0))[:-1]
+    parts = {n: np.split(array, ends) if n == "actions" else np.moveaxis(array, 1, 0) for n, array in wide.items()}
+    return [KeptEpisodes(**{name: parts[name][budget] for name in _KEPT}) for budget in range(len(ends) + 1)]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers import Launcher
+from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, require_types

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers import launcher
+from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.seeding import TUNING_SEEDS

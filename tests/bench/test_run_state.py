@@ -45,7 +45,7 @@ def test_progress_counts_all_that_was_played() -> None:
     counters.test = EvaluationCounts()
     assert tell(at_once=False) == (123, 0.4) and len(told) == 1, "not so soon again"
     assert tell() == (123, 0.4) and len(told) == 2
-    counters.test = EvaluationCounts(episodes=4, solved="0100")
+    counters.test = EvaluationCounts(solved="0100")
     assert tell() == (127, 0.25)
     counters.test, counters.success, run.entry.learns = None, [], False
     assert tell() == (118, None), "one that does not learn is tested once"

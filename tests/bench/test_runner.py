@@ -284,7 +284,7 @@ def test_test_episodes_are_greedy_and_training_explores(tmp_path: Path, monkeypa
     for _ in range(3):
         play_test_episode(counts, env, bench_fakes.TableAgent(context()), privileged=False, purpose="evaluation")
     env.close()
-    assert len(asked) == counts.env_steps > 0 and not any(asked)
+    assert len(asked) == len(counts.actions) > 0 and not any(asked)
     asked.clear()
     result = do(tmp_path / "run", open_loop_starts=0)
     assert sum(asked) == result.training_length.sum(), "each training step explores, and no step of a test"

@@ -21,7 +21,7 @@ from small_runs import do
 from imagine_bench import registry
 from imagine_bench.bench import run_state
 from imagine_bench.bench.control import run_observed
-from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.bench.launchers.jobs import Failure, Job
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.runs import OnProgress

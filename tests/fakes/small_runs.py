@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.bench.control import run_observed
-from imagine_bench.bench.launchers import Failure, Job
+from imagine_bench.bench.launchers.jobs import Failure, Job
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import Apart, Dataset, write_dataset
@@ -51,6 +51,9 @@ def same_but_for_time(a: RunResult, b: RunResult) -> bool:
         return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
 
     arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
+    for one, other in zip(a.checkpoints, b.checkpoints, strict=True):
+        assert one.kept is not None and other.kept is not None
+        arrays += [(getattr(one.kept, name), getattr(other.kept, name)) for name in vars(one.kept)]
     return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
 
 

@@ -12,7 +12,7 @@ import pytest
 from small_runs import do, same_but_for_time, small
 
 from imagine_bench.bench.bench import bench
-from imagine_bench.bench.launchers import launcher
+from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
 from imagine_bench.store.codec import pack, unpack

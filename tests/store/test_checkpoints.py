@@ -148,9 +148,12 @@ def test_a_whole_checkpoint_is_there_at_every_moment_of_a_save(tmp_path: Path) -
 def test_every_counter_comes_back(tmp_path: Path) -> None:
     assert not any(vars(Counters()).values()) and not any(vars(EvaluationCounts()).values()), "all begin at nothing"
     counters = Counters(before=3, train_cpu_s=1.5)
+    counters.starts = [[0, 1], [2, 1], [0, 0]]
     for success, length, queries in [(True, 3, 2), (False, 6, 0), (True, 1, 5)]:
+        counters.try_out([2 * (counters.episode == 1), 1], 4 * (counters.episode != 1))
         counters.add_episode(success, length, queries)
-    counters.test = EvaluationCounts(episodes=4, solved="0110", env_steps=9, return_sum=-1.5, faults=1, cpu_s=0.25)
+    played = {"actions": [2, 0, 1], "lengths": [1, 2], "returns": [-1.5], "faults": [1], "starts": [[0, 1], [1, 2]]}
+    counters.test = EvaluationCounts(solved="01", **played, fingerprints=[7, 9], cpu_s=0.25)
     row = {"episodes": 2, "env_steps": 9, "test_episodes": 5, "successes": 4, "mean_return": 0.5, "mean_length": 2.5}
     counters.rows.append(Checkpoint(**row, faults=1, train_cpu_s=0.5, eval_cpu_s=0.25, diagnostics={"loss": 0.1}))
     save_snapshot(tmp_path, counters.snapshot(AgentState(arrays={}, values={})))
@@ -160,4 +163,5 @@ def test_every_counter_comes_back(tmp_path: Path) -> None:
     assert again == counters
     assert {name: part.tolist() for name, part in again.training().items()} == {
         "success": [True, False, True], "length": [3, 6, 1], "queries": [2, 0, 5],
+        "starts": [[0, 1], [2, 1], [0, 0]], "tried": [[0, 1, 4, 0], [2, 1, 0, 1]],
     }  # fmt: skip

@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -58,7 +58,11 @@ def require_workers(workers: int) -> None:
         raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
 
 
-LAUNCHERS = {"local": "imagine_bench.bench.local:LocalPool", "ray": "imagine_bench.bench.ray:RayCluster"}
+LAUNCHERS = {
+    "local": "imagine_bench.bench.launchers.local:LocalPool",
+    "ray": "imagine_bench.bench.launchers.ray:RayCluster",
+    "slurm": "imagine_bench.bench.launchers.slurm:SlurmCluster",
+}
 """Where runs can be carried out, by name."""
 
 
@@ -83,6 +87,13 @@ class Launcher(Protocol):
         Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
         process, how far each is, and at once of one that failed.
         """
+
+
+def absolute(job: Job) -> Job:
+    """The job with paths that mean the same in every process."""
+    paths = {name: getattr(job.spec, name) for name in ("encoder", "dataset")}
+    spec = replace(job.spec, **{name: path.resolve() for name, path in paths.items() if path is not None})
+    return replace(job, spec=spec, folder=job.folder.resolve())
 
 
 def run_job(job: Job, on_progress: OnProgress) -> None:

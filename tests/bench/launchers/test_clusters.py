@@ -1,4 +1,4 @@
-"""Runs on a real Ray cluster: the same bits as at home, also when a worker or a node dies in the middle."""
+"""Runs on a real Ray cluster and by submitit: the same bits as at home, also when they are cut off in the middle."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.bench.launchers import LAUNCHERS, Job, launcher
-from imagine_bench.bench.local import LocalPool
-from imagine_bench.bench.ray import RayCluster, absolute
+from imagine_bench.bench.launchers.jobs import LAUNCHERS, Job, absolute, launcher
+from imagine_bench.bench.launchers.local import LocalPool
+from imagine_bench.bench.launchers.ray import RayCluster
+from imagine_bench.bench.launchers.slurm import SlurmCluster
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import Progress, RunSpec
@@ -57,14 +59,44 @@ def results(root: Path, seeds: tuple[int, ...]) -> list[Any]:
 
 def test_launchers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(launcher("local", 1), LocalPool)
-    with pytest.raises(UnknownNameError, match=r"No launcher 'rey'. Did you mean 'ray'\? Known: local, ray"):
+    with pytest.raises(UnknownNameError, match=r"No launcher 'rey'. Did you mean 'ray'\? Known: local, ray, slurm"):
         launcher("rey", 1)
     with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
         launcher("ray", 0)
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
-    with pytest.raises(SetupError, match=r"needs Ray: pip install 'imagine-bench\[ray\]'"):
-        launcher("ray", 1)
-    assert set(LAUNCHERS) == {"local", "ray"}
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    for name, module in (("ray", "ray"), ("slurm", "submitit")):
+        with pytest.raises(SetupError, match=rf"needs {module}, .*: pip install 'imagine-bench\[{name}\]'"):
+            launcher(name, 1)
+    assert set(LAUNCHERS) == {"local", "ray", "slurm"}
+
+
+@pytest.mark.slow
+def test_submitted_jobs_give_the_same_bits_also_when_preempted(tmp_path: Path) -> None:
+    """submitit's executor for one machine, with the signal that Slurm sends before it takes a node away."""
+    told: list[Progress] = []
+    preempted: list[int] = []
+
+    def preempt(progress: Progress) -> None:
+        told.append(progress)
+        if progress.episode >= 20 and not preempted:
+            for child in psutil.Process().children(recursive=True):
+                if "submitit.core._submit" in " ".join(child.cmdline()):
+                    child.send_signal(signal.SIGUSR2)
+                    preempted.append(progress.episode)
+
+    assert SlurmCluster(1).launch(jobs(tmp_path / "slurm", (0,), 600), preempt) == ()
+    assert preempted and (tmp_path / "slurm" / "seed_0" / "log.txt").read_text().count("begins or goes on") == 2
+    assert LocalPool(1).launch(jobs(tmp_path / "home", (0,), 600), lambda _: None) == ()
+    assert results(tmp_path / "slurm", (0,)) == results(tmp_path / "home", (0,))
+    assert told[-1].phase == "done"
+
+
+def test_a_submitted_job_that_fails_says_why(tmp_path: Path) -> None:
+    (job,) = jobs(tmp_path, (0,), 60)
+    lost = dataclasses.replace(job, spec=dataclasses.replace(job.spec, encoder=tmp_path / "no.safetensors"))
+    (failure,) = SlurmCluster(1).launch([lost], lambda _: None)
+    assert "no.safetensors" in failure.reason and failure.job.spec.seed == 0
 
 
 @needs_ray

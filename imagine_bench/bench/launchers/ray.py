@@ -11,11 +11,18 @@ import os
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
-from imagine_bench.bench.launchers import ONE_THREAD, Failure, Job, carry_out, require_workers, run_job
-from imagine_bench.errors import BusyError, SetupError
+from imagine_bench.bench.launchers.jobs import (
+    ONE_THREAD,
+    Failure,
+    Job,
+    absolute,
+    carry_out,
+    require_workers,
+    run_job,
+)
+from imagine_bench.errors import BusyError, SetupError, lacking
 from imagine_bench.protocols.runs import OnProgress, Progress
 
 _LOST = 20
@@ -39,7 +46,7 @@ class RayCluster:
         try:
             import ray  # noqa: F401, PLC0415 - an optional dependency
         except ImportError as error:
-            raise SetupError("The launcher 'ray' needs Ray: pip install 'imagine-bench[ray]'.") from error
+            raise lacking("ray") from error
         self._workers = workers
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
@@ -101,13 +108,6 @@ def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Fai
     for progress in ray.get(board.take.remote()):
         on_progress(progress)
     return tuple(failures)
-
-
-def absolute(job: Job) -> Job:
-    """The job with paths that mean the same in every process."""
-    paths = {name: getattr(job.spec, name) for name in ("encoder", "dataset")}
-    spec = replace(job.spec, **{name: path.resolve() for name, path in paths.items() if path is not None})
-    return replace(job, spec=spec, folder=job.folder.resolve())
 
 
 def _reason(ray: Any, task: Any) -> str:

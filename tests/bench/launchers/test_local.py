@@ -14,13 +14,13 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.bench.launchers import Job
-from imagine_bench.bench.local import LocalPool
+from imagine_bench.bench.launchers.jobs import Job
+from imagine_bench.bench.launchers.local import LocalPool
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.runs import Progress
 from imagine_bench.store import run_folder
 
-_HERE = Path(__file__).parents[1] / "fakes"
+_HERE = Path(__file__).parents[2] / "fakes"
 
 
 def job(root: Path, agent: str, seed: int, **changes: object) -> Job:

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from imagine_bench.bench.launchers import ONE_THREAD, Failure, Job, carry_out, require_workers
+from imagine_bench.bench.launchers.jobs import ONE_THREAD, Failure, Job, carry_out, require_workers
 from imagine_bench.protocols.runs import OnProgress, Progress
 
 _POLL_S = 0.5

@@ -1,0 +1,1 @@
+"""What the kept test episodes of a bench prove: that its tables hold, and why its agents failed."""

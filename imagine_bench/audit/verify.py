@@ -1,0 +1,151 @@
+"""Verification: every kept test episode is played again, and all that follows from them is computed anew.
+
+What a replay cannot show is not vouched for: CPU times, diagnostics, what observers measured, and that the agents would
+choose these actions again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.bench.evaluation import Env, replay
+from imagine_bench.bench.progress import counted
+from imagine_bench.bench.run_state import environments
+from imagine_bench.errors import ArtefactError, brief
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.report.page import report_page, texts
+from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
+from imagine_bench.store import run_folder
+from imagine_bench.store.archive import is_archive
+from imagine_bench.store.bench_folder import BenchStore, read_control
+from imagine_bench.store.counters import EvaluationCounts, Played
+from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.results import Checkpoint
+
+_CLAIMS = {
+    "starts": "start", "returns": "return", "success": "success", "faults": "number of faults",
+    "fingerprints": "fingerprint",
+}  # fmt: skip
+"""What is kept of a test episode beside its actions, and what it is called."""
+_LINES = {"report.md": r"^[|-].*$", "index.html": r"<tr>[\s\S]*?</tr>|<li>.*?</li>"}
+"""What is compared of a report's pages: tables and answers; of other files it is every line."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What was found of a run, or of the bench's report."""
+
+    what: str
+    complaint: str = ""  # empty where all holds
+    episodes: int = 0  # played again
+
+    def __str__(self) -> str:
+        holds = f"holds; {self.episodes:,} test episodes played again" if self.episodes else "holds"
+        return f"{self.what}: {self.complaint or holds}"
+
+
+def verify(folder: Path) -> list[Verdict]:
+    """One verdict a run of the bench in ``folder`` and, where all runs hold, one on its report.
+
+    Raises:
+        ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
+    """
+    protocol = read_control(folder)
+    if is_archive(folder):
+        raise ArtefactError(f"{folder} keeps results and no episodes; give a bench's folder, runs/<task>/<preset>-...")
+    unseen = {"observation": "state"} if registry.is_own(protocol.task) else {}  # nobody looks at frames
+    with environments(protocol, **unseen) as envs:
+        return verdicts(folder, Replays(*envs))
+
+
+def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
+    """As :func:`verify`, in environments of the bench's protocol."""
+    protocol, found = read_control(folder), list[Verdict]()
+    runs = [(agent, seed) for seed in protocol.seeds for agent in protocol.agents]
+    for agent, seed in counted(runs, "runs", total=len(runs)):
+        name, run = f"{agent} seed {seed}", BenchStore(folder, protocol).run_folder(agent, seed)
+        try:
+            run_folder.require_run_of(run, protocol, agent, seed)
+            found.append(Verdict(what=name, episodes=_verify_run(run, protocol, seed, replays)))
+        except ArtefactError as error:
+            found.append(Verdict(what=name, complaint=str(error)))
+    if not any(each.complaint for each in found) and (folder / "report").is_dir():
+        found.append(Verdict(what="report", complaint=_report_complaint(folder)))
+    return found
+
+
+class Replays:
+    """Episodes begun and played again in the protocol's own environments, each once."""
+
+    def __init__(self, env: Env, test_env: Env) -> None:
+        self._env, self._test_env = env, test_env
+        self._known: dict[tuple[int, ...], tuple[Played, bool]] = {}
+
+    def start(self, seed: int) -> list[int]:
+        """Where a training episode begins."""
+        return replay(self._env, seed, [])[0].start
+
+    def test(self, seed: int, actions: list[int]) -> tuple[Played, bool]:
+        """A test episode, and whether the actions are all of it."""
+        key = (seed, *actions)
+        if key not in self._known:
+            self._known[key] = replay(self._test_env, seed, actions)
+        return self._known[key]
+
+
+def _verify_run(folder: Path, protocol: Protocol, seed: int, replays: Replays) -> int:
+    """How many test episodes were played again. ArtefactError says in one sentence what does not hold."""
+    if not run_folder.is_done(folder):
+        raise ArtefactError("it is not finished.")
+    run = run_folder.load_run(folder)
+    rows, starts = run.checkpoints, [] if run.training_starts is None else run.training_starts.tolist()
+    if tuple(row.episodes for row in rows) != protocol.budgets:
+        raise ArtefactError(f"it was not tested after {protocol.budgets} episodes, as its protocol says.")
+    for episode, start in enumerate(starts, start=len(run.training_success) - len(starts)):
+        if start != (found := replays.start(episode_seed("training", seed, episode))):
+            raise ArtefactError(f"training episode {episode} of seed {seed} starts at {found}, and {start} was kept.")
+    count, purpose = protocol.evaluation_episodes, evaluation_split(seed)
+    return sum(_verify_test(row, count, purpose, replays) for row in rows)
+
+
+def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> int:
+    where, kept, again = f"after {row.episodes:,} episodes", row.kept, EvaluationCounts()
+    if kept is None:
+        raise ArtefactError("it keeps no test episodes, as no run of before 2026-11-24 does.")
+    sizes = {len(kept.lengths), *(len(getattr(kept, name)) for name in _CLAIMS)}
+    if sizes != {count} or kept.lengths.sum() != len(kept.actions):
+        raise ArtefactError(f"{where} it does not keep {count} whole test episodes.")
+    for test in range(count):
+        played, ends = replays.test(episode_seed(purpose, 0, test), kept.actions_of(test))
+        if not ends:
+            raise ArtefactError(f"{where}, test {test}: its actions do not end an episode, or go on after its end.")
+        again.add(played)
+    for name, word in _CLAIMS.items():
+        claimed, replayed = getattr(kept, name), getattr(again.kept(), name)
+        wrong = np.flatnonzero((claimed != replayed).reshape(count, -1).any(axis=1))
+        if len(wrong):
+            test = int(wrong[0])
+            raise ArtefactError(f"{where}, test {test}: the {word} is {replayed[test]}, and {claimed[test]} was kept.")
+    for name, value in again.figures().items():
+        if getattr(row, name) != value:
+            raise ArtefactError(f"{where}: {name} is {value} by the test episodes, and {getattr(row, name)} was kept.")
+    return count
+
+
+def _report_complaint(folder: Path) -> str:
+    """The first line of the report's tables that does not follow from the runs; empty if all do."""
+    page = report_page(load_so_far(folder))
+    bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
+    for name, text in texts(bare).items():
+        path, pattern = folder / "report" / name, re.compile(_LINES.get(name, "^.*$"), re.MULTILINE)
+        there = pattern.findall(path.read_text()) if path.is_file() else []
+        for has, wanted in zip_longest(there, pattern.findall(text), fillvalue="nothing"):
+            if has != wanted:
+                return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
+    return ""

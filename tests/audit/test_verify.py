@@ -1,0 +1,116 @@
+"""Results are verified by playing the test episodes again: what holds is said to hold, and every forgery is found."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import bench_fakes
+import gymnasium
+import numpy as np
+import pytest
+from forger import FORGERIES
+from small_runs import Inline, context, do, small
+
+from imagine_bench.audit.verify import Replays, verdicts, verify
+from imagine_bench.bench.bench import bench
+from imagine_bench.bench.evaluation import play_test_episode, replay
+from imagine_bench.bench.run_state import environments
+from imagine_bench.errors import ArtefactError
+from imagine_bench.report.page import report_page, texts
+from imagine_bench.seeding import episode_seed
+from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.store.counters import EvaluationCounts
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bench of a learner and of one that is none, with its report."""
+    wanted = small(agents=("table", "random"), evaluation_episodes=8)
+    result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    (result.folder / "report").mkdir()
+    for name, text in texts(report_page(result)).items():  # type: ignore[arg-type] # without images, which are slow
+        (result.folder / "report" / name).write_text(text)
+    return result.folder
+
+
+def test_a_bench_that_was_not_touched_holds(finished: Path) -> None:
+    assert [str(each) for each in verify(finished)] == [
+        "table seed 0: holds; 16 test episodes played again",
+        "random seed 0: holds; 16 test episodes played again",
+        "report: holds",
+    ]
+
+
+def test_two_hundred_forgeries_are_found(finished: Path, tmp_path: Path) -> None:
+    rng, tried, missed = np.random.default_rng(0), Counter[str](), list[str]()
+    with environments(small(), observation="state") as envs:
+        replays = Replays(*envs)
+        for number in range(200):
+            name = str(rng.choice(list(FORGERIES)))
+            folder = tmp_path / str(number) / finished.name
+            shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("checkpoints", "*.png"))
+            FORGERIES[name](folder, rng)
+            (forged,) = folder.parent.iterdir()
+            tried[name] += 1
+            try:
+                found = verdicts(forged, replays)
+            except ArtefactError:
+                continue
+            if not any(each.complaint for each in found):
+                missed.append(name)
+            assert all("\n" not in str(each) for each in found)
+    assert not missed and set(tried) == set(FORGERIES)
+
+
+@pytest.mark.parametrize("appearance", ["clean", "mild"])
+def test_a_policy_cannot_shift_the_starts_of_tests(appearance: str) -> None:
+    """Whatever was played before, and however long it took: test k starts the same, in every pixel."""
+
+    class Constant(bench_fakes.TableAgent):
+        chosen = 0
+
+        def act(self, observation: bench_fakes.Observation, *, explore: bool) -> int:
+            return self.chosen
+
+    starts, lengths = [], []
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance=appearance)
+    for chosen in range(3):
+        agent, counts = Constant(context()), EvaluationCounts()
+        agent.chosen = chosen
+        for _ in range(6):
+            play_test_episode(counts, env, agent, privileged=False, purpose="evaluation")
+        starts.append(counts.starts)
+        lengths.append(counts.lengths)
+        seed = episode_seed("evaluation", 0, 5)
+        assert replay(env, seed, counts.kept().actions_of(5))[0].fingerprint == counts.fingerprints[5]
+    frames = {env.reset(seed=episode_seed("evaluation", 0, 3))[0].tobytes() for _ in range(3)}
+    env.close()
+    assert len(frames) == 1 and starts[0] == starts[1] == starts[2]
+    assert len({tuple(each) for each in lengths}) == 3
+
+
+def test_kept_episodes_are_small_and_come_back(tmp_path: Path) -> None:
+    again = do(tmp_path, evaluation_episodes=60)
+    size = (tmp_path / "episodes.npz").stat().st_size
+    for row in again.checkpoints:
+        assert (
+            row.kept is not None
+            and row.kept.starts.shape == (60, 4)
+            and row.kept.lengths.sum() == len(row.kept.actions)
+        )
+        assert row.kept.success.sum() == row.successes and row.kept.returns.mean() == row.mean_return
+    assert size < 5_000
+
+
+def test_what_is_not_there_is_said_in_a_line_a_run(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / finished.name
+    shutil.copytree(finished, folder)
+    (folder / "table" / "seed_0" / "DONE").unlink()
+    shutil.rmtree(folder / "random")
+    one, other = verify(folder)
+    assert str(one) == "table seed 0: it is not finished." and "random" in other.complaint
+    with pytest.raises(ArtefactError, match="keeps results and no episodes"):
+        verify(Path("docs/results/arrow_puzzle-quick"))
+    assert load_bench(finished)
