@@ -40,14 +40,14 @@ TASKS: dict[str, TaskEntry] = {
     **{
         name: dataclasses.replace(
             _ARROWS, env="imagine_bench.tasks.arrows.spec:make_env", env_id=f"imagine_bench/{gymnasium_name}-v0",
-            horizon=10, options={"horizon": 10, **options},
+            horizon=horizon, options={"horizon": horizon, **options},
         )
-        for name, gymnasium_name, options in (
-            ("arrow_puzzle", "ArrowPuzzle", {}),
-            ("arrow_puzzle_hard", "ArrowPuzzleHard", {"forbid": "equal+agent"}),
-            ("arrow_puzzle_toward", "ArrowPuzzleToward", {"goal": "toward_agent"}),
-            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", {"goal": "clockwise"}),
-            ("arrow_puzzle_easy", "ArrowPuzzleEasy", {"cubes": 1}),
+        for name, gymnasium_name, horizon, options in (
+            ("arrow_puzzle", "ArrowPuzzle", 10, {}),
+            ("arrow_puzzle_hard", "ArrowPuzzleHard", 10, {"forbid": "equal+agent"}),
+            ("arrow_puzzle_toward", "ArrowPuzzleToward", 10, {"goal": "toward_agent"}),
+            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", 10, {"goal": "clockwise"}),
+            ("arrow_puzzle_easy", "ArrowPuzzleEasy", 2, {"cubes": 1}),
         )
     },
     "arrows": _ARROWS,

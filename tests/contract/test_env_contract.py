@@ -20,7 +20,7 @@ from imagine_bench import registry
 from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, HELD_OUT, SceneReader
 
-TASKS = tuple(registry.TASKS)
+TASKS = tuple(name for name in registry.TASKS if name != "arrows")  # which is arrow_puzzle once more
 INFO_KEYS = {
     "action_mask",
     "fault_reason",
@@ -102,13 +102,14 @@ def test_an_episode_keeps_the_contract(env):
     frame, info = env.reset(seed=3)
     check_info(info, spec, after_step=False)
     assert tuple(info["macrostate"].tolist()) in spec.rules.start_states
-    for action in range(3):
+    for step in range(3):
+        action = step % spec.n_actions
         before = tuple(info["macrostate"].tolist())
         new_frame, reward, terminated, truncated, new_info = env.step(np.int64(action))
         check_info(new_info, spec, after_step=True)
         expected = reached(spec, before, action, new_info)
         assert not new_info["fault"]
-        assert (reward, terminated, truncated) == (expected.reward, expected.terminated, False)
+        assert (reward, terminated, truncated) == (expected.reward, expected.terminated, step + 1 >= spec.horizon)
         assert type(reward) is float
         assert new_info["success"] == expected.success
         assert (new_info["sim_time_s"] > 0.5) == (new_info["ik_error_m"] > 0.0) == physics
