@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
-from .description import Arrows, Turn
+from .description import Arrows
 from .rules import ArrowRules, Goal
 
 if TYPE_CHECKING:
@@ -76,18 +76,18 @@ def _described(world: Arrows, goal: Goal) -> str:
 
 
 @functools.cache
-def _world_maker(cubes: int, turns: tuple[tuple[Turn, ...], ...]) -> Callable[[Appearance], ArrowWorld]:
-    """One for each scene, so that worlds of the same scene share what draws it."""
+def _maker(world: Arrows) -> Callable[[Appearance], ArrowWorld]:
+    """The same one for the same world, so that what draws it is shared."""
     from .world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
 
-    return functools.partial(ArrowWorld, cubes=cubes, turns=turns)
+    return functools.partial(ArrowWorld, arrows=world)
 
 
 def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
     """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
     from ..frames import frames_of  # noqa: PLC0415
 
-    return frames_of(_world_maker(rules.world.cubes, rules.world.turns), rules, macrostates, appearance, rng)
+    return frames_of(_maker(Arrows(cubes=rules.world.cubes)), rules, macrostates, appearance, rng)
 
 
 def spec_of(**world: Any) -> TaskSpec:
@@ -141,7 +141,7 @@ def make_env(**options: Any) -> MacroEnv:
     from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
 
     world = Arrows.taken_from(options, MacroEnv.KEYWORDS)
-    return MacroEnv(_spec(world), _world_maker(world.cubes, world.turns), **options)
+    return MacroEnv(_spec(world), _maker(world), **options)
 
 
 def make_limited_env(**options: Any) -> TimeLimit[Any, np.int64]:

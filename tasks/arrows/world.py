@@ -14,7 +14,7 @@ from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.layout import layout
 from ..world import MAX_SKEW_RAD, World
-from .description import Arrows, Turn
+from .description import Arrows
 from .scene import compile_arrow_scene
 
 if TYPE_CHECKING:
@@ -27,11 +27,11 @@ MAX_OFF_SLOT_M = 0.015
 class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance, cubes: int = 3, turns: Sequence[tuple[Turn, ...]] = ()) -> None:
-        self._layout, self._turns = layout(cubes), turns or Arrows(cubes=cubes).turns
-        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(cubes)}
+    def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
+        self._arrows, self._layout = arrows, layout(arrows.cubes)
+        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
-        super().__init__(compile_arrow_scene(cubes), level, objects=objects, materials=materials)
+        super().__init__(compile_arrow_scene(arrows.cubes), level, objects=objects, materials=materials)
         self._hand = int(self.model.body("hand").mocapid[0])
 
     @functools.cached_property
@@ -43,17 +43,18 @@ class ArrowWorld(World):
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: a turned cube stands exactly on its slot, as a good turn leaves it."""
-        for turn in self._turns[action]:
+        for turn in self._arrows.turns[action]:
             if not self._stays(turn.cube, intended):
                 self._put(turn.cube, intended[turn.cube])
-        self._answer(intended)
+        self._gesture(intended[-1])
+        self.update()
 
     def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 
-        A cube that shall stay where it is slips out of the fingers. Then the human points where they shall.
+        A cube that is due and shall stay as it is slips out of the fingers.
         """
-        turns, before = self._turns[action], self.object_poses()
+        turns, before = self._arrows.turns[action], self.object_poses()
         slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
         results = []
         for turn in turns:
@@ -62,17 +63,12 @@ class ArrowWorld(World):
                 capture_motion_hz=capture_motion_hz,
             )))  # fmt: skip
         self.executor.executor.rest(self.data)
-        self._answer(intended)
+        self._gesture(intended[-1])
+        self.update()
         result = functools.reduce(MacroResult.then, results)
         turned = [turn.cube for turn in turns if turn.cube not in slipping]
         pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
-
-    def _answer(self, intended: tuple[int, ...]) -> None:
-        """A human who is to point at another cube does so."""
-        if self._read_gesture() != intended[-1]:
-            self._gesture(intended[-1])
-        self.update()
 
     def _stays(self, cube: int, intended: tuple[int, ...]) -> bool:
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""

@@ -59,7 +59,8 @@ class TurnExecutor:
     ) -> Motion[MacroResult]:
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
-        One that ``slips`` stays: the fingers grip it, open too early, and turn above it. The outcome is a pure function of the loose objects' positions and the arguments, bit for bit.
+        One that ``slips`` stays: the fingers grip it, open too early, and turn above it. The outcome is a pure function
+        of the loose objects' positions and the arguments, bit for bit.
 
         Raises:
             InvalidValueError: No such cube.

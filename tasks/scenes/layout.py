@@ -9,12 +9,9 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-from imagine_bench.errors import InvalidValueError
-
 from . import constants as c
 from .hand import fingertip_m
 
-MAX_CUBES = 6
 _ONE_ROW = 3
 _NEAR_M, _FAR_M, _WIDTH_M = 0.56, 0.65, 0.225
 _BACK_M = 0.027
@@ -33,13 +30,7 @@ class Layout:
 
 @functools.cache
 def layout(cubes: int) -> Layout:
-    """The places of so many cubes.
-
-    Raises:
-        InvalidValueError: Not 1 to 6.
-    """
-    if not 1 <= cubes <= MAX_CUBES:
-        raise InvalidValueError(f"There is no place for {cubes} cubes; give 1 to {MAX_CUBES}.")
+    """The places of 1 to 6 cubes; more would not fit into the view."""
     two_rows = cubes > _ONE_ROW
     spacing_m, middle = (_WIDTH_M / (cubes - 1) if two_rows else c.SLOT_SPACING_M), (cubes - 1) / 2
     rows_m = [(_NEAR_M if cube % 2 else _FAR_M) if two_rows else c.ROW_X_M for cube in range(cubes)]

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.description import MAX_CUBES
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.ik import ArmIK, UnreachableTargetError, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
@@ -18,7 +19,7 @@ from imagine_bench.tasks.motion.trajectory import (
     shortest_duration_s,
 )
 from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, TABLE_HEIGHT_M, TIMESTEP_S
-from imagine_bench.tasks.scenes.layout import MAX_CUBES, layout
+from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.errors import ImagineBenchError
 
