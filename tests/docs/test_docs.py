@@ -84,7 +84,8 @@ def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     variables: dict[str, object] = {}
     exec(compile(code, str(page), "exec"), variables)
-    variables["env"].close()  # type: ignore[attr-defined]
+    if "env" in variables:
+        variables["env"].close()  # type: ignore[attr-defined]
     assert isinstance(variables["env"], gymnasium.Env | gymnasium.vector.VectorEnv)
 
 
