@@ -223,6 +223,10 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """What :meth:`reset` and :meth:`step` return of environments like this as they stand, by its cameras."""
         return self._observer.observe([(env._observer, env._macrostate) for env in envs])
 
+    def share(self, envs: Sequence[MacroEnv]) -> Callable[[mujoco.MjData], None]:
+        """Have a second process draw for :meth:`observe`, as :meth:`.Observer.share` says."""
+        return self._observer.share([env._observer for env in envs])
+
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
         self._latest = None

@@ -3,6 +3,7 @@
 While one lane is planned, the contact physics of those before it runs on other threads, each lane's on its own data and
 for as long as its own motion takes. So the lanes are equal to single environments, bit for bit. One
 ``mujoco.batch.Batch`` called for each distinct end gives the same bits as fast, but needs every lane's data twice.
+Kinematic lanes have nothing to simulate: a second process draws some of them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from imagine_bench.errors import DivergedError, InvalidValueError, brief, requir
 from .macro_env import MacroEnv
 from .motion.executor import Motion
 
+_WORTH_A_PROCESS = 4
+"""Kinematic lanes from which on a second process draws beside this one."""
 _MODES = {mode.value: mode for mode in AutoresetMode}
 _Step = tuple[float, bool, dict[str, Any]]
 Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -63,7 +66,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
             ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
             resets, by ``reset(options={"reset_mask": ...})``), or Gymnasium's enum.
-        threads: Simulations at once; one a core if None.
+        threads: Simulations at once; one a core if None. From 2 on, a second process draws for four and more kinematic
+            lanes, as :mod:`.second_process` says.
 
     Raises:
         UnknownNameError: Another mode.
@@ -97,6 +101,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
         self._clock_s, self._timestep_s = 0.0, float(lanes[0].model.opt.timestep)
+        helped = lanes[0].execution == "kinematic" and threads > 1 and len(lanes) >= _WORTH_A_PROCESS
+        self._begin_to_draw = lanes[0].share(lanes) if helped else None
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -171,6 +177,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             self._acting[lane] = acting = _Acting(motion=motion, due_s=self._clock_s)
             if motion is not None:
                 acting.go_on(self._threads, self._timestep_s)
+                if self._begin_to_draw is not None:
+                    self._begin_to_draw(self.envs[lane].data)
 
     def recv(self, n: int | None = None) -> Batch:
         """What became of the ``n`` lanes, or all, that end first.
@@ -230,7 +238,11 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
     def _restart(
         self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any]
     ) -> dict[int, dict[str, Any]]:
-        infos = {lane: self.envs[lane].restart(seed=seeds[lane], options=options) for lane in lanes}
+        infos = {}
+        for lane in lanes:
+            infos[lane] = self.envs[lane].restart(seed=seeds[lane], options=options)
+            if self._begin_to_draw is not None:
+                self._begin_to_draw(self.envs[lane].data)
         self._elapsed[list(lanes)] = 0
         self._over[list(lanes)] = False
         self._look(lanes)

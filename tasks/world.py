@@ -16,7 +16,7 @@ from imagine_bench.interfaces import Frame, PhysicsSettings
 from .motion import orientation
 from .motion.executor import MacroResult, Motion, at_rest, finish
 from .motion.sensing import Sensing
-from .scenes.appearance import Appearance, AppearanceSampler
+from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
 from .scenes.fragments import Photographer, Shot
@@ -93,27 +93,20 @@ class World(abc.ABC):
         """Everything in the scene that may change, copied."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, physics, _STATE)
-        looks = tuple(np.array(each) for each in self._looks())
+        looks = tuple(np.array(each) for each in looks_of(self.model))
         shot = None if self._photographer is None else self._photographer.shot
         return WorldState(physics=physics, looks=looks, shot=shot, sensing=replace(self.sensing))
 
     def set_state(self, state: WorldState) -> None:
         """Put the scene as it was, to the bit."""
         mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
-        for mine, then in zip(self._looks(), state.looks, strict=True):
+        for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
         if self._photographer is not None and state.shot is not None:
             self._photographer.shot = state.shot
         for name in ("aside_m", "turned_rad"):
             setattr(self.sensing, name, getattr(state.sensing, name))
         self.update()
-
-    def _looks(self) -> tuple[NDArray[np.float64], ...]:
-        """What :meth:`vary` writes into the model: views of it."""
-        model, headlight = self.model, self.model.vis.headlight
-        return (
-            headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat,
-        )  # fmt: skip
 
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""

@@ -116,7 +116,7 @@ class Report:
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
     whose seeds; all else in their protocols must be the same."""
     track: Annotated[str | None, shown("STR", "(default: no tool)")] = None
-    """Write the metrics so far for a tool instead: tensorboard."""
+    """Write the metrics so far for a tool instead: tensorboard, or wandb (offline)."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 

@@ -1,6 +1,8 @@
-"""Three free cubes in a row, each with an arrow on top that points along the body's +x at yaw 0."""
+"""Free cubes on the table, each with an arrow on top that points along the body's +x at yaw 0."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -20,13 +22,13 @@ def arrow_outline() -> np.ndarray:
     return np.array([(_TIP_M, 0.0), *upper, *[(x, -y) for x, y in reversed(upper)]])
 
 
-def add_cubes(spec: mujoco.MjSpec) -> None:
-    """Add bodies ``cube_0`` .. ``cube_2`` on their slots, with free joints ``cube_i_joint``."""
+def add_cubes(spec: mujoco.MjSpec, slots_xy_m: Sequence[tuple[float, float]]) -> None:
+    """Add bodies ``cube_0`` and on, one on each slot, with free joints ``cube_i_joint``."""
     arrow = prism(arrow_outline(), 0.0, _ARROW_THICKNESS_M)
     spec.add_mesh(name="arrow", uservert=arrow.vertices.ravel(), userface=arrow.faces.ravel())
     spec.add_material(name="cube", rgba=(0.93, 0.90, 0.82, 1.0), specular=0.1, shininess=0.1)
     spec.add_material(name="arrow", rgba=(0.09, 0.10, 0.13, 1.0), specular=0.0)
-    for cube, (x_m, y_m) in enumerate(c.SLOTS_XY_M):
+    for cube, (x_m, y_m) in enumerate(slots_xy_m):
         body = spec.worldbody.add_body(name=f"cube_{cube}", pos=(x_m, y_m, c.TABLE_HEIGHT_M + _HALF_M))
         body.add_freejoint(name=f"cube_{cube}_joint")
         body.add_geom(

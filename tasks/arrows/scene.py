@@ -8,23 +8,26 @@ import functools
 import mujoco
 
 from ..scenes.arm import arm_spec, let_arm_touch
-from ..scenes.constants import SLOTS_XY_M
-from ..scenes.hand import add_pointing_hand, fingertip_m
+from ..scenes.constants import AGENT_CAMERA
+from ..scenes.hand import add_pointing_hand
+from ..scenes.layout import layout
 from ..scenes.tabletop import add_tabletop
 from .cubes import add_cubes
 
 
 @functools.cache
-def _compiled() -> mujoco.MjModel:
+def _compiled(cubes: int) -> mujoco.MjModel:
     spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "arrow_puzzle"
     add_tabletop(spec)
-    add_cubes(spec)
-    add_pointing_hand(spec, fingertip_m(SLOTS_XY_M[1]))
+    places = layout(cubes)
+    add_cubes(spec, places.slots_xy_m)
+    add_pointing_hand(spec, places.fingertips_m[cubes // 2])
     let_arm_touch(spec)
+    spec.camera(AGENT_CAMERA).fovy = places.fovy_deg
     return spec.compile()
 
 
-def compile_arrow_scene() -> mujoco.MjModel:
-    """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
-    return copy.copy(_compiled())
+def compile_arrow_scene(cubes: int = 3) -> mujoco.MjModel:
+    """A model of the scene of one's own, with 1 to 6 cubes: appearance may write its colors, lights and cameras."""
+    return copy.copy(_compiled(cubes))

@@ -12,9 +12,9 @@ from ..motion import orientation
 from ..motion.executor import MacroResult, Motion
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
-from ..scenes.hand import fingertip_m
+from ..scenes.layout import layout
 from ..world import MAX_SKEW_RAD, World
-from .rules import N_CUBES, TURNS
+from .description import Arrows, Turn
 from .scene import compile_arrow_scene
 
 if TYPE_CHECKING:
@@ -27,10 +27,11 @@ MAX_OFF_SLOT_M = 0.015
 class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance) -> None:
-        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(N_CUBES)}
+    def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
+        self._arrows, self._layout = arrows, layout(arrows.cubes)
+        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
-        super().__init__(compile_arrow_scene(), level, objects=objects, materials=materials)
+        super().__init__(compile_arrow_scene(arrows.cubes), level, objects=objects, materials=materials)
         self._hand = int(self.model.body("hand").mocapid[0])
 
     @functools.cached_property
@@ -38,28 +39,47 @@ class ArrowWorld(World):
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return TurnExecutor(self.model, self.sensing)
+        return TurnExecutor(self.model, self._layout.slots_xy_m, self.sensing)
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
-        """Kinematic execution: the turned cube stands exactly on its slot, as a good turn leaves it."""
-        cube = TURNS[action].cube
-        self._put(cube, intended[cube])
+        """Kinematic execution: a turned cube stands exactly on its slot, as a good turn leaves it."""
+        for turn in self._turns(action):
+            if not self._stays(turn.cube, intended):
+                self._put(turn.cube, intended[turn.cube])
+        self._gesture(intended[-1])
         self.update()
 
     def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
-        """Physical execution: the arm turns the cube in contact physics, then everything is at rest again."""
-        del intended  # the human keeps pointing
-        turn, before = TURNS[action], self.object_poses()
-        result = yield from self.executor.turn(
-            self.data, cube=turn.cube, clockwise=turn.clockwise, capture_motion_hz=capture_motion_hz
-        )
+        """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
+
+        A cube that is due and shall stay as it is slips out of the fingers.
+        """
+        turns, before = self._turns(action), self.object_poses()
+        slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
+        results = []
+        for turn in turns:
+            results.append((yield from self.executor.turn(
+                self.data, cube=turn.cube, clockwise=turn.clockwise, slips=turn.cube in slipping,
+                capture_motion_hz=capture_motion_hz,
+            )))  # fmt: skip
         self.executor.executor.rest(self.data)
+        self._gesture(intended[-1])
         self.update()
-        pushed = self._pushed((turn.cube,), before, f"while cube {turn.cube} was turned")
+        result = functools.reduce(MacroResult.then, results)
+        turned = [turn.cube for turn in turns if turn.cube not in slipping]
+        pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
 
+    def _turns(self, action: int) -> tuple[Turn, ...]:
+        turn = self._arrows.turns[action]
+        return tuple(replace(turn, cube=cube) for cube in self._arrows.turned_with(turn.cube))
+
+    def _stays(self, cube: int, intended: tuple[int, ...]) -> bool:
+        """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""
+        return self._objects()[0][cube] == intended[cube]
+
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        (x_m, y_m), (right, up, turn) = c.SLOTS_XY_M[index], offset
+        (x_m, y_m), (right, up, turn) = self._layout.slots_xy_m[index], offset
         self.data.qpos[self.object_qpos[index]] = (
             x_m + self._level.object_offset_m * right,
             y_m + self._level.object_offset_m * up,
@@ -68,13 +88,13 @@ class ArrowWorld(World):
         )
 
     def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
-        return {self._hand: fingertip_m(c.SLOTS_XY_M[gesture])}
+        return {self._hand: self._layout.fingertips_m[gesture]}
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
         """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
-        skew_rad, off_m = abs(turned_rad - quarters * _QUARTER_RAD), math.dist(pose[:2], c.SLOTS_XY_M[index])
+        skew_rad, off_m = abs(turned_rad - quarters * _QUARTER_RAD), math.dist(pose[:2], self._layout.slots_xy_m[index])
         problem = self._tipped(index, pose)
         if problem is None and off_m > MAX_OFF_SLOT_M:
             problem = f"{self._names[index]} stands {1e3 * off_m:.0f} mm off its slot"
@@ -85,4 +105,5 @@ class ArrowWorld(World):
     def _read_gesture(self) -> int:
         """The slot that the fingertip is over."""
         fingertip_y_m = float(self.data.mocap_pos[self._hand, 1])
-        return min(range(N_CUBES), key=lambda slot: abs(c.SLOTS_XY_M[slot][1] - fingertip_y_m))
+        slots = self._layout.slots_xy_m
+        return min(range(len(slots)), key=lambda slot: abs(slots[slot][1] - fingertip_y_m))

@@ -115,6 +115,18 @@ class MacroResult:
     qvel: Floats  #: velocities at the same times. Shape (K, nv).
     ctrl: Floats  #: commands to the servos from then on, at the end the last ones. Shape (K, nu).
 
+    def then(self, later: MacroResult) -> MacroResult:
+        """Both as one macro-action; what went wrong first is its fault."""
+        return MacroResult(
+            sim_time_s=self.sim_time_s + later.sim_time_s,
+            ik_error_m=max(self.ik_error_m, later.ik_error_m),
+            fault=self.fault or later.fault,
+            time_s=np.concatenate([self.time_s, later.time_s + self.sim_time_s]),
+            qpos=np.concatenate([self.qpos, later.qpos]),
+            qvel=np.concatenate([self.qvel, later.qvel]),
+            ctrl=np.concatenate([self.ctrl, later.ctrl]),
+        )
+
 
 class MacroExecutor:
     """Executes trajectories on a compiled scene that holds the arm.

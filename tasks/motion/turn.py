@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -11,7 +12,7 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
-from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M, SLOTS_XY_M
+from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
 from .arm_model import ArmModel
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, Motion, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
@@ -24,7 +25,7 @@ _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
 _MAX_SKEW_RAD = math.radians(8)
 """Beyond it the last joint might leave its range, so the other pair of faces is gripped."""
-_PAD_THICKNESS_M, _CLEARANCE_M = 0.008, 0.003
+_PAD_THICKNESS_M, _PAD_HALF_WIDTH_M, _CLEARANCE_M = 0.008, 0.014, 0.003
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
@@ -43,20 +44,23 @@ class TurnExecutor:
     true poses, unless ``sensing`` says otherwise.
     """
 
-    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, slots_xy_m: Sequence[tuple[float, float]], sensing: Sensing | None = None
+    ) -> None:
         self._sensing = sensing or Sensing()
         self.executor = MacroExecutor(model)
         self._arm = ArmModel()
         self._ik = ArmIK(self._arm)
-        self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(SLOTS_XY_M))]
-        self._slots = [self._reach(np.array(slot), None) for slot in SLOTS_XY_M]
+        self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(slots_xy_m))]
+        self._slots_xy_m, self._slots = slots_xy_m, [self._reach(np.array(slot), None) for slot in slots_xy_m]
 
     def turn(
-        self, data: mujoco.MjData, *, cube: int, clockwise: bool, capture_motion_hz: float = 0.0
+        self, data: mujoco.MjData, *, cube: int, clockwise: bool, slips: bool = False, capture_motion_hz: float = 0.0
     ) -> Motion[MacroResult]:
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
-        The outcome is a pure function of the loose objects' positions and the arguments, bit for bit.
+        One that ``slips`` stays: the fingers grip it, open too early, and turn above it. The outcome is a pure function
+        of the loose objects' positions and the arguments, bit for bit.
 
         Raises:
             InvalidValueError: No such cube.
@@ -65,26 +69,28 @@ class TurnExecutor:
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
         poses = [
             self._sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
-            for start, place_m in zip(self._cube_qpos, SLOTS_XY_M, strict=True)
+            for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
-        pose, slot = self._sensing.erring(poses[cube]), self._slots[cube]
+        true, slot = poses[cube], self._slots[cube]
+        pose = self._sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         try:
             grip = self._reach(pose.position_m[:2], slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
-        crowded = any(_crowds(other, pose) for each, other in enumerate(poses) if each != cube)
-        other_faces = not clockwise and (crowded or abs(_skew_rad(pose)) > _MAX_SKEW_RAD)
+        along_x, along_y = (any(_crowds(each, pose, axis) for each in poses if each is not true) for axis in (0, 1))
+        skewed = abs(_skew_rad(pose)) > _MAX_SKEW_RAD
+        other_faces = (along_x and not along_y and not skewed) if clockwise else (along_y or skewed)
         waypoints, error_m = (
-            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces),
+            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces, slips),
             max(grip.error_m, slot.error_m),
         )
         result, qpos, trajectory = yield from self.executor.perform(
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
-        turned = qpos[trajectory.last_step["turn"] + 1]
-        if self.executor.opening_m(turned).mean() < _SQUEEZED_M + _MISSED_M:
+        holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]
+        if self.executor.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")
         return result
 
@@ -103,15 +109,21 @@ def _skew_rad(pose: ObjectPose) -> float:
     return pose.yaw_rad - round(pose.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
 
 
-def _crowds(other: ObjectPose, gripped: ObjectPose) -> bool:
-    """Whether a finger between the two cubes would touch the other one."""
-    reach_m = CUBE_EDGE_M / 2 * (math.cos(_skew_rad(other)) + abs(math.sin(_skew_rad(other))))
-    needed_m = REST_OPENING_M + _PAD_THICKNESS_M + _CLEARANCE_M + reach_m
-    return math.dist(other.position_m[:2], gripped.position_m[:2]) < needed_m
+def _crowds(other: ObjectPose, gripped: ObjectPose, axis: int) -> bool:
+    """Whether fingers along x (axis 0) or y (1) of the gripped cube would touch the other one, which is that way."""
+    offset_m = np.abs(other.position_m[:2] - gripped.position_m[:2])
+    if offset_m[axis] < offset_m[1 - axis]:
+        return False
+    half_m = CUBE_EDGE_M / 2 * (math.cos(_skew_rad(other)) + abs(math.sin(_skew_rad(other)))) + _CLEARANCE_M
+    beside = offset_m[1 - axis] < half_m + _PAD_HALF_WIDTH_M
+    away_m = math.dist(other.position_m[:2], gripped.position_m[:2]) if axis else offset_m[0]
+    return bool(beside and away_m < REST_OPENING_M + _PAD_THICKNESS_M + half_m)
 
 
-def _waypoints(grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool) -> list[Waypoint]:
-    """Down over the cube as it stands, turned to the nominal slot's right angle, and back.
+def _waypoints(
+    grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool, slips: bool
+) -> list[Waypoint]:
+    """Down over the cube as it stands, turned to the nominal slot's right angle, and back; or let go too early.
 
     The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above. A clockwise turn
     begins with the fingers along x, clear of the row, and ends along y; a counter-clockwise one goes the other way,
@@ -122,12 +134,22 @@ def _waypoints(grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other
     before, after = np.zeros(7), np.zeros(7)
     before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skew_rad
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2
+    if slips:
+        turn = [
+            Waypoint(name="open", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
+            Waypoint(name="lift", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M),
+            Waypoint(name="turn", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+        ]
+    else:
+        turn = [
+            Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=_SQUEEZED_M),
+            Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
+            Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+        ]
     return [
         Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M),
         Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=_SQUEEZED_M, min_duration_s=_CLOSE_S),
-        Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=_SQUEEZED_M),
-        Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
-        Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+        *turn,
         *back_to_rest(REST_OPENING_M, _SETTLE_S),
     ]

@@ -91,6 +91,12 @@ def appearance(name: str) -> Appearance:
     return LEVELS[require_known("appearance", name, LEVELS)]
 
 
+def looks_of(model: mujoco.MjModel) -> tuple[NDArray[np.float64], ...]:
+    """What any appearance writes into a model: views of it."""
+    headlight = model.vis.headlight
+    return headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat
+
+
 class AppearanceSampler:
     """Writes samples of light, colors and camera into one model.
 

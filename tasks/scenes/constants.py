@@ -19,8 +19,6 @@ CUBE_REST_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
 """Height of a standing cube's centre."""
 ROW_X_M = 0.62
 SLOT_SPACING_M = 0.09
-SLOTS_XY_M = ((ROW_X_M, SLOT_SPACING_M), (ROW_X_M, 0.0), (ROW_X_M, -SLOT_SPACING_M))
-"""Nominal cube centres, left to right in the agent's frame."""
 
 OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 """Arm configuration from which the wrist camera sees the whole row; every macro-action starts and ends here."""

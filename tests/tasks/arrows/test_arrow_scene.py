@@ -14,6 +14,7 @@ from imagine_bench.tasks.macro_env import agent_camera
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.errors import UnknownNameError
 from imagine_bench.preprocessing import STRIP_WIDTH
@@ -70,7 +71,7 @@ def test_cubes_have_their_mass_and_rest_still_on_their_slots(world):
     for cube in range(3):
         body = world.model.body(f"cube_{cube}")
         assert body.mass[0] == pytest.approx(c.CUBE_MASS_KG)
-        assert world.data.body(f"cube_{cube}").xpos == pytest.approx([*c.SLOTS_XY_M[cube], c.CUBE_REST_Z_M])
+        assert world.data.body(f"cube_{cube}").xpos == pytest.approx([*layout(3).slots_xy_m[cube], c.CUBE_REST_Z_M])
     mujoco.mj_forward(world.model, world.data)
     contacts = world.data.contact[: world.data.ncon]
     assert len(contacts) >= 3

@@ -18,13 +18,14 @@ from imagine_bench.tasks.motion.turn import TurnExecutor
 from imagine_bench.tasks.scenes.constants import (
     CUBE_EDGE_M,
     OBSERVATION_QPOS_RAD,
-    SLOTS_XY_M,
     TABLE_HEIGHT_M,
     TIMESTEP_S,
 )
+from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.errors import DivergedError, InvalidValueError
 
+SLOTS_XY_M = layout(3).slots_xy_m
 QUARTER_RAD = math.pi / 2
 CUBE_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
 
@@ -36,7 +37,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def turner():
-    return TurnExecutor(compile_arrow_scene())
+    return TurnExecutor(compile_arrow_scene(), SLOTS_XY_M)
 
 
 def cube_slice(model, cube):
@@ -232,7 +233,7 @@ def turned_deg(turner, model, change=None):
     """How far cube 1 turns in a clockwise macro-action on a changed scene, and the fault."""
     if change:
         change(model)
-    executor = TurnExecutor(model)
+    executor = TurnExecutor(model, SLOTS_XY_M)
     data = mujoco.MjData(model)
     place(model, data, (0, 0, 0))
     result = finish(executor.turn(data, cube=1, clockwise=True))

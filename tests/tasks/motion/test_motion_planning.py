@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.description import MAX_CUBES
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.ik import ArmIK, UnreachableTargetError, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
@@ -17,10 +18,13 @@ from imagine_bench.tasks.motion.trajectory import (
     plan,
     shortest_duration_s,
 )
-from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, SLOTS_XY_M, TABLE_HEIGHT_M, TIMESTEP_S
+from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, TABLE_HEIGHT_M, TIMESTEP_S
+from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.errors import ImagineBenchError
 
+SLOTS_XY_M = layout(3).slots_xy_m
+ALL_SLOTS_XY_M = sorted({slot for cubes in range(1, MAX_CUBES + 1) for slot in layout(cubes).slots_xy_m})
 QUARTER_RAD = math.pi / 2
 CUBE_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
 
@@ -38,7 +42,7 @@ def ik(arm):
 # Inverse kinematics
 
 
-@pytest.mark.parametrize(("slot", "height_m"), list(itertools.product(SLOTS_XY_M, (CUBE_Z_M, CUBE_Z_M + 0.06))))
+@pytest.mark.parametrize(("slot", "height_m"), list(itertools.product(ALL_SLOTS_XY_M, (CUBE_Z_M, CUBE_Z_M + 0.06))))
 def test_ik_reaches_with_the_tool_straight_down(arm, ik, slot, height_m):
     solution = ik.solve(position_in_base_m=np.array([*slot, height_m]), yaw_rad=math.pi / 4)
     position, frame = arm.tcp_in_base(solution.qpos_rad)
