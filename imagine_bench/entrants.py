@@ -65,6 +65,19 @@ class EncoderEntry:
     description: str = "An encoder."  #: One sentence for a reader who knows none of this
 
 
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEntry:
+    """A registered world model."""
+
+    #: ``"module:attr"`` of a function from AgentContext to :class:`.world_models.WorldModel`; of a privileged one, from
+    #: TaskSpec and the judge's gallery of frames.
+    make: str
+    title: str  #: For headings, legends and tables
+    description: str = "A world model."  #: One sentence for a reader who knows none of this
+    encoder_kind: str | None = None  #: Which of the task's encoders it sees through, ``"latents"`` or ``"codes"``
+    privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
+
+
 class Entrant(NamedTuple):
     """An agent and the settings that it alone has in a bench."""
 

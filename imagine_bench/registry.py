@@ -16,6 +16,7 @@ from imagine_bench.entrants import AgentEntry as AgentEntry  # noqa: PLC0414 - u
 from imagine_bench.entrants import EncoderEntry as EncoderEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import RegressorEntry as RegressorEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import TaskEntry as TaskEntry  # noqa: PLC0414 - users find it here
+from imagine_bench.entrants import WorldModelEntry as WorldModelEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import (
     EXTRAS,
@@ -174,12 +175,45 @@ REGRESSORS: dict[str, RegressorEntry] = {
     ),
 }  # fmt: skip
 
+_WORLD_MODELS = "imagine_bench.agents.world_models"
+WORLD_MODELS: dict[str, WorldModelEntry] = {
+    "copy": WorldModelEntry(
+        make="imagine_bench.judge.models.ends:make_copy", title="copy the last frame",
+        description="Says that nothing ever changes: one end of the scale.",
+    ),
+    "convolutional": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.convolutional:make", title="convolutional",
+        description="A convolutional network from the latest frame and the action to the next frame, in plain torch.",
+    ),
+    "gaussian": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_gaussian", title="VAE + one Gaussian", encoder_kind="latents",
+        description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
+    ),
+    "mdn_dropout": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_dropout", title="VAE + MDN, MC dropout", encoder_kind="latents",
+        description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
+    ),
+    "mdn_ensemble": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
+        description="Three mixture density networks between latents, uncertain where they disagree.",
+    ),
+    "structured": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.structured:make", title="structured", encoder_kind="codes",
+        description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
+    ),
+    "exact": WorldModelEntry(
+        make="imagine_bench.judge.models.ends:make_exact", title="exact", privileged=True,
+        description="The rules and the renderer (privileged): the other end of the scale.",
+    ),
+}  # fmt: skip
+"""World models that ``imagine-bench judge`` judges."""
+
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
-REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP = (
-    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies")
+REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP, WORLD_MODEL_GROUP = (
+    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies", "world_models")
 )
 """Entry points in which installed packages offer what is theirs: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
-EncoderEntry, RegressionSpec, RegressorEntry or Study."""
+EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
 
 
 class _Group(NamedTuple):
@@ -199,6 +233,7 @@ _GROUPS = {
     STUDY_GROUP: _Group(
         "study", "imagine_bench.studies.study:Study", lambda: load("imagine_bench.studies.catalogue:STUDIES")
     ),
+    WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
 }
 TASK_TYPES = {
     "control": "imagine_bench.bench.control:CONTROL",
@@ -457,6 +492,17 @@ def regression(name: str) -> RegressionSpec:
 def regressor_entry(name: str) -> RegressorEntry:
     """The registry line of a regressor. Raises as :func:`task_entry`."""
     entry: RegressorEntry = offered(name, REGRESSORS, REGRESSOR_GROUP)
+    return entry
+
+
+def world_models() -> dict[str, WorldModelEntry]:
+    """All world models by name, also those of installed packages, without those that cannot be loaded."""
+    return {**WORLD_MODELS, **usable(WORLD_MODEL_GROUP)}
+
+
+def world_model_entry(name: str) -> WorldModelEntry:
+    """The registry line of a world model. Raises as :func:`task_entry`."""
+    entry: WorldModelEntry = offered(name, WORLD_MODELS, WORLD_MODEL_GROUP)
     return entry
 
 

@@ -433,7 +433,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def checked(self, action: np.int64 | int) -> int:
         """A macro-action as a number. Raises InvalidValueError: no such action."""
-        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        n_actions = len(self._all_actions)
+        if isinstance(action, (int, np.integer)) and 0 <= action < n_actions:
+            return int(action)
         try:
             chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1
         except Exception:  # as of a macrostate

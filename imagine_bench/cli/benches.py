@@ -186,6 +186,7 @@ class List:
             **{f"{name} learners": kind.learners() for name, kind in task_types().items()},
             **{f"{name} presets": kind.presets for name, kind in task_types().items()},
             "studies": {**STUDIES, **registry.usable(registry.STUDY_GROUP)},
+            "world models": registry.world_models(),
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
             "appearances": APPEARANCES,

@@ -155,7 +155,8 @@ class Attribution:
 
         Among equals of the plan is what the agent does.
         """
-        state, drawn = course.states[0], np.random.default_rng(course.seed).random(self._horizon).tolist()
+        state, rng = course.states[0], np.random.default_rng(course.seed)
+        drawn = rng.random(self._horizon).tolist()
         for step in range(self._horizon):
             row, lived = self._rows.get(state, -1), step < len(course.actions) and state == course.states[step]
             if row < 0:
