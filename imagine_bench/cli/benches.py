@@ -12,7 +12,7 @@ from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
-from imagine_bench.entrants import parse_settings
+from imagine_bench.entrants import file_name, parse_settings
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
@@ -167,7 +167,7 @@ class Study:
         where = launcher(self.launcher, self.workers)
         lines = run_study(study, self.task, root=self.out, launcher=where)
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
-        folder = self.out / self.task / f"study-{study.name}-{runs}"
+        folder = self.out / file_name(registry.task_name(self.task)) / f"study-{study.name}-{runs}"
         write_study(folder, study, lines)
         print(study_table(study, lines))
         print(f"\nStudy:      {folder / 'study.md'}")

@@ -28,14 +28,11 @@ class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
     def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
-        self._arrows, self._layout = arrows, layout(arrows.cubes)
+        self._turns, self._layout = arrows.turns, layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         super().__init__(compile_arrow_scene(arrows.cubes), level, objects=objects, materials=materials)
         self._hand = int(self.model.body("hand").mocapid[0])
-        self._turns = [
-            tuple(replace(turn, cube=cube) for cube in arrows.turned_with(turn.cube)) for turn in arrows.turns
-        ]
 
     @functools.cached_property
     def executor(self) -> TurnExecutor:
