@@ -426,10 +426,14 @@ def agent_entry(name: str) -> AgentEntry:
         UnknownNameError: No such agent.
         SetupError: As :func:`task_entry`.
     """
-    if not isinstance(name, str) or ":" not in name or name in offers(AGENT_GROUP):
-        return offered(name, AGENTS, AGENT_GROUP)
+    return _entrant_entry(name, AGENTS, AGENT_GROUP)
+
+
+def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
+    if not isinstance(name, str) or ":" not in name or name in offers(group):
+        return offered(name, own, group)
     one = entrant(name)
-    entry: AgentEntry = offered(one.agent, AGENTS, AGENT_GROUP)
+    entry = offered(one.agent, own, group)
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
@@ -526,9 +530,8 @@ def regression(name: str) -> RegressionSpec:
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor. Raises as :func:`task_entry`."""
-    entry: RegressorEntry = offered(name, REGRESSORS, REGRESSOR_GROUP)
-    return entry
+    """The registry line of a regressor; an entrant's title says its settings. Raises as :func:`agent_entry`."""
+    return _entrant_entry(name, REGRESSORS, REGRESSOR_GROUP)
 
 
 def world_models() -> dict[str, WorldModelEntry]:
