@@ -86,7 +86,7 @@ def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch
     exec(compile(code, str(page), "exec"), variables)
     if "env" in variables:
         variables["env"].close()  # type: ignore[attr-defined]
-    assert isinstance(variables["env"], gymnasium.Env | gymnasium.vector.VectorEnv)
+        assert isinstance(variables["env"], gymnasium.Env | gymnasium.vector.VectorEnv)
 
 
 def test_the_twelve_lines_bench_an_agent(tmp_path: Path) -> None:
