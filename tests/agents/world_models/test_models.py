@@ -73,7 +73,7 @@ def test_each_keeps_the_contract(name: str, quick: Callable[[str], WorldModel]) 
     assert isinstance(model.parameters(), int)
 
 
-@pytest.mark.parametrize("name", ["mdn_dropout", "mdn_ensemble", "gaussian"])
+@pytest.mark.parametrize("name", ["mdn_dropout", "mdn_ensemble", "mdn_thesis", "gaussian"])
 def test_latent_models_offer_three_uncertainties(name: str, quick: Callable[[str], WorldModel]) -> None:
     found = imagined(quick(name))
     assert found.epistemic is not None and found.aleatoric is not None and found.modal is not None
