@@ -379,7 +379,9 @@ def task_entry(name: str) -> TaskEntry:
         line: TaskEntry = offered(base, TASKS, TASK_GROUP)
         with _guests_faults(f"Task {name} ({line.spec})", own=base in TASKS):
             options = {**line.options, **_options(base, line, said)}
-            entry = dataclasses.replace(line, options=options, env_id=load(line.spec)(**options).env_id)
+            spec: TaskSpec = load(line.spec)(**options)
+            horizon = line.horizon and spec.horizon
+            entry = dataclasses.replace(line, options=options, env_id=spec.env_id, horizon=horizon)
     register_env(entry)
     return entry
 
