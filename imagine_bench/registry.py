@@ -204,6 +204,11 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
+    "mdn_thesis": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_thesis", title="VAE + MDN, thesis' settings", encoder_kind="latents",
+        description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
+        by_default=False,
+    ),
     "structured": WorldModelEntry(
         make=f"{_WORLD_MODELS}.structured:make", title="structured", encoder_kind="codes",
         description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
