@@ -122,6 +122,7 @@ def _spec(world: Arrows) -> TaskSpec:
         preprocessing="gray_strips",
         encoder="arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}",
         rules=rules,
+        sight=world.sight(),
         facts=functools.partial(facts, rules, rules.horizon),
         render_macrostates=functools.partial(_rendered, rules),
         reference=name if name in _IN_THESIS else None,

@@ -1,0 +1,21 @@
+"""Lag: what is observed is some macro-actions old; the first observations of an episode repeat the start."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class Lag:
+    """The observations that are still under way; ``kept`` is all its state.
+
+    Args:
+        macro_actions: Age of what is delivered.
+    """
+
+    def __init__(self, macro_actions: int) -> None:
+        self.macro_actions, self.kept = macro_actions, tuple[Any, ...]()
+
+    def deliver(self, observation: Any) -> Any:
+        """Take in the observation of this moment, once each, and return the one that is due."""
+        self.kept = (*self.kept, observation)[-1 - self.macro_actions :]
+        return self.kept[0]
