@@ -12,6 +12,7 @@ takes_study := TASK VARIANTS LAUNCHER WORKERS ARGS
 takes_plan := TASK EXECUTION ENCODER ARGS
 takes_generalise := TASK ENCODER ARGS
 takes_policy := TASK ENCODER ARGS
+takes_judge := TASK MODELS SEEDS APPEARANCE WORKERS ARGS
 takes_verify := TASK ARGS
 takes_view := TASK ARGS
 takes_report := TASK ARGS
@@ -26,7 +27,7 @@ takes_mutants := ARGS
 takes_docs := ARGS
 takes_lock := ARGS
 # The default of these; without TASK the others take the newest bench of any task.
-bench peers study encoder film: TASK ?= arrow_puzzle
+bench peers study judge encoder film: TASK ?= arrow_puzzle
 peers: AGENTS ?= sb3_dqn sb3_qrdqn sb3_dqn_latents
 peers: SEEDS ?= 0 1 2 3 4
 peers: BUDGETS ?= 100 250 500 1000 2000
@@ -41,7 +42,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan generalise policy verify study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan generalise policy verify judge study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -67,6 +68,9 @@ generalise: ready  ## Ask the newest bench's models for every transition, also t
 
 policy: ready  ## Follow the policies of the newest bench's learners from every start by the rules
 	@$(BIN)/imagine-bench policy $(options)
+
+judge: ready  ## Judge world models against the exact truth of TASK; MODELS may name another package's
+	@$(BIN)/imagine-bench judge $(options)
 
 verify: ready  ## Play every test episode of the newest bench again and say whether its tables follow from them
 	@$(BIN)/imagine-bench verify $(options)

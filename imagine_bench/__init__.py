@@ -5,10 +5,9 @@ Importing it registers the Gymnasium environments and loads neither MuJoCo nor t
 
 from __future__ import annotations
 
-from imagine_bench.registry import TASKS, register_env, register_vector_env
+from imagine_bench.registry import TASKS, register_env
 
 __version__ = "0.1.0"
 
 for _entry in TASKS.values():
     register_env(_entry)
-    register_vector_env(_entry)

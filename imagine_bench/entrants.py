@@ -10,9 +10,10 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain
 
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
 _LONGEST = 100
@@ -25,9 +26,12 @@ class TaskEntry:
     spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
     env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
     env: str  #: ``"module:attr"`` of the environment's constructor
-    horizon: int  #: Macro-actions before truncation
+    horizon: int | None  #: Macro-actions before truncation; None where its environment truncates by itself
     #: Keyword arguments of both, which say which member of a family it is.
     options: Mapping[str, Any] = field(default_factory=dict)
+    #: ``"module:attr"`` of the frozen dataclass of all such arguments; with it, ``NAME:key=value,...`` is a task, too,
+    #: whose TaskSpec has a name and an ``env_id`` of its own.
+    world: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +69,19 @@ class EncoderEntry:
     description: str = "An encoder."  #: One sentence for a reader who knows none of this
 
 
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEntry:
+    """A registered world model."""
+
+    #: ``"module:attr"`` of a function from AgentContext to :class:`.world_models.WorldModel`; of a privileged one, from
+    #: TaskSpec and the judge's gallery of frames.
+    make: str
+    title: str  #: For headings, legends and tables
+    description: str = "A world model."  #: One sentence for a reader who knows none of this
+    encoder_kind: str | None = None  #: Which of the task's encoders it sees through, ``"latents"`` or ``"codes"``
+    privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
+
+
 class Entrant(NamedTuple):
     """An agent and the settings that it alone has in a bench."""
 
@@ -94,15 +111,37 @@ def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[st
 
     Raises InvalidValueError: a word without ``=``, or a name given twice.
     """
-    settings: dict[str, Any] = {}
+    return tuple(sorted((name, _value(text)) for name, text in _texts(pairs, where).items()))
+
+
+def parse_options(text: str, kinds: Mapping[str, str], where: str) -> dict[str, Any]:
+    """``name=value,...`` to values by name; those whose kind has a number in it are read as JSON. Raises likewise."""
+    texts = _texts(_BETWEEN.split(text), where)
+    numbers = {name for name, kind in kinds.items() if "int" in kind or "float" in kind}
+    return {name: _value(text) if name in numbers else text for name, text in texts.items()}
+
+
+def read_mapping(file: Path) -> dict[str, Any]:
+    """A JSON file that holds one mapping. Raises ArtefactError: it does not, or cannot be read."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ArtefactError(f"{file} cannot be read ({plain(error)}); give a JSON file of one mapping.") from error
+    if not isinstance(found, dict):
+        raise ArtefactError(f"{file} holds {brief(found)}; give a JSON file of one mapping.")
+    return found
+
+
+def _texts(pairs: Sequence[str], where: str) -> dict[str, str]:
+    texts: dict[str, str] = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals or not name:
             raise InvalidValueError(f"{where} {pair!r} is not of the form name=value, such as controller.discount=0.9.")
-        if name in settings:
+        if name in texts:
             raise InvalidValueError(f"{where} names {name!r} twice; give it once.")
-        settings[name] = _value(text)
-    return tuple(sorted(settings.items()))
+        texts[name] = text
+    return texts
 
 
 def file_name(text: str) -> str:

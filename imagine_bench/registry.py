@@ -8,6 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -16,7 +17,8 @@ from imagine_bench.entrants import AgentEntry as AgentEntry  # noqa: PLC0414 - u
 from imagine_bench.entrants import EncoderEntry as EncoderEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import RegressorEntry as RegressorEntry  # noqa: PLC0414 - users find it here
 from imagine_bench.entrants import TaskEntry as TaskEntry  # noqa: PLC0414 - users find it here
-from imagine_bench.entrants import entrant
+from imagine_bench.entrants import WorldModelEntry as WorldModelEntry  # noqa: PLC0414 - users find it here
+from imagine_bench.entrants import entrant, parse_options, read_mapping
 from imagine_bench.errors import (
     EXTRAS,
     ImagineBenchError,
@@ -31,22 +33,28 @@ from imagine_bench.errors import (
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
 
+_ARROWS = TaskEntry(
+    spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_limited_env",
+    env_id="imagine_bench/Arrows-v0", horizon=None, world="imagine_bench.tasks.arrows.description:Arrows",
+)  # fmt: skip
 TASKS: dict[str, TaskEntry] = {
     **{
-        name: TaskEntry(
-            spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_env",
-            env_id=f"imagine_bench/{gymnasium_name}-v0", horizon=10, options={"goal": goal},
+        name: dataclasses.replace(
+            _ARROWS, env="imagine_bench.tasks.arrows.spec:make_env", env_id=f"imagine_bench/{gymnasium_name}-v0",
+            horizon=horizon, options={"horizon": horizon, **options},
         )
-        for name, gymnasium_name, goal in (
-            ("arrow_puzzle", "ArrowPuzzle", "toward_human"),
-            ("arrow_puzzle_hard", "ArrowPuzzleHard", "toward_human_alone"),
-            ("arrow_puzzle_toward", "ArrowPuzzleToward", "toward_agent"),
-            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", "left"),
+        for name, gymnasium_name, horizon, options in (
+            ("arrow_puzzle", "ArrowPuzzle", 10, {}),
+            ("arrow_puzzle_hard", "ArrowPuzzleHard", 10, {"forbid": "equal+agent"}),
+            ("arrow_puzzle_toward", "ArrowPuzzleToward", 10, {"goal": "toward_agent"}),
+            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", 10, {"goal": "clockwise"}),
+            ("arrow_puzzle_easy", "ArrowPuzzleEasy", 2, {"cubes": 1}),
         )
     },
+    "arrows": _ARROWS,
     "pick_place": TaskEntry(
-        spec="imagine_bench.tasks.pick_place.spec:SPEC", env="imagine_bench.tasks.pick_place.spec:make_env",
-        env_id="imagine_bench/PickPlace-v0", horizon=50,
+        spec="imagine_bench.tasks.pick_place.spec:spec_of", env="imagine_bench.tasks.pick_place.spec:make_env",
+        env_id="imagine_bench/PickPlace-v0", horizon=50, world="imagine_bench.tasks.pick_place.rules:PickPlace",
     ),
 }  # fmt: skip
 
@@ -174,12 +182,45 @@ REGRESSORS: dict[str, RegressorEntry] = {
     ),
 }  # fmt: skip
 
+_WORLD_MODELS = "imagine_bench.agents.world_models"
+WORLD_MODELS: dict[str, WorldModelEntry] = {
+    "copy": WorldModelEntry(
+        make="imagine_bench.judge.models.ends:make_copy", title="copy the last frame",
+        description="Says that nothing ever changes: one end of the scale.",
+    ),
+    "convolutional": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.convolutional:make", title="convolutional",
+        description="A convolutional network from the latest frame and the action to the next frame, in plain torch.",
+    ),
+    "gaussian": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_gaussian", title="VAE + one Gaussian", encoder_kind="latents",
+        description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
+    ),
+    "mdn_dropout": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_dropout", title="VAE + MDN, MC dropout", encoder_kind="latents",
+        description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
+    ),
+    "mdn_ensemble": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
+        description="Three mixture density networks between latents, uncertain where they disagree.",
+    ),
+    "structured": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.structured:make", title="structured", encoder_kind="codes",
+        description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
+    ),
+    "exact": WorldModelEntry(
+        make="imagine_bench.judge.models.ends:make_exact", title="exact", privileged=True,
+        description="The rules and the renderer (privileged): the other end of the scale.",
+    ),
+}  # fmt: skip
+"""World models that ``imagine-bench judge`` judges."""
+
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
-REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP = (
-    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies")
+REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP, WORLD_MODEL_GROUP = (
+    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies", "world_models")
 )
 """Entry points in which installed packages offer what is theirs: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
-EncoderEntry, RegressionSpec, RegressorEntry or Study."""
+EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
 
 
 class _Group(NamedTuple):
@@ -199,6 +240,7 @@ _GROUPS = {
     STUDY_GROUP: _Group(
         "study", "imagine_bench.studies.study:Study", lambda: load("imagine_bench.studies.catalogue:STUDIES")
     ),
+    WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
 }
 TASK_TYPES = {
     "control": "imagine_bench.bench.control:CONTROL",
@@ -241,7 +283,8 @@ def agents() -> dict[str, AgentEntry]:
 
 def is_own(task: str) -> bool:
     """Whether a task is this suite's, which needs no check and has its encoders."""
-    return task in TASKS and TASKS[task].spec.startswith("imagine_bench.")
+    base = task.partition(":")[0]
+    return base in TASKS and TASKS[base].spec.startswith("imagine_bench.")
 
 
 def regressions() -> dict[str, Any]:
@@ -317,30 +360,57 @@ def guest_packages() -> dict[str, frozenset[str]]:
 
 
 def task_entry(name: str) -> TaskEntry:
-    """The registry line of a task, this suite's or an installed package's.
+    """The registry line of a task, this suite's or an installed package's; also of ``NAME:key=value,...``.
 
     Raises:
-        UnknownNameError: No such task.
+        UnknownNameError: No such task, or no such option; the message lists those that there are.
+        InvalidValueError: The task takes no options, or none of this value.
         SetupError: Its package offers something else under this name, or nothing that can be loaded.
     """
-    entry: TaskEntry = offered(name, TASKS, TASK_GROUP)
+    base, colon, said = name.partition(":") if isinstance(name, str) else (name, "", "")
+    if not colon or name in offers(TASK_GROUP):
+        entry: TaskEntry = offered(name, TASKS, TASK_GROUP)
+    else:
+        line: TaskEntry = offered(base, TASKS, TASK_GROUP)
+        with _guests_faults(f"Task {name} ({line.spec})", own=base in TASKS):
+            options = {**line.options, **_options(base, line, said)}
+            entry = dataclasses.replace(line, options=options, env_id=load(line.spec)(**options).env_id)
     register_env(entry)
     return entry
 
 
+def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Any]:
+    """What is said after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
+    if not entry.world:
+        raise InvalidValueError(f"Task {base} takes no options; leave out {brief(':' + said)}.")
+    kinds = {each.name: str(each.type) for each in dataclasses.fields(load(entry.world))}
+    given = read_mapping(Path(said[1:])) if said.startswith("@") else parse_options(said, kinds, f"task {base}:")
+    for key in given:
+        if key not in kinds:
+            raise UnknownNameError(f"option of task {base}", key, kinds)
+    return given
+
+
+def task_name(name: str) -> str:
+    """The one name of a task, however its options were written. Raises as :func:`task`."""
+    return task(name).id if isinstance(name, str) and ":" in name else name
+
+
+def has_task(name: str) -> bool:
+    """Whether a name is that of a control task, or of one with options, whatever these are."""
+    return name in tasks() or name.partition(":")[0] in tasks()
+
+
 def register_env(entry: TaskEntry) -> None:
-    """Register a task's environment with Gymnasium, unless its id is known already."""
-    if entry.env_id not in gymnasium.registry:
-        options = dict(entry.options)
-        gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=options)
-
-
-def register_vector_env(entry: TaskEntry) -> None:
-    """Register the vector environment of a task whose environment is one of this suite's."""
-    gymnasium.register(
-        vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
-        max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
-    )  # fmt: skip
+    """Register a task's environment with Gymnasium, unless its id is known already; a suite's own also as a vector."""
+    if entry.env_id in gymnasium.registry:
+        return
+    gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
+    if entry.env.startswith("imagine_bench."):
+        gymnasium.register(
+            vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
+            max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
+        )  # fmt: skip
 
 
 def vector_id(env_id: str) -> str:
@@ -356,10 +426,14 @@ def agent_entry(name: str) -> AgentEntry:
         UnknownNameError: No such agent.
         SetupError: As :func:`task_entry`.
     """
-    if not isinstance(name, str) or ":" not in name or name in offers(AGENT_GROUP):
-        return offered(name, AGENTS, AGENT_GROUP)
+    return _entrant_entry(name, AGENTS, AGENT_GROUP)
+
+
+def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
+    if not isinstance(name, str) or ":" not in name or name in offers(group):
+        return offered(name, own, group)
     one = entrant(name)
-    entry: AgentEntry = offered(one.agent, AGENTS, AGENT_GROUP)
+    entry = offered(one.agent, own, group)
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
@@ -416,6 +490,7 @@ def task(name: str) -> TaskSpec:
         InvalidValueError: It contradicts its registry line, or its names its rules.
     """
     entry = task_entry(name)
+    known = tasks()
     with _guests_faults(f"Task {name} ({entry.spec})", own=name in TASKS):
         loaded = load(entry.spec)
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
@@ -424,9 +499,9 @@ def task(name: str) -> TaskSpec:
     listed, values = getattr(spec.rules, "states", None), tuple(map(len, spec.macrostate_values))
     counts = tuple(1 + max(column) for column in zip(*listed, strict=True)) if listed else values
     for what, ours, theirs in (
-        ("id", name, spec.id),
+        ("id", name if name in known else spec.id, spec.id),
         ("env_id", entry.env_id, spec.env_id),
-        ("horizon", entry.horizon, spec.horizon),
+        ("horizon", entry.horizon or spec.horizon, spec.horizon),
         ("n_actions", spec.rules.n_actions, spec.n_actions),
         ("number of macrostate_names", len(spec.rules.start_states[0]), len(spec.macrostate_names)),
         ("numbers of macrostate_values", counts, values),
@@ -455,8 +530,18 @@ def regression(name: str) -> RegressionSpec:
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor. Raises as :func:`task_entry`."""
-    entry: RegressorEntry = offered(name, REGRESSORS, REGRESSOR_GROUP)
+    """The registry line of a regressor; an entrant's title says its settings. Raises as :func:`agent_entry`."""
+    return _entrant_entry(name, REGRESSORS, REGRESSOR_GROUP)
+
+
+def world_models() -> dict[str, WorldModelEntry]:
+    """All world models by name, also those of installed packages, without those that cannot be loaded."""
+    return {**WORLD_MODELS, **usable(WORLD_MODEL_GROUP)}
+
+
+def world_model_entry(name: str) -> WorldModelEntry:
+    """The registry line of a world model. Raises as :func:`task_entry`."""
+    entry: WorldModelEntry = offered(name, WORLD_MODELS, WORLD_MODEL_GROUP)
     return entry
 
 

@@ -98,6 +98,11 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     # Gymnasium's own declaration, whose checker opens a window for "human".
     metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": 1}  # noqa: RUF012
+    KEYWORDS = (
+        "execution", "appearance", "render_mode", "width", "height", "camera", "physics", "motion_hz", "observation",
+        "size",
+    )  # fmt: skip
+    """The keyword arguments of its constructor."""
 
     def __init__(
         self,
@@ -119,7 +124,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
-        self._starts = spec.rules.start_states
+        self._starts, self.horizon = spec.rules.start_states, spec.horizon
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         self._make_world, self.world = make_world, make_world(appearance_level(appearance))
@@ -433,7 +438,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def checked(self, action: np.int64 | int) -> int:
         """A macro-action as a number. Raises InvalidValueError: no such action."""
-        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        n_actions = len(self._all_actions)
+        if isinstance(action, (int, np.integer)) and 0 <= action < n_actions:
+            return int(action)
         try:
             chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1
         except Exception:  # as of a macrostate

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -16,10 +16,12 @@ from imagine_bench.interfaces import Frame
 
 from .rendering import Renderer
 from .scene_reader import arm_columns, tcp_in_world
+from .scenes.arm import TCP_SITE
 from .second_process import SharedRenderer
 from .world import World
 
 _Camera = Callable[[str, int], Renderer]
+_Moment = tuple["Observer", tuple[int, ...]]
 PARTS = ("frame", "human", "state", "proprio")
 SIZES_PX = (32, 256)
 """Smallest and largest edge of an observed image."""
@@ -55,6 +57,7 @@ class Observer:
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
         self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)
+        self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
         self._cameras: dict[str, Renderer | SharedRenderer] = {
             name: camera(name, int(size)) for name in ("frame", "human") if name in names
@@ -66,16 +69,14 @@ class Observer:
         chosen = {name: spaces[name] for name in self._names}
         self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
 
-    def observe(self, moments: Sequence[tuple[Observer, tuple[int, ...]]]) -> list[Any]:
+    def observe(self, moments: Sequence[_Moment]) -> list[Any]:
         """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""
         scenes = [(observer._world.model, observer._world.data) for observer, _ in moments]
         images = {name: camera.frames(scenes) for name, camera in self._cameras.items()}
-        seen = []
-        for row, (observer, macrostate) in enumerate(moments):
-            drawn = {name: frames[row] for name, frames in images.items()}
-            parts = {name: observer._part(name, macrostate, drawn) for name in self._names}
-            seen.append(parts if len(parts) > 1 else parts[self._names[0]])
-        return seen
+        columns = {name: self._column(name, moments, images.get(name)) for name in self._names}
+        if len(columns) == 1:
+            return columns[self._names[0]]
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def share(self, observers: Sequence[Observer]) -> Callable[[mujoco.MjData], None]:
         """Have a second process draw frames of these, this one included; what is returned tells it what will be asked.
@@ -94,12 +95,19 @@ class Observer:
         for camera in self._cameras.values():
             camera.close()
 
-    def _part(self, name: str, macrostate: tuple[int, ...], drawn: Mapping[Any, Frame]) -> NDArray[Any]:
-        if name in drawn:
-            return self._world.develop(drawn[name]) if name == "frame" else drawn[name]
-        if name == "state":
-            one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
-            one_hot[self._offsets[:-1] + macrostate] = 1.0
-            return one_hot
-        arm, tool = self._world.data.qpos[self._arm_qpos], tcp_in_world(self._world.model, self._world.data)
-        return np.concatenate([arm, tool], dtype=np.float32)
+    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> list[NDArray[Any]]:
+        """One part of each moment."""
+        if images is None:
+            return [each._one_hot(state) if name == "state" else each._proprio() for each, state in moments]
+        if name == "human":
+            return images
+        return [each._world.develop(image) for (each, _), image in zip(moments, images, strict=True)]
+
+    def _one_hot(self, macrostate: tuple[int, ...]) -> NDArray[np.float32]:
+        one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
+        one_hot[self._offsets[:-1] + macrostate] = 1.0
+        return one_hot
+
+    def _proprio(self) -> NDArray[np.float32]:
+        data = self._world.data
+        return np.concatenate([data.qpos[self._arm_qpos], tcp_in_world(data, self._tcp)], dtype=np.float32)

@@ -13,11 +13,12 @@ import atexit
 import contextlib
 import copy
 import ctypes
+import functools
 import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -90,15 +91,12 @@ def gl_renderer() -> str:
     return ", ".join(part.decode() for part in parts if part)
 
 
-def _is_current(context: Any) -> bool:
-    """Whether ``context`` is EGL's current one; False where another platform draws."""
-    mine = getattr(context, "_context", None)
-    if mine is None or not type(context).__module__.endswith("egl"):
-        return False
-    from OpenGL import EGL  # noqa: PLC0415  (after the platform is chosen)
+@functools.cache
+def _current() -> Callable[[], int | None]:
+    """EGL's question for the address of the current context; PyOpenGL's own takes ten times as long."""
+    from OpenGL.platform import PLATFORM  # noqa: PLC0415  (after the platform is chosen)
 
-    addresses = [ctypes.cast(pointer, ctypes.c_void_p).value for pointer in (EGL.eglGetCurrentContext(), mine)]
-    return addresses[0] is not None and addresses[0] == addresses[1]
+    return ctypes.CFUNCTYPE(ctypes.c_void_p)(("eglGetCurrentContext", PLATFORM.EGL))
 
 
 def _release() -> None:
@@ -116,6 +114,8 @@ class _Canvas:
         self.pid = os.getpid()
         self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
         self.gl: Any = _new_gl_context(view.width, view.height)
+        self._is_egl = type(self.gl).__module__.endswith("egl")
+        self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if self._is_egl else None
         try:
             with _quality(model, view):
                 self.mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -125,7 +125,7 @@ class _Canvas:
 
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
-        if not _is_current(self.gl):
+        if not self._is_egl or _current()() != self._address:
             self.gl.make_current()
 
     @property
@@ -135,7 +135,7 @@ class _Canvas:
 
     def release(self) -> None:
         """Leave it to any thread; EGL alone can."""
-        if type(self.gl).__module__.endswith("egl"):
+        if self._is_egl:
             _release()
             self.thread = None
 

@@ -89,9 +89,12 @@ def arm_columns(model: mujoco.MjModel) -> tuple[list[int], list[int], list[int]]
     return qpos, qvel, [int(model.actuator(servo).id) for servo in servos]
 
 
-def tcp_in_world(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-    """Position (m) and quaternion (w, x, y, z) of the point between the fingers, kinematics up to date. Shape (7,)."""
-    pose, tcp = np.empty(7), model.site(TCP_SITE).id
+def tcp_in_world(data: mujoco.MjData, tcp: int) -> Floats:
+    """Position (m) and quaternion (w, x, y, z) of a site, the point between the fingers. Shape (7,).
+
+    Kinematics is up to date.
+    """
+    pose = np.empty(7)
     pose[:3] = data.site_xpos[tcp]
     mujoco.mju_mat2Quat(pose[3:], data.site_xmat[tcp])
     return pose
@@ -99,11 +102,11 @@ def tcp_in_world(model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
 
 def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Floats, ctrl: Floats) -> ArmMotion:
     """The arm's part of a scene's motion: times (K,), positions (K, nq), velocities (K, nv) and commands (K, nu)."""
-    data, poses = mujoco.MjData(model), np.empty((len(qpos), 7))
+    data, poses, tcp = mujoco.MjData(model), np.empty((len(qpos), 7)), model.site(TCP_SITE).id
     for row, positions in enumerate(qpos):
         data.qpos[:] = positions
         mujoco.mj_kinematics(model, data)
-        poses[row] = tcp_in_world(model, data)
+        poses[row] = tcp_in_world(data, tcp)
     at, moving, told = arm_columns(model)
     (joints, fingers), (speeds, _), (commands, grips) = (
         np.split(values, [len(ARM_JOINTS)], axis=1) for values in (qpos[:, at], qvel[:, moving], ctrl[:, told])

@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
@@ -332,7 +333,7 @@ def make(
     Args:
         num_envs: Lanes.
         env: ``"module:attr"`` of the environment's constructor.
-        max_episode_steps: As :class:`MacroVectorEnv`.
+        max_episode_steps: As :class:`MacroVectorEnv`; None leaves the environment's own limit.
         autoreset_mode: As :class:`MacroVectorEnv`.
         threads: As :class:`MacroVectorEnv`.
         **options: Keyword arguments of the constructor, the same for all lanes.
@@ -344,6 +345,9 @@ def make(
         raise InvalidValueError(f"num_envs is {brief(num_envs)}; give an integer from 1 on.")
     creator = load_env_creator(env)
     lanes: list[Any] = [creator(**options) for _ in range(int(num_envs))]
+    if isinstance(lanes[0], TimeLimit):  # one that limits itself
+        max_episode_steps = max_episode_steps or lanes[0]._max_episode_steps
+        lanes = [lane.unwrapped for lane in lanes]
     for lane in lanes:
         if not isinstance(lane, MacroEnv):
             raise InvalidValueError(

@@ -67,10 +67,13 @@ class World(abc.ABC):
         self.sensing = Sensing()
         self._bodies = [model.body(body).id for body in objects]
         self._level, self._names = level, tuple(objects.values())
+        self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         self._photographer = None if level.pool is None else Photographer(level)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
+        self._read_at: tuple[bytes, bytes] | None = None
+        self._latest_objects: tuple[tuple[int, ...], str | None] = ((), None)
         self._rest_qpos, self._rest_ctrl = at_rest(model)
         self.data.qpos[:] = self._rest_qpos
         self.update()
@@ -127,7 +130,7 @@ class World(abc.ABC):
         if self._photographer is not None:
             self._patch(self._photographer, rng, move_objects=move_objects)
             return
-        if not self._level.varies_every_frame:
+        if not self._varies:
             return
         self._appearance.vary(rng)
         *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
@@ -198,9 +201,10 @@ class World(abc.ABC):
     # --- what they all do ----------------------------------------------------------------------------------------
 
     def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
+        (x_m, y_m, z_m), turned = offset_m, orientation.about_vertical(yaw_rad)
         for mocap, place_m in self._hands_m(gesture).items():
-            self.data.mocap_pos[mocap] = [nominal + off for nominal, off in zip(place_m, offset_m, strict=True)]
-            self.data.mocap_quat[mocap] = orientation.about_vertical(yaw_rad)
+            self.data.mocap_pos[mocap] = place_m[0] + x_m, place_m[1] + y_m, place_m[2] + z_m
+            self.data.mocap_quat[mocap] = turned
 
     def update(self) -> None:
         """Bring geoms, sites, cameras and lights up to date with positions."""
@@ -213,8 +217,12 @@ class World(abc.ABC):
 
     def _objects(self) -> tuple[tuple[int, ...], str | None]:
         """The value of each object, and what is wrong with the first that is not as it should be."""
-        read = [self._read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
-        return tuple(value for value, _ in read), next((problem for _, problem in read if problem), None)
+        place = self.data.qpos.tobytes(), self.data.mocap_pos.tobytes()
+        if place != self._read_at:  # asked several times of one moment
+            read = [self._read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
+            problem = next((problem for _, problem in read if problem), None)
+            self._read_at, self._latest_objects = place, (tuple([value for value, _ in read]), problem)
+        return self._latest_objects
 
     def _tipped(self, index: int, pose: list[float]) -> str | None:
         tilt_rad = orientation.tilt_rad(*pose[4:6])

@@ -10,7 +10,17 @@ from pathlib import Path
 import pytest
 
 _TOP = Path(__file__).parent.parent
-_VOCABULARY = {"errors", "seeding", "interfaces", "capabilities", "rules", "preprocessing", "regression.interfaces"}
+_VOCABULARY = {
+    "errors",
+    "seeding",
+    "interfaces",
+    "capabilities",
+    "rules",
+    "preprocessing",
+    "regression.interfaces",
+    "world_models",
+    "data.episodes",
+}
 """What every room may import, and all that tasks and agents may take from imagine_bench."""
 _DATA = {"entrants", "registry", "protocols", "store"}
 ARROWS: dict[str, set[str]] = {
@@ -23,7 +33,7 @@ ARROWS: dict[str, set[str]] = {
     "store": {"entrants", "registry", "protocols", "statistics"},
     "data": {*_DATA, "machine", "statistics"},
     "bench": {*_DATA, "machine", "data"},
-    "judge": {*_DATA, "statistics"},
+    "judge": {*_DATA, "data", "machine", "statistics"},
     "recording": {*_DATA, "judge"},
     "studies": {*_DATA, "bench", "statistics"},
     "report": {*_DATA, "bench", "judge", "studies", "machine", "statistics", "reference"},

@@ -1,4 +1,4 @@
-"""A bench's metrics for TensorBoard; extra ``tracking``.
+"""A bench's metrics for TensorBoard and, offline, for Weights & Biases; extra ``tracking``.
 
 Read from the ``metrics.csv`` of each run, which has a row for every budget tested so far: also while the bench runs.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from imagine_bench.errors import InvalidValueError, lacking, require_known
 from imagine_bench.store.codec import table_rows
+from imagine_bench.store.files import make_folder
 
 _METRICS = "metrics.csv"
 Rows = list[dict[str, float]]
@@ -24,7 +25,7 @@ def track(folder: Path, tool: str) -> Path:
         tool: A name in :data:`TOOLS`.
 
     Returns:
-        The folder inside it to open: ``tensorboard --logdir`` it.
+        The folder inside it to open: ``tensorboard --logdir`` it, or ``wandb sync`` the runs in it.
 
     Raises:
         UnknownNameError: Another tool.
@@ -40,7 +41,7 @@ def track(folder: Path, tool: str) -> Path:
     out = folder / tool
     shutil.rmtree(out, ignore_errors=True)
     for run, path in runs.items():
-        write(out, run, [_scalars(row) for row in table_rows(path.read_text(), ("solved",))])
+        write(make_folder(out), run, [_scalars(row) for row in table_rows(path.read_text(), ("solved",))])
     return out
 
 
@@ -62,4 +63,21 @@ def _tensorboard(out: Path, run: Path, rows: Rows) -> None:
     writer.close()
 
 
-TOOLS: dict[str, Callable[[Path, Path, Rows], None]] = {"tensorboard": _tensorboard}
+def _wandb(out: Path, run: Path, rows: Rows) -> None:
+    try:
+        import wandb  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise lacking("wandb") from error
+    quiet = wandb.Settings(
+        console="off", silent=True, x_disable_stats=True, x_disable_meta=True, disable_git=True, save_code=False
+    )
+    written = wandb.init(
+        project=out.parent.name, group=run.parent.name, name=str(run), dir=out, mode="offline", settings=quiet
+    )
+    for row in rows:
+        written.log({name: value for name, value in row.items() if name != "episodes"}, step=int(row["episodes"]))
+    written.finish()
+    wandb.teardown()  # ends its service, which writes the files
+
+
+TOOLS: dict[str, Callable[[Path, Path, Rows], None]] = {"tensorboard": _tensorboard, "wandb": _wandb}

@@ -86,14 +86,14 @@ def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[F
 
 def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:
     """How much of each unfinished run lies before its last test; only runs that act are tested on the way."""
-    if store.protocol.task not in registry.tasks():
+    if not registry.has_task(store.protocol.task):
         return {}
     reached = {pair: run_folder.reached(store.run_folder(*pair)) for pair in store.missing()}
     return {pair: store.protocol.work(pair[0], until) for pair, until in reached.items() if until}
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
-    acts = store.protocol.task in registry.tasks()
+    acts = registry.has_task(store.protocol.task)
     entry = registry.agent_entry(agent) if acts else None  # regressors have no encoder and pause nowhere
     needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
     pauses = until if entry is not None and not entry.external_training_loop else None

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from imagine_bench import __version__
-from imagine_bench.cli.analysis import Generalise, Plan, Policy, Verify
+from imagine_bench.cli.analysis import Generalise, Judge, Plan, Policy, Verify
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
@@ -31,6 +31,7 @@ Command = (
     | Plan
     | Generalise
     | Policy
+    | Judge
     | Verify
     | Study
     | Dataset
@@ -83,7 +84,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except (ModuleNotFoundError, MemoryError, RecursionError, UnicodeError) as error:
         return _say(_words(error))
     except KeyboardInterrupt:
-        resumes = isinstance(command, Bench | Study)
+        resumes = isinstance(command, Bench | Judge | Study)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
         return _say(f"interrupted; the same command {then}.", INTERRUPTED)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Annotated
 
 import tyro
 
+from imagine_bench import registry
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, shown
 from imagine_bench.entrants import parse_settings
-from imagine_bench.interfaces import EXECUTIONS
+from imagine_bench.errors import RunFailedError
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +56,50 @@ class Plan:
                 encoder=self.encoder,
             )
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge:
+    """Judge world models, of this suite and of other packages, against the exact truth of a task's rules."""
+
+    task: str = "arrow_puzzle"
+    """Task whose world is imagined."""
+    models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite)")] = None
+    """World models; 'imagine-bench list' names them."""
+    sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
+        100,
+        300,
+        1000,
+        3000,
+        10000,
+    )
+    """Transitions of the same data after which models are compared, ascending."""
+    seeds: Annotated[tuple[int, ...], listed("INT", "(default: 0 1 2)")] = (0, 1, 2)
+    """Seeds, each of data and of models."""
+    samples: int = 8
+    """Futures imagined of each question."""
+    appearance: str = APPEARANCES[0]
+    """How much light, colors and poses vary."""
+    policy: str = "random"
+    """Who collects the data: random, uniform, oracle or mixed."""
+    workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
+    """Processes at a time."""
+    out: Path = Path("runs/judge")
+    """Folder in which judgements are kept; the same command again goes on."""
+
+    def __call__(self) -> None:
+        """Judge and report."""
+        from imagine_bench.judge.models.study import Judgement, judge  # noqa: PLC0415 - as above
+        from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
+
+        judgement = Judgement(
+            task=self.task, models=self.models or tuple(registry.WORLD_MODELS), sizes=self.sizes, seeds=self.seeds,
+            samples=self.samples, appearance=self.appearance, policy=self.policy,
+        )  # fmt: skip
+        folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
+        print(judgement_report(folder, judgement))
+        if failed:
+            raise RunFailedError("\n".join(failed))
 
 
 @dataclass(frozen=True, kw_only=True)

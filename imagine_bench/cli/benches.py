@@ -12,7 +12,7 @@ from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
-from imagine_bench.entrants import parse_settings
+from imagine_bench.entrants import file_name, parse_settings
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
@@ -116,7 +116,7 @@ class Report:
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
     whose seeds; all else in their protocols must be the same."""
     track: Annotated[str | None, shown("STR", "(default: no tool)")] = None
-    """Write the metrics so far for a tool instead: tensorboard."""
+    """Write the metrics so far for a tool instead: tensorboard, or wandb (offline)."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
@@ -167,7 +167,7 @@ class Study:
         where = launcher(self.launcher, self.workers)
         lines = run_study(study, self.task, root=self.out, launcher=where)
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
-        folder = self.out / self.task / f"study-{study.name}-{runs}"
+        folder = self.out / file_name(registry.task_name(self.task)) / f"study-{study.name}-{runs}"
         write_study(folder, study, lines)
         print(study_table(study, lines))
         print(f"\nStudy:      {folder / 'study.md'}")
@@ -186,6 +186,7 @@ class List:
             **{f"{name} learners": kind.learners() for name, kind in task_types().items()},
             **{f"{name} presets": kind.presets for name, kind in task_types().items()},
             "studies": {**STUDIES, **registry.usable(registry.STUDY_GROUP)},
+            "world models": registry.world_models(),
             "executions": EXECUTIONS,
             "launchers": LAUNCHERS,
             "appearances": APPEARANCES,

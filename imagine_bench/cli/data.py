@@ -10,6 +10,7 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.cli.options import shown
+from imagine_bench.entrants import file_name
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.store.files import require_writable
@@ -63,7 +64,7 @@ class Dataset:
             return
         spec = registry.task(self.task)
         policy = policy_of(self.policy, spec, self.seed, self.encoder)
-        folder = self.out or Path("datasets") / f"{self.task}-{policy.name}"
+        folder = self.out or Path("datasets") / f"{file_name(spec.id)}-{policy.name}"
         require_new(folder)
         require_writable(folder.parent)
         episodes, files, card = collect(

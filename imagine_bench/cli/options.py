@@ -10,6 +10,7 @@ import tyro
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.task_types import task_type
+from imagine_bench.registry import task_name
 from imagine_bench.store.bench_folder import require_either
 
 PRESETS_OWN = "(default: the preset's)"
@@ -47,4 +48,4 @@ def only(task: str | None, given: Path | None) -> tuple[str, ...]:
     if task is None:
         return ()
     task_type(task)  # knows every name
-    return (task,)
+    return (task_name(task),)

@@ -102,6 +102,28 @@ class Episodes:
                 truncated=bool(self.truncated[step]),
             )  # fmt: skip
 
+    def first(self, transitions: int) -> Episodes:
+        """The first so many transitions, the last episode cut off there where it is longer.
+
+        Raises:
+            InvalidValueError: There are fewer, or none is asked for.
+        """
+        if not 1 <= transitions <= len(self.actions):
+            raise InvalidValueError(f"{transitions} transitions of {len(self.actions)}: give 1 to that many")
+        ends = np.cumsum(self.lengths)
+        count = int(np.searchsorted(ends, transitions)) + 1
+        truncated = self.truncated[:transitions].copy()
+        truncated[-1] = not self.terminated[transitions - 1]
+        lengths, success = self.lengths[:count].copy(), self.success[:count].copy()
+        lengths[-1] -= ends[count - 1] - transitions
+        success[-1] &= ends[count - 1] == transitions
+        frames = slice(transitions + count)
+        return Episodes(
+            lengths=lengths, frames=self.frames[frames], action_masks=self.action_masks[frames],
+            actions=self.actions[:transitions], rewards=self.rewards[:transitions],
+            terminated=self.terminated[:transitions], truncated=truncated, success=success,
+        )  # fmt: skip
+
     @cached_property
     def hash(self) -> str:
         """64 hex digits that change when anything in any array does, and with nothing else."""

@@ -11,6 +11,7 @@ from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
+from imagine_bench.registry import task_name as canonical
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -185,10 +186,11 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
-    wanted = Protocol(task=task_name, preset=preset, **values)
+    values["after"] = tuple(map(canonical, values.get("after", ())))
+    wanted = Protocol(task=spec.id, preset=preset, **values)
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         agent_entry(agent)
-    require_same_world(task_name, wanted.after)
+    require_same_world(wanted.task, wanted.after)
     return wanted
 
 

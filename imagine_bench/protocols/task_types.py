@@ -68,9 +68,12 @@ def task_types() -> dict[str, TaskType[ProtocolData]]:
 
 
 def task_type(task: str) -> TaskType[ProtocolData]:
-    """The type of a registered task. Raises UnknownNameError, or SetupError: as :func:`.registry.task_entry`."""
+    """The type of a task, be it with options or without.
+
+    Raises UnknownNameError, or SetupError: as :func:`.registry.task_entry`.
+    """
     for kind in task_types().values():
-        if task in kind.tasks():
+        if task in kind.tasks() or task.partition(":")[0] in kind.tasks():
             return kind
     for group in (registry.TASK_GROUP, registry.REGRESSION_GROUP):
         if isinstance(error := registry.offers(group).get(task), SetupError):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
 from imagine_bench.protocols.data import ProtocolData, digest, require_different, require_seeds
@@ -39,6 +40,7 @@ class RegressionProtocol(ProtocolData):
             object.__setattr__(self, "variants", spec.variants)
         for variant in self.variants:
             spec.require_variant(variant)
+        object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
         for agent in self.agents:
             registry.regressor_entry(agent)
         require_different("agents", self.agents)
@@ -52,6 +54,11 @@ class RegressionProtocol(ProtocolData):
     def work(self, agent: str, until: int | None = None) -> int:
         """Units of a run's work: 100 a variant for training, 10 for measuring; it never pauses before its end."""
         return 110 * len(self.variants)
+
+
+def overrides_of(protocol: RegressionProtocol, agent: str) -> dict[str, Any]:
+    """The settings that replace those of the set for one regressor: the protocol's, above them the entrant's own."""
+    return {**dict(protocol.overrides), **entrant(agent).settings}
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -80,7 +87,10 @@ def plan(
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    settings = registry.load(_SETTINGS)(wanted.hyperparameters, dict(wanted.overrides))
+    check = registry.load(_SETTINGS)
+    settings = check(wanted.hyperparameters, dict(wanted.overrides))
+    for agent in wanted.agents:
+        check(wanted.hyperparameters, overrides_of(wanted, agent))
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)
     return replace(wanted, settings_digest=digest([asdict(one) for one in settings])), {}

@@ -17,7 +17,7 @@ from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.interfaces import Prediction, Regressor, RegressorContext
-from imagine_bench.regression.protocol import RegressionProtocol
+from imagine_bench.regression.protocol import RegressionProtocol, overrides_of
 from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
@@ -82,7 +82,7 @@ class _Run:
             datasets=tuple(self.task.training(variant, node.child("data").generator()) for node in self.networks),
             seeds=tuple(node.child("regressor", variant) for node in self.networks),
             hyperparameters=self.protocol.hyperparameters,
-            overrides=dict(self.protocol.overrides),
+            overrides=overrides_of(self.protocol, self.spec.agent),
             device=self.protocol.device,
         )
         regressor = registry.make_regressor(self.spec.agent, context)

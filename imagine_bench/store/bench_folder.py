@@ -111,7 +111,7 @@ class BenchStore:
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:
     """Where the bench of a protocol belongs below ``root``, the folder of all benches, such as ``runs``."""
-    return Path(root / protocol.task / f"{protocol.preset}-{protocol.hash}")
+    return Path(root / file_name(protocol.task) / f"{protocol.preset}-{protocol.hash}")
 
 
 def load_bench(folder: Path) -> Result:
@@ -144,11 +144,14 @@ def require_either(given: Path | None, task: str | None) -> None:
 
 
 def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
-    """The bench folder below ``root`` that was worked on last, of any task or of some, or ArtefactError."""
-    found = [path for path in root.glob(f"*/*/{_SESSIONS}") if not tasks or path.parts[-3] in tasks]
+    """The bench folder below ``root`` that was worked on last, of any task or of some, or ArtefactError.
+
+    A task's name without options also means it with any.
+    """
+    found = [path for path in root.glob(f"*/*/{_SESSIONS}") if not tasks or _is_of(path.parts[-3], tasks)]
     if not found:
         some = next(iter(tasks), "arrow_puzzle")
-        where = root / some if len(tasks) == 1 else root
+        where = root / file_name(some) if len(tasks) == 1 else root
         raise ArtefactError(
             f"There is no {'such ' if tasks else ''}bench below {where}; "
             f"run one with 'imagine-bench bench --task {some}'."
@@ -157,15 +160,23 @@ def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
 
 
 def newest_recording(root: Path, task: str | None = None) -> Path:
-    """The recording below ``root`` that was written last, of any task or of one, or ArtefactError."""
-    where = root / (task or "")
-    found = sorted(where.glob("**/recording.rrd"), key=lambda path: path.stat().st_mtime)
+    """The recording below ``root`` that was written last, of any task or of one, or ArtefactError; tasks as above."""
+    where = root / file_name(task or "")
+    folders = [each for each in root.glob("*/") if task is None or _is_of(each.name, (task,))]
+    found = sorted(
+        (path for each in folders for path in each.glob("**/recording.rrd")), key=lambda path: path.stat().st_mtime
+    )
     if not found:
         raise ArtefactError(
             f"There is no recording below {where}; run a bench with 'imagine-bench bench --task "
             f"{task or 'arrow_puzzle'}'."
         )
     return found[-1]
+
+
+def _is_of(folder: str, tasks: Collection[str]) -> bool:
+    names = [file_name(task) for task in tasks]
+    return any(folder == name or folder.startswith(f"{name}-") for name in names)
 
 
 def _facts(environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 import platformdirs
 
 from imagine_bench import registry
+from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import TaskSpec, bundled_name
 from imagine_bench.rules import states_of
@@ -65,7 +66,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
             f"give finite numbers of shape ({len(frames)}, Z)."
         )
     known = hashlib.sha256(f"{entry.make}/{spec.preprocessing}/".encode() + np.round(features, 3).tobytes()).hexdigest()
-    path = cache_folder() / "encoders" / known[:12] / f"{name}-{spec.id}-{appearance}{_SUFFIX}"
+    path = cache_folder() / "encoders" / known[:12] / f"{name}-{file_name(spec.id)}-{appearance}{_SUFFIX}"
     what = f"The scale and the probe of {name} for {spec.id} at {appearance} are made"
     _once(path, what, lambda: registry.load(_FIT)(spec, name=name, offer=entry.make, appearance=appearance, path=path))
     return path

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
@@ -169,7 +170,7 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
         protocol=protocol,
         runs=tuple(cut(run, protocol) for result in results for run in result.runs if run.seed in protocol.seeds),
         environment={"command": commands, **benches},
-        folder=root / protocol.task / f"merged-{protocol.hash}",
+        folder=root / file_name(protocol.task) / f"merged-{protocol.hash}",
         wall_s=sum(result.wall_s for result in results),
         missing=tuple(sentence for result in results for sentence in result.missing),
     )

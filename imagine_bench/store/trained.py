@@ -80,7 +80,7 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
 
 def require_control(task: str, what: str) -> None:
     """Raise ArtefactError for a task in which no agent acts."""
-    if task not in registry.tasks():
+    if not registry.has_task(task):
         raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
 
 

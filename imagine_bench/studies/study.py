@@ -24,7 +24,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, re
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, require_types
 from imagine_bench.protocols.task_types import Encoders, task_type
-from imagine_bench.registry import tasks
+from imagine_bench.registry import has_task
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult, RunResult
@@ -162,7 +162,7 @@ def _dotted(variant: Mapping[str, Any]) -> dict[str, Any]:
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
-    if task not in tasks():
+    if not has_task(task):
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
     planned = [(variant, *_plan(study, task, variant)) for variant in study.variants]  # all checked before any is run

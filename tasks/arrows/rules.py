@@ -1,91 +1,143 @@
-"""The rules of the arrow puzzle (thesis, chapter 5) and of its family: no physics, no images, exact.
+"""The rules of arrow puzzles (thesis, chapter 5): no physics, no images, exact.
 
-A macrostate is ``(d0, d1, d2, pointed)``: the arrow directions of the cubes, left to right in the agent's frame, and
-the cube the human points at. Directions: 0 toward the human (up in the frame), 1 right, 2 toward the agent, 3 left.
-What a turn does and what is illegal is the same for the whole family; its members differ in the goal.
+A world is a goal, what is forbidden, what a turn turns, the order of the macro-actions and its dials; see
+:class:`.description.Arrows`, which also says what a macrostate is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import count, pairwise, product
+
+import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-N_CUBES = 3
-N_DIRECTIONS = 4
+from ..dials.fickle import fickle
+from ..dials.slip import slipping
+from .description import N_DIRECTIONS, Arrows
+
 TOWARD_HUMAN, RIGHT, TOWARD_AGENT, LEFT = range(N_DIRECTIONS)
 
 GOAL_REWARD = 50.0
 ILLEGAL_REWARD = -5.0
 STEP_REWARD = -1.0
-
-
-@dataclass(frozen=True)
-class Turn:
-    """A macro-action: a quarter turn of one cube, as seen in the frame."""
-
-    cube: int
-    clockwise: bool
-
-
-TURNS = tuple(Turn(cube, clockwise) for cube in range(N_CUBES) for clockwise in (True, False))
-"""What each action does."""
+SHORTEST_HORIZON = 10
+PLANS_IN_HORIZON = 2
+"""Where a world names no horizon, it is so many times its longest shortest plan, and at least the shortest horizon."""
 
 
 @dataclass(frozen=True)
 class Goal:
     """A condition on legal macrostates."""
 
-    pointed: int  #: direction of the arrow of the cube that the human points at
-    absent: int | None = None  #: direction that no arrow may have, or None
+    pointed: int | None = None  #: direction of the arrow of the cube that the human points at, or None for any
+    absent: tuple[int, ...] = ()  #: directions that no arrow may have
+    pattern: tuple[int, ...] = ()  #: direction of every arrow, or empty for any
+
+    @classmethod
+    def of(cls, world: Arrows) -> Goal:
+        """That of a world."""
+        pattern = "0" * world.cubes if world.goal == "all" else world.goal
+        goal = _GOALS[world.goal] if world.goal in _GOALS else cls(pattern=tuple(map(int, pattern)))
+        return replace(goal, absent=(*goal.absent, TOWARD_AGENT)) if "agent" in world.forbidden else goal
 
     def holds(self, macrostate: tuple[int, ...]) -> bool:
         """Whether a legal macrostate is a goal."""
-        directions = macrostate[:N_CUBES]
-        return directions[macrostate[N_CUBES]] == self.pointed and self.absent not in directions
+        *directions, pointed = macrostate
+        return (
+            (self.pointed is None or directions[pointed] == self.pointed)
+            and (not self.pattern or tuple(directions) == self.pattern)
+            and not any(each in directions for each in self.absent)
+        )
 
 
-GOALS = {
-    "toward_human": Goal(TOWARD_HUMAN),  # thesis 5.2.1
-    "toward_human_alone": Goal(TOWARD_HUMAN, absent=TOWARD_AGENT),  # the hard variant, thesis 5.2.3
+_GOALS = {
+    "pointed": Goal(TOWARD_HUMAN),
     "toward_agent": Goal(TOWARD_AGENT),
-    "left": Goal(LEFT, absent=TOWARD_HUMAN),
+    "clockwise": Goal(LEFT, absent=(TOWARD_HUMAN,)),
 }
-"""One a member of the family."""
 
 
 @dataclass(frozen=True)
-class ArrowPuzzleRules:
-    """The macrostate machine of the arrow puzzle.
+class ArrowRules:
+    """The macrostate machine of a world.
 
     Args:
-        goal: Which of the legal macrostates are goals.
+        world: The world.
     """
 
-    goal: Goal = GOALS["toward_human"]
+    world: Arrows = Arrows()  # noqa: RUF009 - frozen
+
+    @cached_property
+    def goal(self) -> Goal:
+        """Which of the legal macrostates are goals."""
+        return Goal.of(self.world)
 
     @property
     def n_actions(self) -> int:
-        """Two turns a cube."""
-        return len(TURNS)
+        """Two a cube."""
+        return len(self.world.turns)
 
     @cached_property
     def states(self) -> tuple[tuple[int, ...], ...]:
-        """All 192 macrostates."""
-        return tuple(product(*[range(N_DIRECTIONS)] * N_CUBES, range(N_CUBES)))
+        """All macrostates: 192 of three cubes, 24,576 of six."""
+        cubes = self.world.cubes
+        return tuple(product(*[range(N_DIRECTIONS)] * cubes, range(cubes)))
 
     @cached_property
     def start_states(self) -> tuple[tuple[int, ...], ...]:
-        """The macrostates that are not terminal: of 72 legal ones, those that are no goal."""
-        return tuple(state for state in self.states if not self.is_terminal(state))
+        """The macrostates that are no end and from which turns lead to a goal, whatever the dials are.
+
+        Raises:
+            InvalidValueError: There is none; the message says what there is.
+        """
+        lengths = self.plan_lengths
+        starts = tuple(state for state, length in zip(self.states, lengths.tolist(), strict=True) if length > 0)
+        if not starts:
+            legal, goals = (sum(map(what, self.states)) for what in (self.is_legal, self.is_goal))
+            raise InvalidValueError(
+                f"World {self.world} has no start from which its goal can be reached: of {len(lengths)} macrostates "
+                f"{legal} are legal and {goals} of them goals; give another goal or forbid less."
+            )
+        return starts
+
+    @cached_property
+    def plan_lengths(self) -> NDArray[np.int64]:
+        """Fewest turns from each macrostate to a goal, dials apart; 0 at goals, -1 where no turns do. Shape (S,)."""
+        states = np.array(self.states)
+        legal, goal = (np.array([what(state) for state in self.states]) for what in (self.is_legal, self.is_goal))
+        after = []
+        for turns in self.world.turns:
+            turned = states.copy()
+            for turn in turns:
+                turned[:, turn.cube] = (turned[:, turn.cube] + (1 if turn.clockwise else -1)) % N_DIRECTIONS
+            after.append(np.ravel_multi_index(tuple(turned.T), states.max(axis=0) + 1))
+        lengths = np.where(goal, 0, -1)
+        for length in count(1):
+            leads = np.any([lengths[reached] == length - 1 for reached in after], axis=0)
+            found = legal & (lengths < 0) & leads
+            if not found.any():
+                break
+            lengths[found] = length
+        return lengths
+
+    @property
+    def horizon(self) -> int:
+        """Macro-actions before truncation."""
+        longest = int(self.plan_lengths.max())
+        return self.world.horizon or max(SHORTEST_HORIZON, PLANS_IN_HORIZON * longest)
 
     def is_legal(self, macrostate: tuple[int, ...]) -> bool:
-        """Whether all arrows point in different directions."""
-        return len(set(macrostate[:N_CUBES])) == N_CUBES
+        """Whether no two arrows are alike that may not be."""
+        directions, forbidden = macrostate[:-1], self.world.forbidden
+        if "equal" in forbidden and len(set(directions)) < len(directions):
+            return False
+        return "neighbours" not in forbidden or all(left != right for left, right in pairwise(directions))
 
     def is_goal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether the macrostate is legal and a goal."""
@@ -96,15 +148,16 @@ class ArrowPuzzleRules:
         return self.is_goal(macrostate) or not self.is_legal(macrostate)
 
     def turned(self, macrostate: tuple[int, ...], action: int) -> tuple[int, ...]:
-        """The macrostate after a quarter turn, also out of a terminal one.
+        """The macrostate after a macro-action that does not slip, also out of a terminal one.
 
         Raises:
             InvalidValueError: No such action.
         """
         if not 0 <= action < self.n_actions:
             raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
-        turn, turned = TURNS[action], list(macrostate)
-        turned[turn.cube] = (turned[turn.cube] + (1 if turn.clockwise else -1)) % N_DIRECTIONS
+        turned = list(macrostate)
+        for turn in self.world.turns[action]:
+            turned[turn.cube] = (turned[turn.cube] + (1 if turn.clockwise else -1)) % N_DIRECTIONS
         return tuple(turned)
 
     def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
@@ -117,8 +170,16 @@ class ArrowPuzzleRules:
         return Outcome(1.0, reached, STEP_REWARD, terminated=False, success=False)
 
     def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        """The one result of a turn, which is certain."""
-        return (self.judge(macrostate, action, self.turned(macrostate, action)),)
+        """The result of a turn, which is certain but for the dials."""
+        found: tuple[Outcome, ...] = (self.judge(macrostate, action, self.turned(macrostate, action)),)
+        if self.world.slip:
+            found = slipping(found, self.judge(macrostate, action, macrostate), self.world.slip)
+        return fickle(found, self._pointed_elsewhere, self.world.fickle) if self.world.fickle else found
+
+    def _pointed_elsewhere(self, outcome: Outcome) -> list[Outcome]:
+        *directions, pointed = outcome.macrostate
+        others = [(*directions, cube) for cube in range(self.world.cubes) if cube != pointed]
+        return [self.judge(outcome.macrostate, 0, other) for other in others]
 
     @cached_property
     def _policy(self) -> dict[tuple[int, ...], int]:

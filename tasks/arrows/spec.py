@@ -1,7 +1,7 @@
-"""The arrow puzzle (thesis, chapter 5) and its family: what the bench needs to know, and the environments.
+"""Arrow puzzles (thesis, chapter 5): what the bench needs to know of each world, and the environments.
 
-The members of the family share scene, macro-actions and the illegal rule, and so encoders and everything that moves;
-they differ in the goal alone: what has been learned of the world in one of them is true in every other.
+Worlds of as many cubes share scene and encoders, whatever their goals and dials: what has been learned of how one of
+them moves is true in every other whose turns are the same.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """
@@ -9,33 +9,46 @@ Importing this module is cheap: MuJoCo loads when an environment or a frame is m
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from imagine_bench.errors import require_known
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
-from .rules import GOALS, N_CUBES, TURNS, ArrowPuzzleRules, Goal
+from .description import Arrows
+from .rules import ArrowRules, Goal
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
+    from ..scenes.appearance import Appearance
+    from .world import ArrowWorld
 
-HORIZON = 10
 _DIRECTIONS = ("toward the human", "right", "toward the agent", "left")
-_CUBES = ("left", "middle", "right")
-_FAMILY = {
-    "toward_human": ("arrow_puzzle", "Arrow puzzle", "ArrowPuzzle"),
-    "toward_human_alone": ("arrow_puzzle_hard", "Arrow puzzle, hard", "ArrowPuzzleHard"),
-    "toward_agent": ("arrow_puzzle_toward", "Arrow puzzle, toward the agent", "ArrowPuzzleToward"),
-    "left": ("arrow_puzzle_clockwise", "Arrow puzzle, clockwise", "ArrowPuzzleClockwise"),
+_CUBES = {1: ("only",), 2: ("left", "right"), 3: ("left", "middle", "right")}
+_COUNTED = ("one", "two", "three", "four", "five", "six")
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
+_FORBIDDEN = {
+    "none": "",
+    "equal": ", and no two arrows may ever point the same way",
+    "neighbours": ", and no two neighbouring arrows may ever point the same way",
 }
-"""By goal: name, title, and Gymnasium's name of the task."""
+_NAMED = {
+    Arrows(horizon=10): ("arrow_puzzle", "Arrow puzzle", "ArrowPuzzle"),
+    Arrows(forbid="equal+agent", horizon=10): ("arrow_puzzle_hard", "Arrow puzzle, hard", "ArrowPuzzleHard"),
+    Arrows(goal="toward_agent", horizon=10): (
+        "arrow_puzzle_toward", "Arrow puzzle, toward the agent", "ArrowPuzzleToward",
+    ),
+    Arrows(goal="clockwise", horizon=10): ("arrow_puzzle_clockwise", "Arrow puzzle, clockwise", "ArrowPuzzleClockwise"),
+    Arrows(cubes=1, horizon=2): ("arrow_puzzle_easy", "Arrow puzzle, easy", "ArrowPuzzleEasy"),
+}  # fmt: skip
+"""Registered points of the family: name, title, and Gymnasium's name of the task."""
 _IN_THESIS = ("arrow_puzzle", "arrow_puzzle_hard")
 _TARGETS = PerformanceTargets(
-    objects=tuple(f"cube_{cube}" for cube in range(N_CUBES)),
+    objects=("cube_0", "cube_1", "cube_2"),
     as_ruled=0.999,
     other_objects_mm=1.0,
     error_deg=1.0,
@@ -47,65 +60,91 @@ _TARGETS = PerformanceTargets(
 """The first task's; the others share its physics and its encoders."""
 
 
-def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
-    from ..frames import frames_of  # noqa: PLC0415
-    from .world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
-
-    return frames_of(ArrowWorld, ArrowPuzzleRules(), macrostates, appearance, rng)
-
-
-def _described(goal: Goal) -> str:
-    alone = "" if goal.absent is None else f" with no arrow {_DIRECTIONS[goal.absent]},"
+def _described(world: Arrows, goal: Goal) -> str:
+    if goal.pointed is not None:
+        wanted = f"The arrow of the cube pointed at must come to point {_DIRECTIONS[goal.pointed]}"
+    else:
+        wanted = f"The arrows must come to point {', '.join(_DIRECTIONS[each] for each in goal.pattern)}"
+    absent = "".join(f", with no arrow {_DIRECTIONS[each]}" for each in goal.absent)
+    forbidden = "".join(_FORBIDDEN.get(part, "") for part in world.forbidden if world.cubes > 1)
+    carry = "cube carries an arrow" if world.cubes == 1 else "cubes carry an arrow each"
+    also = " and the next one with it" if world.coupling == "neighbour" else ""
     return (
-        "Three cubes carry an arrow each and a human points at one of them; the arm turns one cube by a quarter a "
-        f"time. The arrow of the cube pointed at must come to point {_DIRECTIONS[goal.pointed]},{alone} and no two "
-        "arrows may ever point the same way."
+        f"{_COUNTED[world.cubes - 1].capitalize()} {carry} and a human points at one of them; the arm turns one cube"
+        f"{also} by a quarter a time. {wanted}{absent}{forbidden}."
     )
 
 
 @functools.cache
-def spec_of(goal: str = "toward_human") -> TaskSpec:
-    """The member of the family with a goal.
+def _maker(world: Arrows) -> Callable[[Appearance], ArrowWorld]:
+    """The same one for the same world, so that what draws it is shared."""
+    from .world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
+
+    return functools.partial(ArrowWorld, arrows=world)
+
+
+def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
+    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
+    from ..frames import frames_of  # noqa: PLC0415
+
+    return frames_of(_maker(Arrows(cubes=rules.world.cubes)), rules, macrostates, appearance, rng)
+
+
+def spec_of(**world: Any) -> TaskSpec:
+    """A world of the family, by the fields of :class:`.description.Arrows`.
 
     Raises:
-        UnknownNameError: No such goal; the message lists all of them.
+        InvalidValueError: No such world, or one whose goal cannot be reached from anywhere.
+        UnknownNameError: An unknown goal, forbid or coupling.
     """
-    name, title, gymnasium_name = _FAMILY[require_known("goal", goal, _FAMILY)]
-    rules = ArrowPuzzleRules(GOALS[goal])
+    return _spec(Arrows(**world))
+
+
+@functools.cache
+def _spec(world: Arrows) -> TaskSpec:
+    rules = ArrowRules(world)
+    said = str(world).partition(":")[2].replace(",", ", ")
+    unnamed = (str(world), f"Arrows ({said})" if said else "Arrows", f"Arrows-{world.hash}" if said else "Arrows")
+    name, title, gymnasium_name = _NAMED.get(world, unnamed)
+    cubes = _CUBES.get(world.cubes, _ORDINALS[: world.cubes])
     return TaskSpec(
         id=name,
         title=title,
-        description=_described(rules.goal),
+        description=_described(world, rules.goal),
         env_id=f"imagine_bench/{gymnasium_name}-v0",
-        horizon=HORIZON,
+        horizon=rules.horizon if rules.start_states else 0,
         action_names=tuple(
-            f"turn the {_CUBES[turn.cube]} cube {'clockwise' if turn.clockwise else 'counter-clockwise'}"
-            for turn in TURNS
+            f"turn the {cubes[turn.cube]} cube {'clockwise' if turn.clockwise else 'counter-clockwise'}"
+            for turn, *_ in world.turns
         ),
-        macrostate_names=(*(f"{cube} arrow" for cube in _CUBES), "pointed cube"),
-        macrostate_values=(_DIRECTIONS,) * N_CUBES + (_CUBES,),
+        macrostate_names=(*(f"{cube} arrow" for cube in cubes), "pointed cube"),
+        macrostate_values=(_DIRECTIONS,) * world.cubes + (cubes,),
         preprocessing="gray_strips",
-        encoder="arrow_puzzle",
+        encoder="arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}",
         rules=rules,
-        facts=functools.partial(facts, rules, HORIZON),
-        render_macrostates=render_macrostates,
+        facts=functools.partial(facts, rules, rules.horizon),
+        render_macrostates=functools.partial(_rendered, rules),
         reference=name if name in _IN_THESIS else None,
         targets=_TARGETS if name == "arrow_puzzle" else None,
     )
 
 
-def make_env(*, goal: str = "toward_human", **options: Any) -> MacroEnv:
-    """A member of the family.
+def make_env(**options: Any) -> MacroEnv:
+    """A world of the family, without a time limit.
 
     Args:
-        goal: A name in :data:`.rules.GOALS`.
-        **options: The keyword arguments of MacroEnv.
+        **options: Fields of :class:`.description.Arrows`, and the keyword arguments of MacroEnv.
 
     Raises:
-        UnknownNameError: No such goal; the message lists all of them.
+        InvalidValueError, UnknownNameError: As :func:`spec_of`.
     """
-    from ..macro_env import MacroEnv  # noqa: PLC0415
-    from .world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads with the first environment)
+    from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
 
-    return MacroEnv(spec_of(goal), ArrowWorld, **options)
+    world = Arrows.taken_from(options, MacroEnv.KEYWORDS)
+    return MacroEnv(_spec(world), _maker(world), **options)
+
+
+def make_limited_env(**options: Any) -> TimeLimit[Any, np.int64]:
+    """As :func:`make_env`, truncated at the world's own horizon."""
+    env = make_env(**options)
+    return TimeLimit(env, env.horizon)

@@ -14,7 +14,7 @@ from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.layout import layout
 from ..world import MAX_SKEW_RAD, World
-from .description import Arrows, Turn
+from .description import Arrows
 from .scene import compile_arrow_scene
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
     def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
-        self._arrows, self._layout = arrows, layout(arrows.cubes)
+        self._turns, self._layout = arrows.turns, layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         super().__init__(compile_arrow_scene(arrows.cubes), level, objects=objects, materials=materials)
@@ -43,7 +43,7 @@ class ArrowWorld(World):
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: a turned cube stands exactly on its slot, as a good turn leaves it."""
-        for turn in self._turns(action):
+        for turn in self._turns[action]:
             if not self._stays(turn.cube, intended):
                 self._put(turn.cube, intended[turn.cube])
         self._gesture(intended[-1])
@@ -54,7 +54,7 @@ class ArrowWorld(World):
 
         A cube that is due and shall stay as it is slips out of the fingers.
         """
-        turns, before = self._turns(action), self.object_poses()
+        turns, before = self._turns[action], self.object_poses()
         slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
         results = []
         for turn in turns:
@@ -69,10 +69,6 @@ class ArrowWorld(World):
         turned = [turn.cube for turn in turns if turn.cube not in slipping]
         pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
-
-    def _turns(self, action: int) -> tuple[Turn, ...]:
-        turn = self._arrows.turns[action]
-        return tuple(replace(turn, cube=cube) for cube in self._arrows.turned_with(turn.cube))
 
     def _stays(self, cube: int, intended: tuple[int, ...]) -> bool:
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""

@@ -7,11 +7,17 @@ human's palm, four with the hands withdrawn, which is how the human answers what
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
+
+from ..dials.dials import Dials
+from ..dials.fickle import fickle
+from ..dials.slip import slipping
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)
@@ -35,12 +41,22 @@ def _with(objects: tuple[int, ...], index: int, value: int) -> tuple[int, ...]:
     return (*objects[:index], value, *objects[index + 1 :])
 
 
+@dataclass(frozen=True, kw_only=True)
+class PickPlace(Dials):
+    """A world: dials only."""
+
+    FAMILY: ClassVar[str] = "pick_place"
+
+
+@dataclass(frozen=True)
 class PickPlaceRules:
     """The macrostate machine: action i picks object i, or places it if it is held; action 3 hands over.
 
     The human's next gesture is drawn: after a pick that was asked for, the two other objects and the open palm are
-    equally likely. Everything else is certain.
+    equally likely. Everything else is certain but for the dials.
     """
+
+    world: PickPlace = PickPlace()
 
     @property
     def n_actions(self) -> int:
@@ -102,7 +118,22 @@ class PickPlaceRules:
         return _with(objects, held, PLACED) if action == held else objects
 
     def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        """One outcome a possible next gesture."""
+        """One outcome a possible next gesture, and of what slips, which is not punished."""
+        found = self._outcomes(macrostate, action)
+        if self.is_terminal(macrostate):
+            return found
+        if self.world.slip:
+            unmoved = Outcome(1.0, macrostate, PLACE_REWARD, terminated=False, success=False)
+            found = slipping(found, unmoved, self.world.slip)
+        return fickle(found, self._asked_otherwise, self.world.fickle) if self.world.fickle else found
+
+    def _asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
+        objects, gesture = outcome.macrostate[:N_OBJECTS], outcome.macrostate[N_OBJECTS]
+        held = held_object(outcome.macrostate)
+        wishes = POINTING if held is None else self._wishes(held)
+        return [replace(outcome, macrostate=(*objects, wish)) for wish in wishes if wish != gesture]
+
+    def _outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
         objects = self.objects_after(macrostate, action)
         if not self.is_asked_for(macrostate, action):
             gesture = OPEN_PALM if HANDED_OVER in objects else WITHDRAWN

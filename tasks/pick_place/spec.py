@@ -6,6 +6,7 @@ Importing this module is cheap: MuJoCo loads when an environment or a frame is m
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
-from .rules import N_OBJECTS, PickPlaceRules
+from .rules import N_OBJECTS, PickPlace, PickPlaceRules
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
@@ -88,8 +89,24 @@ SPEC = TaskSpec(
 )
 
 
+def spec_of(**world: Any) -> TaskSpec:
+    """The task with its dials turned. Raises as :class:`.rules.PickPlace`."""
+    return _spec(PickPlace(**world))
+
+
+@functools.cache
+def _spec(world: PickPlace) -> TaskSpec:
+    if world == PickPlace():
+        return SPEC
+    rules, dials = PickPlaceRules(world), str(world).partition(":")[2].replace(",", ", ")
+    return replace(
+        SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
+        rules=rules, facts=functools.partial(facts, rules, HORIZON), reference=None, targets=None,
+    )  # fmt: skip
+
+
 def make_env(**options: Any) -> MacroEnv:
-    """Pick-and-place with a human; ``options`` are the keyword arguments of MacroEnv.
+    """Pick-and-place with a human; ``options`` are its dials and the keyword arguments of MacroEnv.
 
     Actions 0, 1, 2 pick object i up, or put it back if it is held; action 3 hands over. What the robot is told it does
     as far as that is possible, asked for or not; what is not possible it reaches out for in vain. The human answers
@@ -100,4 +117,4 @@ def make_env(**options: Any) -> MacroEnv:
     from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
     from .world import PickWorld  # noqa: PLC0415
 
-    return MacroEnv(SPEC, PickWorld, **options)
+    return MacroEnv(_spec(PickPlace.taken_from(options, MacroEnv.KEYWORDS)), PickWorld, **options)

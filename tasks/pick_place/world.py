@@ -50,6 +50,7 @@ class PickWorld(World):
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
+        self._tcp_m, self._palm_m = self.data.site_xpos[self._tcp], self.data.mocap_pos[self._palm]
         self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
 
     @functools.cached_property
@@ -146,9 +147,9 @@ class PickWorld(World):
     # --- reading -------------------------------------------------------------------------------------------------
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        spec, name, position_m = OBJECTS[index], self._names[index], pose[:3]
-        tcp_m, palm_m = self.data.site_xpos[self._tcp].tolist(), self.data.mocap_pos[self._palm].tolist()
-        if position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M and math.dist(position_m, tcp_m) < MAX_OFF_GRIP_M:
+        spec, name, position_m, palm_m = OBJECTS[index], self._names[index], pose[:3], self._palm_m.tolist()
+        in_the_air = position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M
+        if in_the_air and math.dist(position_m, self._tcp_m.tolist()) < MAX_OFF_GRIP_M:
             return PICKED, None
         in_palm = math.dist(position_m[:2], palm_m[:2]) < PALM_REACH_M
         if in_palm and abs(position_m[2] - palm_m[2] - spec.grip_height_m) < MAX_LIFT_OFF_M:

@@ -1,6 +1,9 @@
-"""Metrics of a bench in TensorBoard, read back by it."""
+"""Metrics of a bench in TensorBoard, read back by it, and in the files of Weights & Biases, read by its messages."""
 
 from __future__ import annotations
+
+import json
+import struct
 
 import pytest
 
@@ -43,8 +46,42 @@ def test_tensorboard_reads_the_scalars_back(bench, capsys):
     assert "solved" not in events.Tags()["tensors"]
 
 
+def _records(path):
+    """The messages in a file: records of a LevelDB log, after a header of seven bytes, in blocks of 32 KiB."""
+    content, at, part = path.read_bytes(), 7, b""
+    while at + 7 <= len(content):
+        if 32768 - at % 32768 < 7:
+            at += 32768 - at % 32768
+            continue
+        _, length, kind = struct.unpack_from("<IHB", content, at)
+        part += content[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in {1, 4}:  # whole, or the last of several
+            yield part
+            part = b""
+
+
+def test_weights_and_biases_files_are_whole(bench):
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    out = track(bench, "wandb")
+    found = {}
+    for path in out.glob("wandb/offline-run-*/*.wandb"):
+        records = [Record.FromString(content) for content in _records(path)]
+        assert [each.exit.exit_code for each in records if each.HasField("exit")] == [0]
+        (run,) = (each.run for each in records if each.HasField("run"))
+        found[run.display_name] = [
+            {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in each.history.item}
+            for each in records
+            if each.HasField("history")
+        ]
+    assert sorted(found) == ["dqn/seed_0", "random/seed_3"]
+    rows = [(row["_step"], row["success_rate"], row["mean_return"]) for row in found["random/seed_3"]]
+    assert rows == [(2, 0.05, -2.5), (4, 0.25, 3.0)]
+
+
 def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
-    with pytest.raises(UnknownNameError, match="Known: tensorboard"):
+    with pytest.raises(UnknownNameError, match="Known: tensorboard, wandb"):
         track(bench, "mlflow")
     with pytest.raises(InvalidValueError, match="has been tested yet"):
         track(tmp_path / "elsewhere", "tensorboard")

@@ -13,6 +13,9 @@ from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
+BUNDLED = [name for name in TASKS if name != "arrow_puzzle_easy"]
+"""Tasks whose encoders are bundled."""
+
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("preset", PRESETS)
@@ -25,10 +28,10 @@ def test_every_preset_survives_json_with_its_hash(task, preset):
 @pytest.mark.parametrize("name", TASKS)
 def test_success_thresholds_lie_between_chance_and_optimum(name):
     facts, success_threshold = task(name).facts(), task(name).success_threshold
-    assert facts.chance_level < 0.5 < success_threshold <= facts.optimum
+    assert facts.chance_level <= 0.5 < success_threshold <= facts.optimum
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", BUNDLED)
 def test_photo_has_latents_and_says_that_it_has_no_codes(name):
     wanted, paths = plan_control(name, "quick", appearance="photo", agents=("dqn",))
     assert set(paths) == {"latents"} and "-photo@" in wanted.encoder
@@ -37,7 +40,7 @@ def test_photo_has_latents_and_says_that_it_has_no_codes(name):
 
 
 @pytest.mark.parametrize("appearance", [name for name in APPEARANCES if name != "photo"])
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", BUNDLED)
 def test_quick_finds_encoders_at_every_appearance(name, appearance):
     wanted, paths = plan_control(name, "quick", appearance=appearance)
     assert set(paths) == {"latents", "codes"} and wanted.codes is not None

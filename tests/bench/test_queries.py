@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import Pupil
-from imagine_bench.tasks.arrows.rules import ArrowPuzzleRules
+from imagine_bench.tasks.arrows.rules import ArrowRules
 from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
@@ -103,7 +103,7 @@ def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
 
 
 def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
-    oracle = LabelOracle(ArrowPuzzleRules())
+    oracle = LabelOracle(ArrowRules())
     assert oracle.label((3, 1, 2, 0), np.array([0])) == Label(50.0, True)
     assert oracle.label((3, 1, 2, 0), np.array([0, 1])) == Label(-1.0, False), "there and back through a goal"
     for actions in ([], [6], [0, -1]):

@@ -16,7 +16,7 @@ from recordings import contents, times
 from imagine_bench import registry
 from imagine_bench.bench.bench import plan
 from imagine_bench.cli import main
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.calibration import log_score
 from imagine_bench.protocols.runs import Progress, RunSpec
@@ -33,6 +33,7 @@ from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import read_json
 from imagine_bench.store.trained import load_trained
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
@@ -417,3 +418,16 @@ def test_lists_of_sessions_are_rows_not_python() -> None:
         ("seeds", "0; 1"), ("sessions.1.wall_s", "1.0"),
         ("sessions.2.wall_s", "2.0"), ("sessions.2.changed.commit", "a"),
     ]  # fmt: skip
+
+
+def test_one_regressor_with_two_settings_in_one_bench(tmp_path: Path) -> None:
+    protocol, _ = plan("toy_regression", "smoke", agents=("mc_dropout:epochs=6", "mc_dropout"), overrides=_TINY)
+    assert protocol.agents == ("mc_dropout:epochs=6", "mc_dropout")
+    spent = {}
+    for agent in protocol.agents:
+        run(RunSpec(protocol=protocol, agent=agent, seed=0), tmp_path / agent[-1], lambda _: None)
+        spent[agent] = read_json(tmp_path / agent[-1] / "config.json", "the settings")["settings"]["epochs"]
+    assert spent == {"mc_dropout:epochs=6": 6, "mc_dropout": 4}
+    assert registry.regressor_entry("mc_dropout:epochs=6").title == "MC dropout (epochs 6)"
+    with pytest.raises(UnknownNameError, match=r"No setting 'epoch'\. Did you mean 'epochs'"):
+        plan("toy_regression", "smoke", agents=("mc_dropout:epoch=6",))

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.rules import ArrowPuzzleRules
+from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
@@ -35,12 +35,12 @@ def test_the_command_says_what_holds(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out.startswith("ok     it is made\n")
 
 
-class _Leaky(ArrowPuzzleRules):
+class _Leaky(ArrowRules):
     def outcomes(self, macrostate: Any, action: int) -> Any:
         return tuple(dataclasses.replace(each, probability=0.9) for each in super().outcomes(macrostate, action))
 
 
-class _Generous(ArrowPuzzleRules):
+class _Generous(ArrowRules):
     """Rewards a turn with 1 more than the environment does."""
 
     def outcomes(self, macrostate: Any, action: int) -> Any:
@@ -74,7 +74,7 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         assert report(chosen) == len(chosen) == 1
         return next(_failed(capsys))
 
-    leaky, generous = (kind(spec.rules.goal) for kind in (_Leaky, _Generous))  # type: ignore[attr-defined]
+    leaky, generous = (kind(spec.rules.world) for kind in (_Leaky, _Generous))  # type: ignore[attr-defined]
     assert "sum to 0.9, not 1" in check("distributions", rules=leaky)
     assert "macro-actions end as the rules say: action" in check("as the rules say", rules=generous)
     draw = np.random.default_rng(0)

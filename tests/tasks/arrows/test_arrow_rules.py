@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.rules import GOALS, LEFT, TOWARD_AGENT, TOWARD_HUMAN, ArrowPuzzleRules
-from imagine_bench.tasks.arrows.spec import make_env, spec_of
+from imagine_bench.tasks.arrows.rules import LEFT, TOWARD_AGENT, TOWARD_HUMAN
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import evaluate, facts, fewest_actions, greedy, is_random, optimal_policy, tabulate
 
-FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(ArrowPuzzleRules(goal) for goal in GOALS.values())
-NAMES = ["easy", "hard", "toward", "clockwise"]
+NAMES = ["arrow_puzzle", "arrow_puzzle_hard", "arrow_puzzle_toward", "arrow_puzzle_clockwise"]
+FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(registry.task(name).rules for name in NAMES)
 ALL = pytest.mark.parametrize("rules", FAMILY, ids=NAMES)
 
 
@@ -42,16 +42,12 @@ def test_goals_are_what_their_tasks_say():
     assert goals(CLOCKWISE) == {(LEFT, frozenset({1, 2, 3}))}
 
 
-def test_each_goal_has_a_task_that_says_it():
-    specs = {goal: spec_of(goal) for goal in GOALS}
-    assert [spec.rules.goal for spec in specs.values()] == list(GOALS.values())
-    assert "to point toward the human, and no two" in specs["toward_human"].description
-    assert "toward the human, with no arrow toward the agent, and no two" in specs["toward_human_alone"].description
-    assert "to point left, with no arrow toward the human, and no two" in specs["left"].description
-    assert specs["left"].action_names[3] == "turn the middle cube counter-clockwise"
-    for make in (spec_of, lambda goal: make_env(goal=goal)):
-        with pytest.raises(UnknownNameError, match=r"goal 'lefft'.*'left'"):
-            make("lefft")
+def test_each_task_says_its_goal():
+    said = {name: registry.task(name) for name in NAMES}
+    assert "to point toward the human, and no two" in said["arrow_puzzle"].description
+    assert "human, with no arrow toward the agent, and no two" in said["arrow_puzzle_hard"].description
+    assert "left, with no arrow toward the human, and no two" in said["arrow_puzzle_clockwise"].description
+    assert said["arrow_puzzle_clockwise"].action_names[3] == "turn the middle cube counter-clockwise"
 
 
 def test_the_family_shares_everything_but_the_goal():

@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import mink
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import MAX_CUBES
@@ -76,6 +77,23 @@ def test_ik_depends_on_its_arguments_alone(ik):
     first = ik.solve(**target).qpos_rad
     ik.solve(position_in_base_m=np.array([0.5, -0.2, 0.1]), yaw_rad=0.1)
     np.testing.assert_array_equal(ik.solve(**target).qpos_rad, first)
+
+
+def test_steps_are_mink_s_to_the_bit(ik):
+    """Near targets and far ones, at the joints' limits too."""
+    rng, at_limits = np.random.default_rng(0), 0
+    configuration, limits = ik._configuration, mink.ConfigurationLimit(ik._configuration.model)
+    posture = mink.PostureTask(configuration.model, cost=1e-3)
+    posture.set_target(np.array(HOME_QPOS_RAD))
+    for _ in range(200):
+        place = mink.SE3.from_rotation_and_translation(pointing_down(rng.uniform(-3, 3)), rng.uniform(-0.9, 0.9, 3))
+        ik._reach.set_target(place)
+        configuration.update(rng.uniform(limits.lower, limits.upper))
+        expected = mink.solve_ik(configuration, [ik._reach, posture], 1.0, "daqp", limits=[limits])
+        np.testing.assert_array_equal(ik._step(), expected)
+        after = configuration.q + expected / limits.gain
+        at_limits += bool(np.isclose(after, limits.lower).any() or np.isclose(after, limits.upper).any())
+    assert 20 < at_limits
 
 
 def test_ik_covers_the_table(ik):

@@ -1,0 +1,110 @@
+"""A convolutional next-frame predictor of plain torch: what a newcomer would write first.
+
+The latest frame and the action go into a small U-shaped network that draws the next frame; reward and end are read from
+its narrowest layer. It imagines one future, and knows nothing of what it does not know.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.world_models import Imagined
+
+from ..encoders.perception import prepare_torch
+from ..networks.weights import initialise
+
+_STEPS, _BATCH, _RATE, _CHUNK = 600, 32, 2e-3, 256
+_REWARD = 10.0  # units of reward that the network's output is in
+
+
+class NextFrame(nn.Module):
+    """From frames (N, 3, 64, 64) and actions to next frames, rewards and logits of the end."""
+
+    def __init__(self, n_actions: int) -> None:
+        super().__init__()
+        self.n_actions = n_actions
+        self.down = nn.Sequential(nn.Conv2d(3, 16, 4, stride=4), nn.ReLU(), nn.Conv2d(16, 32, 4, stride=4), nn.ReLU())
+        self.middle = nn.Sequential(nn.Linear(512 + n_actions, 256), nn.ReLU(), nn.Linear(256, 512), nn.ReLU())
+        self.up = nn.Sequential(
+            nn.ConvTranspose2d(64, 16, 4, stride=4), nn.ReLU(), nn.ConvTranspose2d(16, 6, 4, stride=4)
+        )
+        self.outcome = nn.Linear(512, 2)
+
+    def forward(self, frames: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Next frames (N, 3, 64, 64), rewards (N,) in units of 10, logits (N,)."""
+        seen = self.down(frames)
+        hidden = self.middle(torch.cat([seen.flatten(1), functional.one_hot(actions, self.n_actions)], dim=1))
+        drawn, mask = self.up(torch.cat([seen, hidden.view_as(seen)], dim=1)).chunk(2, dim=1)
+        mask = mask.sigmoid()  # where it paints over what was there
+        reward, logit = self.outcome(hidden).unbind(dim=1)
+        return (1.0 - mask) * frames + mask * drawn.sigmoid(), reward, logit
+
+
+class Convolutional:
+    """The network as a world model."""
+
+    def __init__(self, n_actions: int) -> None:
+        self.network = NextFrame(n_actions)
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Squared error of pixels and rewards, cross-entropy of ends; as many steps whatever the data."""
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        initialise(self.network, generator)
+        before = torch.from_numpy(dataset.rows[0])
+        frames, actions = torch.from_numpy(dataset.frames), torch.from_numpy(dataset.actions)
+        rewards, ended = torch.from_numpy(dataset.rewards).float(), torch.from_numpy(dataset.terminated).float()
+        optimiser = torch.optim.Adam(self.network.parameters(), lr=_RATE)
+        for _ in range(_STEPS):
+            rows = torch.randint(len(actions), (_BATCH,), generator=generator)
+            images, target = _images(frames[before[rows]]), _images(frames[before[rows] + 1])
+            drawn, reward, logit = self.network(images, actions[rows])
+            loss = 50.0 * (drawn - target).square().mean() + (reward - rewards[rows] / _REWARD).square().mean()
+            loss = loss + functional.binary_cross_entropy_with_logits(logit, ended[rows])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+
+    @torch.no_grad()
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """One future, fed its own pictures; see :class:`imagine_bench.world_models.WorldModel`."""
+        del samples, rng
+        asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :])
+        pieces = zip(torch.from_numpy(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)
+        pictures, rewards, ended = (torch.cat(column) for column in zip(*(self._roll(*p) for p in pieces), strict=True))
+        return Imagined(
+            pictures=(pictures * 255.0).round().to(torch.uint8).numpy()[:, None],
+            probabilities=np.ones((len(frames), 1, asked.shape[1])),
+            rewards=rewards.numpy()[:, None], p_ended=ended.numpy()[:, None],
+        )  # fmt: skip
+
+    def _roll(self, frames: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pictures (N, D, 64, 64, 3), rewards and P(ended) (N, D) of one piece."""
+        images, alive = _images(frames), torch.ones(len(frames))
+        drawn, earned, over = [], [], []
+        for action in actions.unbind(dim=1):
+            images, reward, logit = self.network(images, action)
+            drawn.append(images.permute(0, 2, 3, 1))
+            earned.append(alive * reward * _REWARD)
+            alive = alive * (1.0 - logit.sigmoid())
+            over.append(1.0 - alive)
+        return torch.stack(drawn, dim=1), torch.stack(earned, dim=1), torch.stack(over, dim=1)
+
+    def parameters(self) -> int:
+        """Weights and biases."""
+        return sum(parameter.numel() for parameter in self.network.parameters())
+
+
+def _images(frames: Tensor) -> Tensor:
+    return frames.permute(0, 3, 1, 2).float() / 255.0
+
+
+def make(context: AgentContext) -> Convolutional:
+    """The model for a task."""
+    prepare_torch(context.device)
+    return Convolutional(context.n_actions)

@@ -1,0 +1,106 @@
+"""The thesis' world models: a VAE that was trained beforehand, and a mixture density network between its latents.
+
+Three of them: one network with Monte-Carlo dropout, an ensemble, and one with a single Gaussian, which cannot hold two
+outcomes. Networks, losses and uncertainties are those of the agents that imagine (:mod:`..imagination`), at the
+settings of ``quick``; only how long they train is fixed here, and is the same whatever the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.world_models import UNCERTAINTIES, Imagined
+
+from ..encoders.encoder import Encoder
+from ..encoders.perception import load_perception, prepare_torch
+from ..imagination.rollouts import Imagination
+from ..imagination.settings import HYPERPARAMETERS, Settings
+from ..imagination.uncertainty import decompose
+from ..replay import RealMemory
+
+UPDATES = 1_500
+_MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25, "imagination.weight_samples": 20}
+_GAUSSIAN = {**_MC_DROPOUT, "model.components": 1}
+
+
+class LatentModel:
+    """Encoder, environment model and decoder as a world model."""
+
+    def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
+        self.encoder, self.settings, device = encoder, settings, encoder.device
+        size, seeds = encoder.latent_size, context.seeds
+        self.imagination = Imagination(size, context.n_actions, settings, filtered=False, seeds=seeds, device=device)
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Encode every frame once and make :data:`UPDATES` updates."""
+        generator = self._generator(rng)
+        before = torch.from_numpy(dataset.rows[0])
+        mu, sigma = (each.cpu() for each in self.encoder.encode(dataset.frames))
+        memory = RealMemory(len(before), self.encoder.latent_size, self.encoder.device)
+        columns = {
+            "mu": mu[before], "sigma": sigma[before], "next_mu": mu[before + 1], "next_sigma": sigma[before + 1],
+            "action": dataset.actions, "reward": dataset.rewards.astype(np.float32),
+            "terminated": dataset.terminated.astype(np.float32),
+        }  # fmt: skip
+        memory.load({name: np.asarray(column) for name, column in columns.items()}, len(before))
+        model = self.settings.model
+        for _ in range(UPDATES):
+            batch = memory.sample(model.batch_size, generator, spread=model.spread, balance=model.balance)
+            self.imagination.model.update(batch, generator)
+
+    @torch.no_grad()
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """Futures in closed loop through latents; see :class:`imagine_bench.world_models.WorldModel`."""
+        generator, rows = self._generator(rng), len(frames)
+        z = self.encoder.encode(frames[:, -1])[0].repeat_interleave(samples, dim=0)  # [N S, Z]
+        weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))
+        steps: dict[str, list[Any]] = {name: [] for name in ("pictures", "rewards", "p_ended", *UNCERTAINTIES)}
+        for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
+            step = self.imagination.step(z, action.repeat_interleave(samples), weights, generator)
+            z, spread = step.next_z, decompose(step.samples)
+            steps["pictures"].append((self.encoder.decode(z) * 255.0).round().astype(np.uint8))
+            steps["rewards"].append((alive * step.reward).numpy())
+            alive = alive * (1.0 - step.p_terminated)
+            steps["p_ended"].append((1.0 - alive).numpy())
+            for name in UNCERTAINTIES:
+                reduced = self.imagination.filter.score(getattr(spread, name))
+                steps[name].append(reduced.view(rows, samples).mean(dim=1).numpy())
+        found = {name: np.stack(each, axis=1) for name, each in steps.items()}
+        for name in ("pictures", "rewards", "p_ended"):
+            found[name] = found[name].reshape(rows, samples, *found[name].shape[1:])
+        return Imagined(**found)
+
+    def parameters(self) -> int:
+        """Weights and biases of the environment model; the encoder's were there before."""
+        return sum(parameter.numel() for parameter in self.imagination.model.parameters())
+
+    def _generator(self, rng: np.random.Generator) -> torch.Generator:
+        return torch.Generator(self.encoder.device).manual_seed(int(rng.integers(2**63)))
+
+
+def _make(context: AgentContext, overrides: Mapping[str, Any]) -> LatentModel:
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, overrides, context.config_group)
+    prepare_torch(context.device)
+    return LatentModel(load_perception(context).encoder, settings, context)
+
+
+def make_dropout(context: AgentContext) -> LatentModel:
+    """One network whose hidden units are dropped again and again."""
+    return _make(context, _MC_DROPOUT)
+
+
+def make_ensemble(context: AgentContext) -> LatentModel:
+    """Three networks without dropout."""
+    return _make(context, {"model.members": 3, "model.dropout": 0.0})
+
+
+def make_gaussian(context: AgentContext) -> LatentModel:
+    """One network with dropout and one Gaussian."""
+    return _make(context, _GAUSSIAN)

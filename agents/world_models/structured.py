@@ -1,0 +1,103 @@
+"""The structured model of the agent ``factored``: tables over discrete codes of a scene's factors."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, Floats, Frame
+from imagine_bench.world_models import Imagined
+
+from ..encoders.encoder import Encoder
+from ..encoders.perception import load_perception, prepare_torch
+from ..factored.factors import Codes, CodeTransition
+from ..factored.model import FactoredModel
+from ..factored.settings import HYPERPARAMETERS
+
+
+class StructuredModel:
+    """Codes, tables and decoder as a world model."""
+
+    def __init__(self, encoder: Encoder, context: AgentContext) -> None:
+        if not encoder.card.code_sizes:
+            raise InvalidValueError("The structured model reads codes; give an encoder of the recipe 'codes'.")
+        self.encoder, self.sizes = encoder, encoder.card.code_sizes
+        settings = HYPERPARAMETERS.resolve(context.hyperparameters, {}, context.config_group)
+        self.model = FactoredModel(self.sizes, context.n_actions, settings)
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Count every transition; nothing is random."""
+        del rng
+        codes, before = list(map(tuple, self._codes(dataset.frames).tolist())), dataset.rows[0]
+        rows = zip(before, dataset.actions.tolist(), dataset.rewards.tolist(), dataset.terminated.tolist(), strict=True)
+        for row, action, reward, terminated in rows:
+            self.model.add(CodeTransition(codes[row], action, codes[row + 1], reward, terminated))
+        self.model.outcomes.fit()
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """Futures drawn code by code; see :class:`imagine_bench.world_models.WorldModel`.
+
+        ``epistemic`` is the probability that something untested decides, ``modal`` that something else happens than
+        what is likeliest.
+        """
+        asked = actions[:, frames.shape[1] - 1 :]
+        rows, depth = asked.shape
+        shape = (rows, samples, depth)
+        codes, alive = np.repeat(self._codes(frames[:, -1]), samples, axis=0), np.ones(rows * samples)
+        drawn, rewards, ended, unknown, other = [], np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        for step in range(depth):
+            action = np.repeat(asked[:, step], samples)
+            codes, reward, ends, untested, p_other = self._step(codes, action, rng)
+            drawn.append(codes)
+            rewards[:, :, step] = (alive * reward).reshape(rows, samples)
+            alive = alive * (1.0 - ends)
+            for array, values in ((ended, 1.0 - alive), (unknown, untested), (other, p_other)):
+                array[:, :, step] = values.reshape(rows, samples)
+        return Imagined(
+            pictures=self._pictures(np.stack(drawn, axis=1)).reshape(*shape, 64, 64), rewards=rewards, p_ended=ended,
+            epistemic=unknown.mean(axis=1), modal=other.mean(axis=1),
+        )  # fmt: skip
+
+    def _step(
+        self, codes: Codes, action: NDArray[np.int64], rng: np.random.Generator
+    ) -> tuple[Codes, Floats, Floats, Floats, Floats]:
+        """Next codes (R, P), and of each row reward, P(end), P(untested) and P(other), (R,)."""
+        every, following = np.arange(len(codes)), np.zeros_like(codes)
+        known, likeliest = np.ones(len(codes)), np.ones(len(codes))
+        for factor, predicted in enumerate(self.model.dynamics.predict(codes)):
+            seen, unknown = predicted.seen[every, action], predicted.unknown[every, action]
+            trusted = (seen.sum(axis=1) > unknown)[:, None]
+            chance = np.where(trusted, seen, predicted.expected[every, action])
+            chance = chance / chance.sum(axis=1, keepdims=True)
+            following[:, factor] = (chance.cumsum(axis=1) < rng.random((len(codes), 1))).sum(axis=1)
+            known, likeliest = known * (1.0 - unknown), likeliest * chance.max(axis=1)
+        following = np.minimum(following, np.array(self.sizes) - 1)
+        outcomes, untested = self.model.outcomes.predict(codes, action, following)
+        reward, ends = outcomes @ self.model.outcomes.rewards, outcomes @ self.model.outcomes.ends
+        return following, reward, ends, 1.0 - known * (1.0 - untested), 1.0 - likeliest
+
+    def _codes(self, frames: Frame) -> Codes:
+        """Codes of frames (N, 64, 64, 3). Shape (N, P)."""
+        parts = self.encoder.encode(frames)[0].split(self.sizes, dim=1)
+        return torch.stack([part.argmax(dim=1) for part in parts], dim=1).numpy()
+
+    def _pictures(self, codes: Codes) -> NDArray[np.uint8]:
+        """Pictures of codes (..., P), each different code drawn once. Shape (rows, 64, 64)."""
+        different, which = np.unique(codes.reshape(-1, codes.shape[-1]), axis=0, return_inverse=True)
+        hot = [functional.one_hot(torch.from_numpy(v.copy()), n) for v, n in zip(different.T, self.sizes, strict=True)]
+        drawn = self.encoder.decode(torch.cat(hot, dim=1).float())
+        return (drawn * 255.0).round().astype(np.uint8)[which.ravel()]
+
+    def parameters(self) -> int:
+        """Entries of the tables of the dynamics."""
+        return sum(table.counts.size for factor in self.model.dynamics.factors for table in factor.tables)
+
+
+def make(context: AgentContext) -> StructuredModel:
+    """The model for a task; InvalidValueError if the context's encoder gives no codes."""
+    prepare_torch(context.device)
+    return StructuredModel(load_perception(context).encoder, context)

@@ -1,0 +1,303 @@
+"""A judgement: models by sizes of data by seeds, each kept in a file of its own, so that it can be taken up again."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from imagine_bench import registry
+from imagine_bench.data.collect import collect, policy_of
+from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
+from imagine_bench.entrants import file_name
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.interfaces import AgentContext, State, TaskSpec
+from imagine_bench.judge.models import asking
+from imagine_bench.judge.models.asking import Answers, Reader, ask, call
+from imagine_bench.judge.models.ends import Gallery
+from imagine_bench.judge.models.scores import by_depth, one_step_scores, ranking_scores
+from imagine_bench.judge.models.truth import Questions, shares
+from imagine_bench.machine import describe_environment
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+from imagine_bench.store.codec import write_arrays
+from imagine_bench.store.files import make_folder, read_json, read_sealed, sealed, with_null, write_json
+from imagine_bench.world_models import WorldModel
+
+SIZES = (100, 300, 1_000, 3_000, 10_000)
+SAMPLES = 8
+_FORMAT = 1
+_READ = 1_000  # frames that the reader is measured on
+_READER = "imagine_bench.agents.world_models.reader"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """What is judged. InvalidValueError: nothing to judge, or sizes, seeds or samples out of range."""
+
+    task: str
+    models: tuple[str, ...]
+    sizes: tuple[int, ...] = SIZES  #: Transitions of the same data, ascending
+    seeds: tuple[int, ...] = (0, 1, 2)
+    samples: int = SAMPLES  #: Futures imagined of each question
+    appearance: str = "clean"
+    policy: str = "random"  #: Who collects the data, as :data:`.data.collect.POLICIES`
+
+    def __post_init__(self) -> None:
+        if not self.models or not self.seeds or min(self.seeds) < 0:
+            raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
+        if not self.sizes or sorted(set(self.sizes)) != list(self.sizes) or self.sizes[0] < 1:
+            raise InvalidValueError(f"sizes is {self.sizes}; give ascending numbers of transitions, at least 1.")
+        if not 1 <= self.samples <= 1_000:
+            raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
+        for name in self.models:
+            registry.world_model_entry(name)
+
+    @property
+    def folder_name(self) -> str:
+        """Where it is kept: the same for all that can be compared."""
+        same = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
+        digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
+        return f"{file_name(self.task)}-{self.appearance}-{digest}"
+
+
+class Cell(NamedTuple):
+    """One model, fitted once."""
+
+    model: str
+    seed: int
+    transitions: int
+
+    @property
+    def file(self) -> str:
+        """The name of its file."""
+        return f"{file_name(self.model)}-seed{self.seed}-{self.transitions}.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _World:
+    """What every model is asked, and with what it is read: the same for all."""
+
+    spec: TaskSpec
+    gallery: Gallery
+    reader: Reader
+    one_step: Questions
+    rollouts: Questions
+    ranked: Questions
+
+
+def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
+    """Fit and question whatever is not kept yet.
+
+    Returns:
+        The folder with a file a cell, and what went wrong with models, a sentence each.
+    """
+    folder = make_folder(root / judgement.folder_name)
+    for seed in judgement.seeds:
+        data_of(judgement, folder, seed)
+    prepare(judgement, folder)
+    cells = [Cell(m, s, n) for m in judgement.models for s in judgement.seeds for n in judgement.sizes]
+    waiting = [cell for cell in cells if not (folder / cell.file).exists()]
+    failed: dict[str, None] = {}
+    with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:
+        for cell, why in _carried_out(judgement, folder, waiting, workers):
+            bar.set_postfix_str(f"{cell.model}, {cell.transitions:,}")
+            bar.update()
+            if why:
+                failed[why] = None
+    write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **describe_environment()})
+    return folder, list(failed)
+
+
+def _carried_out(judgement: Judgement, folder: Path, cells: Sequence[Cell], workers: int) -> Any:
+    """Each cell as it is done, and why it failed or an empty text."""
+    if workers == 1:
+        yield from ((cell, carry_out(judgement, folder, cell)) for cell in cells)
+        return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        jobs = {pool.submit(carry_out, judgement, folder, cell): cell for cell in cells}
+        for job in as_completed(jobs):
+            yield jobs[job], job.result()
+
+
+def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
+    """Fit one model, question it and keep the scores; why that failed, or an empty text."""
+    try:
+        found, pictures = judge_cell(judgement, folder, cell)
+    except ImagineBenchError as error:
+        return str(error)
+    if cell.seed == judgement.seeds[0] and cell.transitions == judgement.sizes[-1]:
+        write_arrays(folder / Path(cell.file).with_suffix(".npz"), pictures)
+    write_json(folder / cell.file, sealed(with_null(found)))
+    return ""
+
+
+def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The scores of one model, fitted once, and a few of its pictures beside the truth."""
+    world = prepare(judgement, folder)
+    entry = registry.world_model_entry(cell.model)
+    seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
+    dataset = data_of(judgement, folder, cell.seed)
+    model, price = make(entry, world, judgement.appearance, seeds)
+    episodes = dataset.episodes.first(cell.transitions)
+    begun_s = time.process_time()
+    call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
+    fit_s = time.process_time() - begun_s
+    questions = {"one_step": world.one_step, "rollouts": world.rollouts, "ranked": world.ranked}
+    answers: dict[str, Answers] = {}
+    for name, each in questions.items():
+        answers[name] = ask(
+            model, cell.model, each, samples=judgement.samples, reader=world.reader, gallery=world.gallery,
+            rng=seeds.child(name).generator(),
+        )  # fmt: skip
+    steps = sum(each.steps for each in answers.values())
+    scores = one_step_scores(world.spec, world.one_step, answers["one_step"], visited(dataset, cell.transitions))
+    found = {
+        **cell._asdict(), "data": dataset.episodes.hash, **scores,
+        **by_depth(world.rollouts, answers["rollouts"]), **ranking_scores(world.spec, world.ranked, answers["ranked"]),
+        "fit_s": fit_s, "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps,
+        "parameters": int(call(cell.model, "parameters", model.parameters)), **price,
+    }  # fmt: skip
+    return found, _pictures(model, world, scores["worst"], seeds)
+
+
+def make(
+    entry: registry.WorldModelEntry, world: _World, appearance: str, seeds: SeedTree
+) -> tuple[WorldModel, dict[str, Any]]:
+    """A new model, and what was spent on it beforehand: the encoder's name and frames."""
+    if entry.privileged:
+        return registry.load(entry.make)(world.spec, world.gallery), {"encoder": "", "encoder_frames": 0}
+    path = None if entry.encoder_kind is None else encoders.own(world.spec, appearance, entry.encoder_kind)
+    context = AgentContext(
+        n_actions=world.spec.n_actions, preprocessing=world.spec.preprocessing, encoder=path, seeds=seeds,
+        config_group=world.spec.config_group,
+    )  # fmt: skip
+    card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
+    price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
+    return registry.load(entry.make)(context), price
+
+
+def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
+    """The data of a seed, made in the kinematic execution where it is not there yet."""
+    return _data(judgement.task, judgement.policy, judgement.appearance, judgement.sizes[-1], folder, seed)
+
+
+@functools.lru_cache(maxsize=4)
+def _data(task: str, policy: str, appearance: str, transitions: int, folder: Path, seed: int) -> Dataset:
+    place = folder / f"data-seed{seed}"
+    if place.exists():
+        return read_dataset(place)
+    spec = registry.task(task)
+    episodes = -(-transitions // spec.horizon)
+    while True:
+        settings: dict[str, Any] = {"execution": "kinematic", "appearance": appearance}
+        played, apart, card = collect(spec, policy_of(policy, spec, seed), episodes=episodes, seed=seed, **settings)
+        if len(played.actions) >= transitions:
+            return write_dataset(place, played, apart, card, "npz")
+        episodes *= 2
+
+
+def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
+    """The (macrostate, action) pairs of the first so many transitions; no model is given them."""
+    macrostates = read_apart(dataset)["privileged"]["macrostates"][dataset.episodes.rows[0][:transitions]]
+    return set(zip(map(tuple, macrostates.tolist()), dataset.episodes.actions[:transitions].tolist(), strict=True))
+
+
+def prepare(judgement: Judgement, folder: Path) -> _World:
+    """Questions and reader, made once in each process."""
+    return _prepared(judgement.task, judgement.appearance, folder)
+
+
+@functools.lru_cache(maxsize=2)
+def _prepared(task: str, appearance: str, folder: Path) -> _World:
+    spec = registry.task(task)
+    gallery = Gallery(spec, appearance)
+    return _World(
+        spec=spec, gallery=gallery, reader=_reader(spec, appearance, folder),
+        one_step=asking.one_step(spec, gallery), rollouts=asking.rollouts(spec, gallery),
+        ranked=asking.ranked(spec, gallery),
+    )  # fmt: skip
+
+
+def _reader(spec: TaskSpec, appearance: str, folder: Path) -> Reader:
+    """The reader of a folder, trained and measured where there is none."""
+    path, code = folder / "reader.safetensors", registry.load(_READER)
+    if not path.exists():
+        reader = code.train_reader(spec, appearance)
+        write_json(folder / "reader.json", reader_errors(reader, spec, appearance))
+        reader.save(path)
+    return code.load_reader(spec, path)
+
+
+def reader_errors(reader: Reader, spec: TaskSpec, appearance: str) -> dict[str, float]:
+    """How often a reader is wrong on frames that it was not trained on, and what it makes of pictures of nothing.
+
+    Shares of real frames: ``misread``, taken for another macrostate, and ``refused``; the others are shares taken for a
+    picture of this world of black and gray fog, noise, and blends of two frames of different macrostates.
+    """
+    rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
+    states = np.array(states_of(spec.rules), dtype=np.int64)
+    macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
+    frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
+    differ = (macrostates != others).any(axis=1)
+    blends = ((frames[differ].astype(np.uint16) + blended[differ]) // 2).astype(np.uint8)
+    read, nothing = reader.read(frames), {
+        "black": np.zeros_like(frames[:1]), "gray": np.full_like(frames[:1], 128),
+        "noise": rng.integers(0, 256, frames.shape, dtype=np.uint8), "blends": blends,
+    }  # fmt: skip
+    refused = read[:, 0] < 0
+    return {
+        "misread": float(((read != macrostates).any(axis=1) & ~refused).mean()), "refused": float(refused.mean()),
+        **{f"{name}_read": float((reader.read(each)[:, 0] >= 0).mean()) for name, each in nothing.items()},
+    }  # fmt: skip
+
+
+def _pictures(model: WorldModel, world: _World, worst: list[int], seeds: SeedTree) -> dict[str, NDArray[Any]]:
+    """The worst transitions and one rollout, imagined once more: before, likeliest real outcome, imagined of each.
+
+    ``right`` says whether what is imagined, as read, may happen.
+    """
+    rng = seeds.child("pictures").generator()
+    found: dict[str, NDArray[Any]] = {}
+    for name, questions, rows in (("worst", world.one_step, worst), ("futures", world.rollouts, [0])):
+        imagined = model.imagine(questions.frames[rows], questions.actions[rows], 1, rng)
+        read = asking.read_pictures(imagined, world.reader, world.gallery, len(world.spec.macrostate_names))[:, 0]
+        pictures = imagined.pictures[:, 0]
+        if pictures.dtype != np.uint8:
+            pictures = (np.asarray(pictures) * 255.0).round().astype(np.uint8)
+        truth = [[shares(course) for course in questions.truth[row]] for row in rows]
+        real = [[world.gallery.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
+        right = [
+            [tuple(state) in each for state, each in zip(states, steps, strict=True)]
+            for states, steps in zip(read.tolist(), truth, strict=True)
+        ]
+        arrays: dict[str, NDArray[Any]] = {
+            "before": questions.frames[rows, -1],
+            "actions": questions.asked[rows],
+            "imagined": pictures,
+        }
+        arrays |= {"real": np.array(real), "right": np.array(right)}
+        found |= {f"{name}_{each}": array for each, array in arrays.items()}
+    return found
+
+
+def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
+    """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
+    cells = [Cell(m, s, n) for m in judgement.models for s in judgement.seeds for n in judgement.sizes]
+    return [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]

@@ -1,0 +1,262 @@
+"""What a judgement found: a table, futures beside the truth, what models know of their errors, and where those are."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from imagine_bench import registry
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.filmstrips import png, transition_sheet
+from imagine_bench.judge.models.scores import COVERAGES
+from imagine_bench.judge.models.study import Cell, Judgement, kept
+from imagine_bench.report.page import aligned, flat, write_page
+from imagine_bench.report.plots import image
+from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
+from imagine_bench.report.sections import Cell as TableCell
+from imagine_bench.statistics import difference, holm, interval, iqm
+from imagine_bench.store.codec import read_arrays
+from imagine_bench.store.files import csv_text, read_json
+
+COLUMNS = {
+    "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps", "missed": "missed outcomes",
+    "invented": "invented", "nothing": "no picture", "outcome_ece": "calibration error", "outcome_brier": "Brier",
+    "reward_error": "reward error", "end_error": "end error", "value_loss": "value loss", "regret": "regret of 1 of 5",
+    "auroc_epistemic": "AUROC, wrong", "auroc_never": "AUROC, never seen", "worth_of_refusing": "worth of refusing",
+    "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
+}  # fmt: skip
+SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "regret", "auroc_epistemic", "fit_s")
+_COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
+_WHY_DASH = "not offered by the model, or nothing to tell apart"
+Cells = Mapping[tuple[str, int], Sequence[dict[str, Any]]]
+"""Kept cells, one a seed, by model and transitions."""
+
+
+def judgement_report(folder: Path, judgement: Judgement) -> str:
+    """Write ``folder / "report"`` and return the short table and where everything lies."""
+    cells = by_model(kept(folder, judgement))
+    page = write_page(folder / "report", _page(folder, judgement, cells))
+    head = ["world model", "transitions", *(COLUMNS[name] for name in SHORT)]
+    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT)]
+    return "\n".join([*aligned([head, *rows]), "", f"Report: {page}"])
+
+
+def by_model(found: Sequence[dict[str, Any]]) -> Cells:
+    """Cells by model and transitions."""
+    grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for cell in found:
+        grouped.setdefault((cell["model"], cell["transitions"]), []).append(cell)
+    return grouped
+
+
+def scores(cells: Sequence[dict[str, Any]], name: str) -> list[float]:
+    """A score of each cell, by name; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
+    values = [cell["tv_by_depth"][int(name[3:]) - 1] if name.startswith("tv_") else cell[name] for cell in cells]
+    return [math.nan if value is None else float(value) for value in values]
+
+
+def mean_cell(values: Sequence[float]) -> TableCell:
+    """Interquartile mean over seeds with its 95 % interval; a dash where no seed has a number."""
+    there = [value for value in values if not math.isnan(value)]
+    if not there:
+        return TableCell(text=DASH)
+    low, high = interval(there)
+    shown = "" if math.isnan(low) or low == high else f"[{number(low)}, {number(high)}]"
+    return TableCell(text=number(iqm(there)), interval=shown)
+
+
+def _title(model: str) -> str:
+    return registry.world_model_entry(model).title
+
+
+def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list[Any]]:
+    return [
+        [_title(model), f"{size:,}", *(mean_cell(scores(cells[model, size], name)) for name in names)]
+        for model, size in itertools.product(judgement.models, judgement.sizes)
+        if (model, size) in cells
+    ]
+
+
+def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
+    spec = registry.task(judgement.task)
+    made = read_json(folder / "judgement.json", "a judgement")
+    errors = read_json(folder / "reader.json", "a reader's errors")
+    largest = [model for model in judgement.models if (model, judgement.sizes[-1]) in cells]
+    table = Table(
+        name="judgement", header=["world model", "transitions", *COLUMNS.values()], why_dash=_WHY_DASH,
+        rows=_rows(judgement, cells, tuple(COLUMNS)),
+        caption=f"Interquartile means over {len(judgement.seeds)} seeds of data and model, with 95 % intervals. 0 is "
+        "best in every error; value loss, regret and worth are in units of reward.",
+    )  # fmt: skip
+    words = [
+        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
+        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
+        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
+        "fog as something."
+    ]
+    sections = [
+        Section(title="Every score", words=words, tables=[table], images=_futures(folder, judgement, largest)),
+        Section(title="Does it know?", images=[_risk_image(judgement, cells, largest)]),
+        Section(title="By depth", images=[_depth_image(judgement, cells, largest)]),
+        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
+        _where_section(spec, judgement, cells, largest, folder),
+    ]
+    return Page(
+        title=f"{spec.title}: world models against the exact truth",
+        subtitle=f"Data: {judgement.policy} policy, kinematic · appearance “{judgement.appearance}” · "
+        f"{judgement.samples} futures a question",
+        question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
+        answers=_answers(judgement, cells, largest), sections=sections,
+        facts=flat("", made), settings={}, protocol=flat("", dataclasses.asdict(judgement)), recordings=[],
+        files={"scores.csv": _csv(cells)},
+    )  # fmt: skip
+
+
+def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[str]:
+    """The best model that is given no rules, at the largest size."""
+    last = judgement.sizes[-1]
+    learned = [model for model in models if not registry.world_model_entry(model).privileged]
+    if not learned:
+        return []
+    found = []
+    for name, words in (("total_variation", "total variation"), ("value_loss", "value loss")):
+        scored = {
+            model: iqm(values) for model in learned if not np.isnan(values := scores(cells[model, last], name)).any()
+        }
+        if scored:
+            best = min(scored, key=lambda model: scored[model])
+            found.append(f"After {last:,} transitions {_title(best)} has the smallest {words}: {number(scored[best])}.")
+    return found
+
+
+def _csv(cells: Cells) -> str:
+    names = ["model", "transitions", "seed", *COLUMNS]
+    rows = [
+        [model, size, cell["seed"], *(f"{scores([cell], name)[0]:.6g}" for name in COLUMNS)]
+        for (model, size), each in cells.items()
+        for cell in each
+    ]
+    return csv_text([names, *rows])
+
+
+def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Table:
+    """Each pair's difference in total variation at the largest size."""
+    last = judgement.sizes[-1]
+    pairs = list(itertools.combinations(models, 2))
+    found = [difference(*(scores(cells[model, last], "total_variation") for model in pair)) for pair in pairs]
+    adjusted = holm([one.p for one in found])
+    rows: list[list[str | TableCell]] = [
+        [_title(a), _title(b), TableCell(text=number(one.value), interval=f"[{number(one.low)}, {number(one.high)}]"),
+         number(p)]
+        for (a, b), one, p in zip(pairs, found, adjusted, strict=True)
+    ]  # fmt: skip
+    return Table(
+        name="differences", header=["model", "against", "difference of total variation", "p"], rows=rows,
+        caption=f"After {last:,} transitions; Yuen's test over seeds, p by Holm.", why_dash="one seed says nothing",
+        folded="Every pair",
+    )  # fmt: skip
+
+
+def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> Figure:
+    figure = Figure(figsize=(9.2, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for (model, values), color in zip(series.items(), itertools.cycle(_COLORS)):
+        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
+    axes.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.03, 1.05))
+    axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def _risk_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
+    last = judgement.sizes[-1]
+    curves = {model: [cell["risk"] for cell in cells[model, last] if cell["risk"]] for model in models}
+    series = {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+    shares = [100.0 * share for share in COVERAGES]
+    return image(
+        "risk_coverage",
+        lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
+        alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
+        caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
+        f"uncertainty are not here. After {last:,} transitions, mean over seeds.",
+    )  # fmt: skip
+
+
+def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
+    last = judgement.sizes[-1]
+    series = {model: np.mean([cell["tv_by_depth"] for cell in cells[model, last]], axis=0).tolist() for model in models}
+    steps = range(1, 1 + len(next(iter(series.values()), [])))
+    return image(
+        "depth", lambda: _lines(list(steps), series, "imagined macro-actions", "total variation"), svg=True,
+        alt="Total variation to the exact distribution by imagined depth",
+        caption=f"Total variation to the exact distribution by depth, after {last:,} transitions.",
+    )  # fmt: skip
+
+
+def _arrays(folder: Path, judgement: Judgement, model: str) -> dict[str, Any] | None:
+    path = folder / Path(Cell(model, judgement.seeds[0], judgement.sizes[-1]).file).with_suffix(".npz")
+    return dict(read_arrays(path)) if path.exists() else None
+
+
+def _futures(folder: Path, judgement: Judgement, models: Sequence[str]) -> list[Image]:
+    """One rollout, real and as each model imagines it."""
+    names = registry.task(judgement.task).action_names
+    found = {model: arrays for model in models if (arrays := _arrays(folder, judgement, model)) is not None}
+    if not found:
+        return []
+    one = next(iter(found.values()))
+    titles = ["start", *(f"{step}. {names[action]}" for step, action in enumerate(one["futures_actions"][0], start=1))]
+    start = one["futures_before"][0]
+    rows: list[tuple[str, Any, Any]] = [("real", [start, *one["futures_real"][0]], None)]
+    for model, arrays in found.items():
+        rows.append((_title(model), [start, *map(_rgb, arrays["futures_imagined"][0])],
+                     [True, *arrays["futures_right"][0].tolist()]))  # fmt: skip
+    return [
+        Image.of(
+            png(transition_sheet(titles, rows)),
+            name="futures",
+            alt="One future, real and imagined by every model",
+            caption="One real start and the same macro-actions, real and as each model imagines them.",
+        )
+    ]
+
+
+def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], folder: Path) -> Section:
+    """Total variation by what may make it hard, and the worst ten transitions of each model."""
+    last = judgement.sizes[-1]
+    groups: dict[tuple[str, str], dict[str, TableCell]] = {}
+    for model in models:
+        wheres = [cell["where"] for cell in cells[model, last]]
+        for kind, name in {(kind, name): None for where in wheres for kind, each in where.items() for name in each}:
+            values = [where[kind][name] for where in wheres if name in where[kind]]
+            groups.setdefault((kind, name), {})[model] = mean_cell(values)
+    rows: list[list[str | TableCell]] = [
+        [kind, name, *(found.get(model, DASH) for model in models)] for (kind, name), found in groups.items()
+    ]
+    table = Table(
+        name="where", header=["by", "which", *map(_title, models)], rows=rows, why_dash="no such transition",
+        caption=f"Total variation of one step after {last:,} transitions; of a coordinate, that of it alone.",
+    )  # fmt: skip
+    images = []
+    for model in models:
+        arrays = _arrays(folder, judgement, model)
+        if arrays is not None and not arrays["worst_right"].all():
+            titles = [spec.action_names[action] for action in arrays["worst_actions"][:, 0]]
+            strips: list[tuple[str, Any, Any]] = [
+                ("before", list(arrays["worst_before"]), None), ("real", list(arrays["worst_real"][:, 0]), None),
+                ("imagined", list(map(_rgb, arrays["worst_imagined"][:, 0])), arrays["worst_right"][:, 0].tolist()),
+            ]  # fmt: skip
+            name = f"worst_{model}"
+            images.append(Image.of(png(transition_sheet(titles, strips)), name=name, alt=f"Worst of {_title(model)}",
+                                   caption=f"The ten worst transitions of {_title(model)}."))  # fmt: skip
+    return Section(title="Where it fails", tables=[table], images=images)
+
+
+def _rgb(picture: Any) -> Any:
+    return picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)

@@ -1,0 +1,82 @@
+"""The dials of a task, and what says a world in one line: ``pick_place:slip=0.1``."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
+
+GESTURES = ("always", "first")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dials:
+    """A world by its dials; ``str`` gives its canonical name, which says what differs from the defaults.
+
+    Raises:
+        InvalidValueError: A value of the wrong type or out of its range in ``RANGES``.
+    """
+
+    slip: float = 0.0  #: probability, up to 0.99, that a macro-action leaves all as it is
+    fickle: float = 0.0  #: probability that the human wants something else after a macro-action that ends nothing
+    gesture: str | float = "always"  #: which frames show it: all, only the ``"first"``, or each with a probability
+    lag: int = 0  #: macro-actions that a frame is old, 0 to 10
+    distractors: int = 0  #: things in view that move and are of no consequence, 0 to 4
+
+    FAMILY: ClassVar[str]
+    RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "slip": (0.0, 0.99), "fickle": (0.0, 1.0), "gesture": (0.0, 1.0), "lag": (0, 10), "distractors": (0, 4),
+    }  # fmt: skip
+    """Lowest and highest value of each number; integers where these are."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.RANGES.items():
+            if getattr(self, name) is not getattr(type(self), name) and not (name == "gesture" and self._named_gesture):
+                object.__setattr__(self, name, self._in_range(name, low, high))
+
+    @property
+    def _named_gesture(self) -> bool:
+        return isinstance(self.gesture, str) and self.gesture in GESTURES
+
+    def _in_range(self, name: str, low: float, high: float) -> float:
+        value, kind = getattr(self, name), type(low)
+        right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
+        if not right or not low <= value <= high:
+            words = f"{'an integer' if kind is int else 'a number'} from {low:g} to {high:g}"
+            also = f", or {' or '.join(GESTURES)}" if name == "gesture" else ""
+            raise InvalidValueError(f"{name} is {brief(value)}; give {words}{also}.")
+        return kind(value)
+
+    def _usual(self, name: str) -> Any:
+        """The value that the canonical name leaves out."""
+        return getattr(type(self), name)
+
+    def __str__(self) -> str:
+        own_first = sorted((each.name for each in fields(self)), key=lambda name: name in Dials.__annotations__)
+        said = [f"{name}={value}" for name in own_first if (value := getattr(self, name)) != self._usual(name)]
+        return f"{self.FAMILY}:{','.join(said)}" if said else self.FAMILY
+
+    @property
+    def hash(self) -> str:
+        """Eight hexadecimal digits of the canonical name."""
+        return hashlib.sha256(str(self).encode()).hexdigest()[:8]
+
+    @classmethod
+    def taken_from(cls, options: dict[str, Any], others: Iterable[str]) -> Self:
+        """The world that keyword arguments say, taken out of them. Raises UnknownNameError: one not of the others."""
+        names = [each.name for each in fields(cls)]
+        for name in options:
+            if name not in (*names, *others):
+                raise UnknownNameError("keyword argument", name, (*names, *others))
+        world = cls(**{name: options.pop(name) for name in names if name in options})
+        world.require_shown()
+        return world
+
+    def require_shown(self) -> None:
+        """Raise InvalidValueError for a dial that environments do not carry out."""
+        for name in ("gesture", "lag", "distractors"):
+            if (value := getattr(self, name)) != getattr(Dials, name):
+                raise InvalidValueError(f"No environment shows {name}={value} yet; leave it out.")

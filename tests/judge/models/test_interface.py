@@ -1,0 +1,85 @@
+"""What a model hands in is checked, and what is wrong with it is one sentence that names model and method."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imagine_bench.data.episodes import Episodes, joined
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.world_models import Imagined, require_imagined, weights_of
+
+SHAPE = (3, 4, 2)
+GOOD = Imagined(
+    pictures=np.zeros((*SHAPE, 64, 64, 3), dtype=np.uint8), probabilities=np.full(SHAPE, 0.25), rewards=np.zeros(SHAPE),
+    p_ended=np.zeros(SHAPE), epistemic=np.zeros((3, 2)),
+)  # fmt: skip
+
+
+def check(**changes: Any) -> Imagined:
+    return require_imagined(dataclasses.replace(GOOD, **changes), name="theirs", rows=3, depth=2, samples=4)
+
+
+def test_what_is_right_is_taken_as_it_is() -> None:
+    assert check() is not None
+    assert np.array_equal(weights_of(check(probabilities=None)), np.full(SHAPE, 0.25))
+    assert check(pictures=np.ones((*SHAPE, 20, 30), dtype=np.float32)).pictures.shape[3:] == (20, 30)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"pictures": GOOD.pictures[:2]}, "gave pictures of shape (2, 4, 2, 64, 64, 3); give (3, 4, 2, H, W)"),
+        ({"pictures": GOOD.pictures[:, :3], "probabilities": None, "rewards": None, "p_ended": None}, "of shape (3, 3"),
+        ({"pictures": np.zeros((*SHAPE, 64, 64, 3))[..., :2]}, "gave pictures of shape"),
+        ({"pictures": np.full((*SHAPE, 8, 8), 2.0)}, "give uint8, or floats from 0 to 1"),
+        ({"pictures": "a picture"}, "gave pictures of str"),
+        ({"rewards": np.full(SHAPE, np.nan)}, "gave rewards with NaN"),
+        ({"rewards": np.zeros((3, 2))}, "gave rewards of shape (3, 2); give (3, 4, 2)"),
+        ({"probabilities": np.full(SHAPE, 0.2)}, "sum to 0.8 over S; they must sum to 1"),
+        ({"probabilities": np.full(SHAPE, -0.25)}, "probabilities outside of [0, 1]"),
+        ({"p_ended": np.full(SHAPE, 1.5)}, "p_ended outside of [0, 1]"),
+        ({"epistemic": np.zeros(3)}, "gave epistemic of shape (3,); give (3, 2)"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidValueError) as found:
+        check(**changes)
+    assert str(found.value).startswith("World model theirs: imagine() gave") and words in str(found.value)
+
+
+def test_something_else_is_refused() -> None:
+    with pytest.raises(InvalidValueError, match="theirs: imagine\\(\\) gave ndarray; give an Imagined"):
+        require_imagined(np.zeros(3), name="theirs", rows=3, depth=2, samples=4)
+
+
+def episodes(*lengths: int) -> Episodes:
+    parts = []
+    for index, length in enumerate(lengths):
+        ends = [False] * (length - 1) + [True]
+        frames = np.full((length + 1, 64, 64, 3), index, dtype=np.uint8)
+        frames[:, 0, 0, 0] = range(length + 1)
+        parts.append({
+            "frames": frames, "action_masks": np.ones((length + 1, 2), dtype=np.int8), "actions": [0] * length,
+            "rewards": [float(index)] * length, "terminated": ends, "truncated": [False] * length, "success": True,
+        })  # fmt: skip
+    return joined(parts)
+
+
+def test_the_first_transitions_are_the_same_ones() -> None:
+    whole = episodes(2, 3, 4)
+    for count in range(1, 10):
+        part = whole.first(count)
+        assert len(part.actions) == count and np.array_equal(part.rewards, whole.rewards[:count])
+        before, every = part.rows[0], whole.rows[0][:count]
+        assert np.array_equal(part.frames[before], whole.frames[every])
+        assert np.array_equal(part.frames[before + 1], whole.frames[every + 1])
+        assert np.array_equal(part.terminated, whole.terminated[:count])
+    assert whole.first(9).hash == whole.hash
+    assert whole.first(4).truncated.tolist() == [False, False, False, True]
+    assert whole.first(4).success.tolist() == [True, False]
+    with pytest.raises(InvalidValueError, match="10 transitions of 9"):
+        whole.first(10)
