@@ -43,7 +43,7 @@ def _windows(cubes: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
 
 @cache
 def _stretch(pixels: int) -> NDArray[np.float32]:
-    """Linear interpolation that makes columns a third wider: cubes as large as in strips. Shape (pixels, 4/3 pixels)."""
+    """Linear interpolation that makes cubes as large as in strips. Shape (pixels, 4/3 pixels)."""
     at = (np.arange(pixels * 4 // 3) + 0.5) * 0.75 - 0.5
     return np.stack([np.interp(at, np.arange(pixels), row) for row in np.eye(pixels)]).astype(np.float32)
 
@@ -86,9 +86,7 @@ def small_rgb(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 PREPROCESSING: dict[str, Preprocess] = {"whole_rgb": whole_rgb, "small_rgb": small_rgb}
-PREPROCESSING |= {
-    gray_name(cubes): partial(gray_cells, cubes=cubes) for cubes in range(1, 7)
-}
+PREPROCESSING |= {gray_name(cubes): partial(gray_cells, cubes=cubes) for cubes in range(1, 7)}
 
 
 def preprocess(name: str) -> Preprocess:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imagine_bench.errors import UnknownNameError
-from imagine_bench.preprocessing import gray_cells, join_cells, preprocess, small_rgb, whole_rgb
+from imagine_bench.preprocessing import gray_cells, gray_name, join_cells, preprocess, small_rgb, whole_rgb
 
 
 def test_strips_hold_the_columns_of_their_cube():
@@ -20,6 +20,16 @@ def test_joined_strips_are_the_gray_frame():
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     gray = frames @ np.array([0.299, 0.587, 0.114]) / 255
     np.testing.assert_allclose(join_cells(gray_cells(frames)), gray, atol=1e-6)
+
+
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_joined_cells_are_cut_into_the_same_cells(cubes):
+    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    cells = preprocess(gray_name(cubes))(frames)
+    assert cells.shape[:2] == (2, cubes) and cells.dtype == np.float32
+    assert cells.min() >= 0.0 and cells.max() <= 1.0
+    joined = np.rint(255 * join_cells(cells)).astype(np.uint8)
+    np.testing.assert_allclose(preprocess(gray_name(cubes))(joined[..., None].repeat(3, axis=-1)), cells, atol=0.5 / 255)
 
 
 def test_whole_rgb_moves_channels_first():
