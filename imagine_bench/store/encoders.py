@@ -106,7 +106,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 
 
 def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
-    """The task's own encoder of a kind; that of another package's task, or of looks none is bundled for, is trained once.
+    """The task's own encoder of a kind; one of looks that none is bundled for is trained once.
 
     Raises as :func:`resolve`, and BusyError: another process trains it.
     """
