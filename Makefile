@@ -14,6 +14,7 @@ takes_generalise := TASK ENCODER ARGS
 takes_policy := TASK ENCODER ARGS
 takes_judge := TASK MODELS SEEDS APPEARANCE WORKERS ARGS
 takes_verify := TASK ARGS
+takes_why := TASK ENCODER ARGS
 takes_view := TASK ARGS
 takes_report := TASK ARGS
 takes_data := ARGS
@@ -42,7 +43,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan generalise policy verify judge study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan generalise policy judge verify why study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -74,6 +75,9 @@ judge: ready  ## Judge world models against the exact truth of TASK; MODELS may 
 
 verify: ready  ## Play every test episode of the newest bench again and say whether its tables follow from them
 	@$(BIN)/imagine-bench verify $(options)
+
+why: ready  ## Give every failed test episode of the newest bench the one cause that it has
+	@$(BIN)/imagine-bench why $(options)
 
 study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench study $(options)

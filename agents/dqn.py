@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from . import snapshot
@@ -121,6 +121,11 @@ class DQN:
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Values of every macro-action at the mean latents. Shape (A,)."""
         return self._values(self.tested, observation)
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        encoder = self.perception.encoder
+        return encoder.read_macrostate(encoder.encode(frames)[0])
 
     def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
         mu, _ = self.perception.posterior(observation.frame)

@@ -139,6 +139,31 @@ class ReplayReader(Protocol):
         """Macrostates (N, M), as a probe reads them, and actions (N,) of the real transitions that it remembers."""
 
 
+@runtime_checkable
+class FrameReader(Protocol):
+    """An agent that can say what it takes a frame for."""
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        """Macrostates (N, M), as a probe reads them from how frames (N, 64, 64, 3) are encoded; it changes nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedOutcomes:
+    """What a model expects of every macro-action in N frames; what is missing to probability 1 ends the episode."""
+
+    macrostates: NDArray[np.int64]  #: what may follow, B branches, as a probe reads it. Shape (N, A, B, M).
+    p_continues: NDArray[np.float64]  #: probability that this follows and the episode goes on. Shape (N, A, B).
+    reward: NDArray[np.float64]  #: expected reward. Shape (N, A).
+
+
+@runtime_checkable
+class OutcomePredictor(Protocol):
+    """An agent whose model can be asked for all of one step; nothing changes in the agent."""
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """What its model expects from frames (N, 64, 64, 3); ``rng`` draws components, noise, dropout masks."""
+
+
 def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: int) -> list[int] | None:
     """What an :class:`Imaginer` is to imagine: the first ``depth`` of the actions, or None for its own choice.
 

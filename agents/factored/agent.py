@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ImaginedRollout, Label, planned_actions
+from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
@@ -156,6 +156,24 @@ class FactoredAgent:
         following, p_likeliest = self.model.sample(code, chosen, rng)
         reward, p_terminated, unknown = (float(each[chosen]) for each in self.planner.outcome(code))
         return ImaginedStep(chosen, following, reward, p_terminated, values, unknown, 1.0 - p_likeliest)
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        return self.perception.macrostates(self.perception.codes(frames))
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """What its planner plans with; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        codes = self.perception.codes(frames)
+        if not self._ready:
+            nothing = np.zeros((len(codes), self.n_actions))
+            where = np.repeat(self.perception.macrostates(codes)[:, None, None], self.n_actions, axis=1)
+            return ExpectedOutcomes(macrostates=where, p_continues=nothing[..., None], reward=nothing)
+        found = self.model.successors(np.array(codes, dtype=np.int64))
+        branches = found.following.reshape(-1, found.following.shape[-1]).tolist()
+        read = self.perception.macrostates([tuple(code) for code in branches])
+        return ExpectedOutcomes(
+            macrostates=read.reshape(*found.p_continues.shape, -1), p_continues=found.p_continues, reward=found.reward
+        )
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """What it did, labels of an oracle not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""

@@ -50,11 +50,14 @@ class CodePerception:
         """The code of a frame (64, 64, 3); the last one is kept, because often it is asked for twice."""
         key = frame.tobytes()
         if self._last is None or self._last[0] != key:
-            hot = self._encoder.encode(frame[None])[0][0]  # [sum of the sizes]
-            code = tuple(int(values.argmax()) for values in hot.split(self._encoded))
-            whole = code if self._factored else (int(np.ravel_multi_index(code, self._encoded)),)
-            self._last = (key, whole)
+            self._last = (key, self.codes(frame[None])[0])
         return self._last[1]
+
+    def codes(self, frames: Frame) -> list[Code]:
+        """The codes of frames (N, 64, 64, 3)."""
+        hot = self._encoder.encode(frames)[0]  # [N, sum of the sizes]
+        rows = torch.stack([values.argmax(dim=1) for values in hot.split(self._encoded, dim=1)], dim=1).tolist()
+        return [tuple(row) if self._factored else (int(np.ravel_multi_index(row, self._encoded)),) for row in rows]
 
     def _latents(self, codes: Sequence[Code]) -> torch.Tensor:
         """N codes as the encoder decodes them: one-hot. Shape (N, sum of the encoder's sizes)."""

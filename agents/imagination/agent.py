@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.capabilities import Follow, ImaginedRollout, SampledFutures, planned_actions
+from imagine_bench.capabilities import ExpectedOutcomes, Follow, ImaginedRollout, SampledFutures, planned_actions
 from imagine_bench.interfaces import AgentContext, AgentState, Frame
 from imagine_bench.seeding import SeedTree
 
@@ -23,11 +23,12 @@ from ..meters import Meters
 from ..networks.precision import settle
 from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
-from .futures import sample_futures
+from .futures import predict, sample_futures
 from .rollouts import TERMINAL, Imagination, Imagined
 from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
 
+_BRANCHES = 8  # samples that stand for what the model expects of a step
 _Kind = TypeVar("_Kind", bound="ImaginingAgent")
 
 
@@ -144,6 +145,20 @@ class ImaginingAgent(DQN):
         weights, action = self.imagination.draw_weights(generator), torch.as_tensor(actions, device=z.device)
         likeliest = self.imagination.likeliest(z, action, weights, generator)
         return self.perception.encoder.read_macrostate(likeliest)
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """As many samples as :data:`_BRANCHES`; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        z, shape = self.perception.encoder.encode(frames)[0], (len(frames), self.n_actions, _BRANCHES)
+        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
+        action = np.tile(np.repeat(np.arange(self.n_actions), _BRANCHES), len(frames))
+        z, weights = z.repeat_interleave(self.n_actions * _BRANCHES, dim=0), self.imagination.draw_weights(generator)
+        next_z, reward, p_terminated = predict(self.imagination, z, action, weights, generator)
+        read = self.perception.encoder.read_macrostate(next_z)
+        return ExpectedOutcomes(
+            macrostates=read.reshape(*shape, -1),
+            p_continues=(p_terminated <= TERMINAL).double().cpu().numpy().reshape(shape) / _BRANCHES,
+            reward=reward.double().cpu().numpy().reshape(shape).mean(axis=2),
+        )
 
     def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """What the real memory holds; see :class:`imagine_bench.capabilities.ReplayReader`."""

@@ -36,7 +36,7 @@ def sample_futures(
         alive = np.flatnonzero(~ended & (action >= 0))
         if alive.size:
             rows = torch.from_numpy(alive).to(z.device)
-            next_z, reward, p_terminated = _predict(imagination, z[rows], action[alive], weights, generator)
+            next_z, reward, p_terminated = predict(imagination, z[rows], action[alive], weights, generator)
             z[rows] = next_z
             macrostates[alive] = encoder.read_macrostate(next_z)
             rewards[alive], ended[alive] = reward.cpu().numpy(), (p_terminated > TERMINAL).cpu().numpy()
@@ -52,7 +52,7 @@ def sample_futures(
     )
 
 
-def _predict(
+def predict(
     imagination: Imagination, z: Tensor, action: NDArray[np.int64], weights: Weights, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentContext, AgentState, Floats, Observation, Transition
+from imagine_bench.capabilities import ExpectedOutcomes
+from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from ..factored.perception import CodePerception
@@ -33,7 +35,7 @@ class CountTableAgent(TabularAgent):
         directed: bool,
     ) -> None:  # fmt: skip
         super().__init__(read_codes(perception), n_actions, settings, seeds)
-        self.code_sizes, self.directed = perception.sizes, directed
+        self.perception, self.code_sizes, self.directed = perception, perception.sizes, directed
         self._plans: dict[bool, dict[int, Floats]] = {}
 
     def values(self, observation: Observation, *, explore: bool) -> Floats:
@@ -44,6 +46,27 @@ class CountTableAgent(TabularAgent):
             with self.meters.cpu_time("time/model_s"):
                 self._plans[optimistic] = self.table.action_values(discount, untried)
         return self._plans[optimistic].get(self.read(observation), np.full(self.n_actions, untried))
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        return self.perception.macrostates(self.perception.codes(frames))
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """What the table holds; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        here = [code for (code,) in self.perception.codes(frames)]
+        pairs = [self.table.expected(state, action) for state in here for action in range(self.n_actions)]
+        most = max(1, *(len(branches) for branches, _ in pairs))
+        following = np.repeat(np.repeat(here, self.n_actions)[:, None], most, axis=1)  # filled up with no change
+        p_continues = np.zeros(following.shape)
+        for row, (branches, _) in enumerate(pairs):
+            for column, (state, share) in enumerate(branches):
+                following[row, column], p_continues[row, column] = state, share
+        read, shape = self.perception.macrostates([(code,) for code in following.ravel().tolist()]), (len(here), -1)
+        return ExpectedOutcomes(
+            macrostates=read.reshape(*shape, most, read.shape[1]),
+            p_continues=p_continues.reshape(*shape, most),
+            reward=np.array([reward for _, reward in pairs]).reshape(shape),
+        )
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Count the transition; if the table then predicts otherwise, plan anew when next asked."""

@@ -59,6 +59,13 @@ class CountTable:
             counts = np.array([self._rows[row] for row in rows]) if len(rows) > 1 else np.ones(1)
             yield rows[rng.choice(len(rows), p=counts / counts.sum()) if len(rows) > 1 else 0]
 
+    def expected(self, state: int, action: int) -> tuple[list[tuple[int, float]], float]:
+        """States that follow a pair and how probably the episode goes on there; and the expected reward."""
+        rows = self._branches.get((state, action), [])
+        total = sum(self._rows[row] for row in rows)
+        shares = [(row, self._rows[row] / total) for row in rows]
+        return [(row[2], share) for row, share in shares if not row[4]], sum(row[3] * share for row, share in shares)
+
     def action_values(self, discount: float, untried: float) -> dict[int, Floats]:
         """Optimal values (A,) of each known state in the model of the counts; an untried pair is worth ``untried``.
 

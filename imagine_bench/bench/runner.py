@@ -20,7 +20,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder
-from imagine_bench.store.results import Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
+from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
 
 
 class AtBudget(TypedDict, total=False):
@@ -28,6 +28,7 @@ class AtBudget(TypedDict, total=False):
 
     open_loop: OpenLoop
     futures: Futures
+    beliefs: Beliefs
 
 
 class AtEnd(TypedDict, total=False):
@@ -117,4 +118,5 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
         diagnostics=test.diagnostics,
         open_loop=measured.get("open_loop"),
         futures=measured.get("futures"),
+        beliefs=measured.get("beliefs"),
     )

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from imagine_bench import __version__
-from imagine_bench.cli.analysis import Generalise, Judge, Plan, Policy, Verify
+from imagine_bench.cli.analysis import Generalise, Judge, Plan, Policy, Verify, Why
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
@@ -33,6 +33,7 @@ Command = (
     | Policy
     | Judge
     | Verify
+    | Why
     | Study
     | Dataset
     | View

@@ -164,3 +164,14 @@ class Policy(_OfBench):
         from imagine_bench.report.policy import policy_report  # noqa: PLC0415 - as above
 
         print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Why(_OfBench):
+    """Give every failed test episode of a bench the one cause that it has; its report then shows them."""
+
+    def __call__(self) -> None:
+        """Play, swap truth in, report."""
+        from imagine_bench.audit.why import why_report  # noqa: PLC0415 - as above
+
+        print(why_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))

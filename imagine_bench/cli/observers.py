@@ -5,6 +5,8 @@ from __future__ import annotations
 from imagine_bench.bench.run_state import Run
 from imagine_bench.bench.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.capabilities import FutureSampler, Imaginer
+from imagine_bench.interfaces import Frame
+from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
 from imagine_bench.judge.futures import imagined_futures
 from imagine_bench.judge.imagination_quality import (
     OPEN_LOOP_DEPTH,
@@ -14,6 +16,7 @@ from imagine_bench.judge.imagination_quality import (
     open_loop,
     open_loop_starts,
 )
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
 
@@ -60,6 +63,24 @@ class FuturesObserver(RunObserver):
             purpose=evaluation_split(run.spec.seed),
         )
         return {"futures": found}
+
+
+class BeliefsObserver(RunObserver):
+    """Asks a learner about every macrostate at every budget, so that 'imagine-bench why' can say why it failed."""
+
+    def __init__(self) -> None:
+        self._frames: Frame | None = None
+
+    def at_budget(self, run: Run, budget: int) -> AtBudget:
+        """``beliefs`` of an agent that learns, in a task of not too many macrostates."""
+        task, entry = run.task, run.entry
+        if not entry.learns or len(states_of(task.rules)) > MOST_STATES:
+            return {}
+        if self._frames is None:  # the same at every budget
+            appearance, purpose = run.protocol.appearance_in_tests, evaluation_split(run.spec.seed)
+            self._frames = frames_to_ask_with(run.agent, task, appearance=appearance, purpose=purpose)
+        rng = SeedTree(run.spec.seed).child("beliefs", budget).generator()
+        return {"beliefs": beliefs(run.agent, task.rules, self._frames, rng, privileged=entry.privileged)}
 
 
 class ExamplesObserver(RunObserver):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 from zlib import crc32
@@ -14,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from imagine_bench.judge.causes import CAUSES
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.sections import Image
@@ -29,6 +31,9 @@ _COLORS = (
     "#4d9221", "#5b5ea6", "#c51b7d", "#5ab4ac", "#b35806", "#542788",
 )  # fmt: skip
 Value = TypeVar("Value")
+Failures = dict[str, dict[int, tuple[int, Counter[str]]]]
+"""By agent and budget: tests of all seeds, and failures by cause."""
+_CAUSE_COLORS = ("#0072b2", "#56b4e9", "#e69f00", "#cc79a7", "#882255", "#8c8c8c", "#2b2b2f")
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imagine_bench",
@@ -127,6 +132,32 @@ def gain_figure(data: ReportData) -> Figure:
     axes.plot([], [], color=_INK, label="thesis", **_THESIS_LINE)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=2, fontsize=9)
     _end_labels(axes, last, _episodes_axis(axes, data))
+    return figure
+
+
+def causes_figure(found: Failures) -> Figure:
+    """Failed test episodes (%) by cause, stacked, at every budget, a panel an agent."""
+    columns = min(3, len(found))
+    lines = -(-len(found) // columns)
+    figure = Figure(figsize=(1.2 + 2.9 * columns, 0.9 + 2.5 * lines), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(lines, columns, sharey=True, squeeze=False)).ravel()
+    shown = [name for name in CAUSES if any(counts[name] for rows in found.values() for _, counts in rows.values())]
+    for axes, (agent, by_budget) in zip(panels, found.items(), strict=False):
+        bottom, places = np.zeros(len(by_budget)), np.arange(len(by_budget))
+        for name in shown:
+            shares = np.array([100.0 * counts[name] / tests for tests, counts in by_budget.values()])
+            axes.bar(places, shares, 0.8, bottom=bottom, color=_CAUSE_COLORS[list(CAUSES).index(name)], label=name)
+            bottom += shares
+        axes.set_title(agent_words(agent).title, fontsize=9.5)
+        axes.set_xticks(places, [f"{budget:,}" for budget in by_budget], rotation=45, ha="right")
+        axes.grid(visible=False, axis="x")
+        axes.set_ylim(0, 100)
+    for axes in panels[len(found) :]:
+        axes.set_visible(False)
+    figure.supxlabel("real training episodes", fontsize=10.5)
+    figure.supylabel("test episodes that failed (%)", fontsize=10.5)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return figure
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.files import first_difference
@@ -75,6 +75,17 @@ class ComparedRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Beliefs:
+    """What an agent does, and what its model expects, in every macrostate of its task, S of them, in a frame of each.
+
+    They are in the order of :func:`imagine_bench.rules.states_of`.
+    """
+
+    action: NDArray[np.int16]  #: Macro-action without exploring; 0 in terminal macrostates. Shape (S,).
+    model: ExpectedOutcomes | None  #: None for an agent without a model that can be asked
+
+
+@dataclass(frozen=True, kw_only=True)
 class KeptEpisodes:
     """K test episodes as they were played, N macro-actions in all, so that anyone can play them again."""
 
@@ -113,6 +124,9 @@ class Checkpoint:
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
     futures: Futures | None = None  #: Sampled futures against the rules, for agents that can be asked for many
+    #: What the agent does and expects everywhere, for the causes of its failures; None for agents that do not learn,
+    #: for tasks of too many macrostates, and in results of before 2026-11-24.
+    beliefs: Beliefs | None = field(default=None, compare=False)
     #: The test episodes themselves. None in results of before 2026-11-24.
     kept: KeptEpisodes | None = field(default=None, compare=False)
 

@@ -1,0 +1,125 @@
+"""Why the agents of a bench failed: every failed test episode, at every budget, with the one cause that it has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench.bench.evaluation import Env
+from imagine_bench.bench.run_state import make_env
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import Agent
+from imagine_bench.judge.causes import Attribution, Course, misread
+from imagine_bench.report.analysis import Analysis, Measured, analyse, chosen, markdown
+from imagine_bench.report.page import write_report
+from imagine_bench.report.sections.causes import HEAD, causes_table, failures
+from imagine_bench.seeding import episode_seed, evaluation_split
+from imagine_bench.store import run_folder
+from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.results import KeptEpisodes
+from imagine_bench.store.trained import Trained
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tested:
+    """The causes of one test's failures."""
+
+    episodes: int  # real training episodes before
+    tests: int
+    causes: Mapping[int, str]  # by number of the test
+
+
+def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+    """Find the causes for every learner of a bench, and write its report anew: see :func:`.analysis.analyse`."""
+    bench = chosen(folder, root, task)
+    said = analyse(WhyAnalysis, bench, root=root, task=None, encoder=encoder)
+    write_report(load_so_far(bench))
+    return said
+
+
+class WhyAnalysis(Analysis[tuple[Tested, ...]]):
+    """The causes of every failure."""
+
+    name = "why"
+    heading = "why agents failed"
+    rows_file = "causes.csv"
+
+    def measure(self, trained: Trained) -> tuple[Tested, ...]:
+        """Play its failed test episodes again and find their causes.
+
+        Raises:
+            ArtefactError: An unfinished run, or one that keeps no test episodes.
+            InvalidValueError: What it experienced is not known, or its task has too many macrostates.
+        """
+        protocol, found = trained.spec.protocol, []
+        if protocol.dataset or protocol.after:
+            raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
+        if not run_folder.is_done(trained.folder):
+            raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
+        run = run_folder.load_run(trained.folder)
+        with closing(make_env(protocol, protocol.task, testing=True)) as env:
+            courses = _Courses(env, trained.agent, trained.spec.seed)
+            for row in run.checkpoints:
+                if row.kept is None or run.tried is None:
+                    raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
+                if row.beliefs is None:
+                    raise InvalidValueError(f"{self.spec.id} has too many macrostates to ask an agent about each.")
+                tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
+                attribution = Attribution(self.spec, row.beliefs, tried)
+                failed = np.flatnonzero(~row.kept.success).tolist()
+                causes = {test: attribution.cause(courses.of(row.kept, test)) for test in failed}
+                found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
+        return tuple(found)
+
+    def table(self, runs: Sequence[Measured[tuple[Tested, ...]]]) -> str:
+        """Shares of the failures by agent and budget, as Markdown."""
+        _, *rows = self.rows(runs)
+        found = causes_table(failures(rows))
+        return "\n".join([*markdown(found.header, found.rows), "", found.remark])
+
+    def rows(self, runs: Sequence[Measured[tuple[Tested, ...]]]) -> Iterable[Sequence[object]]:
+        """One row a failure; and one a test without any, whose cause is empty."""
+        yield HEAD
+        for run in runs:
+            for each in run.value:
+                head = [run.agent, run.seed, each.episodes, each.tests]
+                yield from ([*head, test, cause] for test, cause in each.causes.items() or [("", "")])
+
+    def summary(self, value: tuple[Tested, ...]) -> dict[str, Any]:
+        """Failures by budget and cause."""
+        return {"failures": {str(each.episodes): Counter(each.causes.values()) for each in value}}
+
+
+class _Courses:
+    """Failed test episodes, played again with the agent's eyes open; each once."""
+
+    def __init__(self, env: Env, agent: Agent, seed: int) -> None:
+        self._env, self._agent, self._purpose = env, agent, evaluation_split(seed)
+        self._known: dict[tuple[int, ...], Course] = {}
+
+    def of(self, kept: KeptEpisodes, test: int) -> Course:
+        """The course of one of the episodes kept."""
+        actions, seed = kept.actions_of(test), episode_seed(self._purpose, 0, test)
+        if (seed, *actions) not in self._known:
+            self._known[seed, *actions] = self._play(seed, actions)
+        return self._known[seed, *actions]
+
+    def _play(self, seed: int, actions: list[int]) -> Course:
+        frame, info = self._env.reset(seed=seed)
+        frames, infos, terminated = [frame], [info], False
+        for action in actions:
+            frame, _, terminated, _, info = self._env.step(action)
+            frames.append(frame)
+            infos.append(info)
+        states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
+        wrong = misread(self._agent, np.array(frames[:-1]), states[:-1])
+        return Course(
+            states=[tuple(state) for state in states.tolist()], actions=actions, terminated=bool(terminated),
+            faults=[bool(info["fault"]) for info in infos[1:]], misread=wrong.tolist(), seed=seed,
+        )  # fmt: skip

@@ -1,0 +1,226 @@
+"""Why an agent failed a test episode: truth is swapped in, one stage at a time, until the episode is solved.
+
+What the agent saw is made right first, then its plan, then what its model says of transitions that it never
+experienced, then all of its model, then physics. Each stage keeps the truth of those before it. The first stage that
+solves the episode names its cause; where none does, an optimal policy would have failed too. So every failure has
+exactly one cause. A policy cannot be learned anew in a model that was made right; so the plan comes before the model:
+where perfect planning in the agent's own model solves the episode, that model was right enough.
+
+An agent without a model has, in its place, what it experienced: true where it was, and nothing elsewhere.
+
+An episode is lived again by the rules. Where a stage does in a step what the agent did there, the same happens, faults
+of physics included; where it does something else, chance decides with the same uniform number.
+
+Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor
+from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import Purpose, SeedTree
+from imagine_bench.store.results import Beliefs
+
+CAUSES = {
+    "misread": "a frame was misread",
+    "unexperienced": "a transition that it needed was never experienced",
+    "model": "its model was wrong, though it was experienced",
+    "planning": "its model was right; its plan was cut off, or its policy not greedy in it",
+    "values": "its values were wrong, though what it needed was experienced (no model)",
+    "fault": "physics disagreed with the rules",
+    "unlucky": "an optimal policy would have failed too",
+}
+"""Causes in the order in which tables and figures have them."""
+MOST_STATES = 2_000
+"""A task of more macrostates is too large to ask an agent about every one."""
+_TRIES = 8  # frames of a macrostate, until the agent reads one right
+_NOWHERE = -1e6  # reward of what was never experienced, for an agent that has nothing but what it experienced
+_TIE = 1e-6
+
+
+class Model(NamedTuple):
+    """What follows in every macrostate; probabilities of less than 1 in sum end the episode."""
+
+    following: NDArray[np.int64]  # rows of macrostates, -1 for what is none. Shape (S, A, B).
+    p_continues: Floats  # shape (S, A, B)
+    reward: Floats  # expected reward. Shape (S, A).
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """What happened in a failed test episode of L macro-actions."""
+
+    states: Sequence[State]  # length L + 1
+    actions: Sequence[int]  # length L
+    terminated: bool  # whether it ended in a terminal macrostate
+    faults: Sequence[bool]  # whether physics disagreed with the rules. Length L.
+    misread: Sequence[bool]  # whether the agent misread the frame before each macro-action. Length L.
+    seed: int  # of the uniform numbers
+
+
+def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose: Purpose) -> Frame:
+    """A frame of every macrostate that the agent reads right, if one of :data:`_TRIES` is. Shape (S, 64, 64, 3).
+
+    Without a model an agent is not asked about terminal macrostates; theirs are black.
+    """
+    states = np.array(states_of(spec.rules), dtype=np.int64)
+    rng = SeedTree(0).child(purpose, "causes", spec.id).generator()
+    frames = np.zeros((len(states), 64, 64, 3), dtype=np.uint8)
+    modelled = isinstance(agent, OutcomePredictor)
+    left = np.array([modelled or not spec.rules.is_terminal(tuple(state)) for state in states.tolist()])
+    for _ in range(_TRIES):
+        if left.any():
+            frames[left] = spec.render_macrostates(states[left], appearance, rng)
+            left[left] = misread(agent, frames[left], states[left])
+    return frames
+
+
+def misread(agent: Agent, frames: Frame, states: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,)."""
+    if not isinstance(agent, FrameReader):
+        return np.zeros(len(frames), dtype=np.bool_)
+    return np.asarray((agent.read_frames(frames) != states).any(axis=1))
+
+
+def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> Beliefs:
+    """What the agent would do, and what its model expects, in every macrostate, shown by ``frames``; see above."""
+    states, action = states_of(rules), np.zeros(len(frames), dtype=np.int16)
+    for row, state in enumerate(states):
+        if not rules.is_terminal(state):
+            seen = Observation(frame=frames[row], macrostate=np.array(state) if privileged else None)
+            action[row] = agent.act(seen, explore=False)
+    model = agent.predict_outcomes(frames, rng) if isinstance(agent, OutcomePredictor) else None
+    if model is not None:
+        small = {"macrostates": np.int16, "p_continues": np.float32, "reward": np.float32}
+        model = ExpectedOutcomes(**{name: getattr(model, name).astype(kind) for name, kind in small.items()})
+    return Beliefs(action=action, model=model)
+
+
+class Attribution:
+    """Finds the cause of failures of one agent at one budget.
+
+    Args:
+        spec: The task.
+        held: What the agent does and expects.
+        tried: Macrostate and macro-action of everything that it had experienced. Shape (pairs, M + 1).
+    """
+
+    def __init__(self, spec: TaskSpec, held: Beliefs, tried: NDArray[np.int64]) -> None:
+        self._rules, self._horizon, self._held = spec.rules, spec.horizon, held
+        self._rows = {state: row for row, state in enumerate(states_of(spec.rules))}
+        truth = true_model(spec.rules)
+        known = np.zeros(truth.reward.shape, dtype=np.bool_)
+        for *state, action in tried.tolist():
+            known[self._rows[tuple(state)], action] = True
+        nothing = Model(truth.following, np.zeros_like(truth.p_continues), np.full_like(truth.reward, _NOWHERE))
+        own = _mixed(known, truth, nothing) if held.model is None else self._own(held.model)
+        self._stages = (
+            ("planning" if held.model else "values", self._plan(own), True),
+            ("unexperienced", self._plan(_mixed(known, own, truth)), True),
+            ("model", self._plan(truth), True),
+            ("fault", self._plan(truth), False),
+        )
+
+    def cause(self, course: Course) -> str:
+        """One of :data:`CAUSES`."""
+        if any(course.misread) and self._solves(course, None, faults=True):
+            return "misread"
+        found = (name for name, plan, faults in self._stages if self._solves(course, plan, faults=faults))
+        return next(found, "unlucky")
+
+    def _own(self, model: ExpectedOutcomes) -> Model:
+        flat = map(tuple, model.macrostates.reshape(-1, model.macrostates.shape[-1]).tolist())
+        following = np.array([self._rows.get(state, -1) for state in flat]).reshape(model.p_continues.shape)
+        return Model(following, model.p_continues.astype(np.float64), model.reward.astype(np.float64))
+
+    def _plan(self, model: Model) -> NDArray[np.bool_]:
+        """Which macro-actions have the largest return in those left, 1 to H of them. Shape (H, S, A)."""
+        value, best = np.zeros(len(model.reward) + 1), []  # the last one is of what is no macrostate
+        for _ in range(self._horizon):
+            q = model.reward + (model.p_continues * value[model.following]).sum(axis=2)
+            value[:-1] = q.max(axis=1)
+            best.append(q >= (value[:-1] - _TIE * np.maximum(1.0, np.abs(value[:-1])))[:, None])
+        return np.array(best)
+
+    def _solves(self, course: Course, plan: NDArray[np.bool_] | None, *, faults: bool) -> bool:
+        """Whether the episode succeeds where frames are read right and, if given, a plan is followed.
+
+        Among equals of the plan is what the agent does.
+        """
+        state, rng = course.states[0], np.random.default_rng(course.seed)
+        drawn = rng.random(self._horizon).tolist()
+        for step in range(self._horizon):
+            row, lived = self._rows.get(state, -1), step < len(course.actions) and state == course.states[step]
+            if row < 0:
+                return False
+            action = int(course.actions[step] if lived and not course.misread[step] else self._held.action[row])
+            if plan is not None and not plan[self._horizon - step - 1, row, action]:
+                action = int(plan[self._horizon - step - 1, row].argmax())
+            if lived and action == course.actions[step] and (faults or not course.faults[step]):
+                if course.terminated and step + 1 == len(course.actions):
+                    return False
+                state = course.states[step + 1]
+                continue
+            share = drawn[step]
+            if lived and not course.faults[step]:  # what happened tells where the number lay
+                before, probability = _place(self._rules.outcomes(state, course.actions[step]), course.states[step + 1])
+                share = before + probability * share
+            outcome = _at(self._rules.outcomes(state, action), share)
+            if outcome.terminated:
+                return outcome.success
+            state = outcome.macrostate
+        return False
+
+
+def _at(outcomes: Sequence[Outcome], share: float) -> Outcome:
+    """The outcome at a number in [0, 1), as environments draw it."""
+    ends = np.cumsum([outcome.probability for outcome in outcomes])
+    return outcomes[min(int(np.searchsorted(ends, share, side="right")), len(outcomes) - 1)]
+
+
+def _place(outcomes: Sequence[Outcome], macrostate: State) -> tuple[float, float]:
+    """Where the outcomes that lead to a macrostate begin, and how probable the first of them is."""
+    before = 0.0
+    for outcome in outcomes:
+        if outcome.macrostate == macrostate:
+            return before, outcome.probability
+        before += outcome.probability
+    return 0.0, 1.0  # none does
+
+
+def true_model(rules: Rules) -> Model:
+    """The rules as a model."""
+    states = states_of(rules)
+    rows = {state: row for row, state in enumerate(states)}
+    every = [[rules.outcomes(state, action) for action in range(rules.n_actions)] for state in states]
+    shape = (len(states), rules.n_actions, max(len(outcomes) for actions in every for outcomes in actions))
+    following, p_continues, reward = np.full(shape, -1), np.zeros(shape), np.zeros(shape[:2])
+    for row, actions in enumerate(every):
+        for action, outcomes in enumerate(actions):
+            for branch, outcome in enumerate(outcomes):
+                following[row, action, branch] = rows.get(outcome.macrostate, -1)
+                p_continues[row, action, branch] = outcome.probability * (not outcome.terminated)
+                reward[row, action] += outcome.probability * outcome.reward
+    return Model(following, p_continues, reward)
+
+
+def _mixed(where: NDArray[np.bool_], one: Model, other: Model) -> Model:
+    """One model where (S, A) says so, and the other elsewhere."""
+    most = max(one.following.shape[2], other.following.shape[2])
+
+    def wide(values: NDArray[Any]) -> NDArray[Any]:
+        return np.pad(values, ((0, 0), (0, 0), (0, most - values.shape[2])))
+
+    return Model(
+        np.where(where[..., None], wide(one.following), wide(other.following)),
+        np.where(where[..., None], wide(one.p_continues), wide(other.p_continues)),
+        np.where(where, one.reward, other.reward),
+    )

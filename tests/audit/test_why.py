@@ -1,0 +1,96 @@
+"""Why a bench's agents failed: every failure of every test is in the table, once, and the report shows it."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_runs import Inline, small
+
+from imagine_bench import registry
+from imagine_bench.audit import why
+from imagine_bench.audit.verify import verify
+from imagine_bench.bench.bench import bench
+from imagine_bench.errors import ArtefactError, ImagineBenchError
+from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
+from imagine_bench.report.page import report_page, texts
+from imagine_bench.report.sections.causes import causes_table, read_failures
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.results import BenchResult
+
+SPEC = registry.task("arrow_puzzle")
+
+
+def write_texts(result: BenchResult) -> None:
+    """A report without images, which are slow to draw."""
+    for name, text in texts(report_page(result)).items():
+        write_bytes(make_folder(result.folder / "report") / name, text.encode())
+
+
+def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(why, "write_report", write_texts)
+    wanted = small(agents=("table", "random"), seeds=(0, 1), evaluation_episodes=12)
+    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+    said = why.why_report(folder, root=tmp_path, task=None, encoder=None)
+    with (folder / "why" / "causes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    result = load_bench(folder)
+    for run in result.of("table"):  # type: ignore[union-attr]
+        for row in run.checkpoints:
+            mine = [r for r in rows if (int(r["seed"]), int(r["episodes"])) == (run.seed, row.episodes) and r["cause"]]
+            failed = [test for test, each in enumerate(row.solved) if each == "0"]
+            assert [int(r["test"]) for r in mine] == failed and {r["cause"] for r in mine} <= set(CAUSES)
+    assert {row["agent"] for row in rows} == {"table"}, "one that does not learn has nothing to explain"
+    for line in causes_table(read_failures(folder)).rows:
+        shares = [float(str(cell)) for cell in line[3:]]
+        assert abs(sum(shares) - 100.0) < 0.2
+    assert "| table |" in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
+    assert not any(each.complaint for each in verify(folder)), "the report with its causes follows from the runs"
+
+
+def test_a_run_that_keeps_no_episodes_is_one_sentence(tmp_path: Path) -> None:
+    folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    (folder / "table" / "seed_0" / "DONE").unlink()
+    with pytest.raises(ArtefactError, match="is not finished; give the bench command again"):
+        why.why_report(folder, root=tmp_path, task=None, encoder=None)
+    (folder / "why").mkdir(exist_ok=True)
+    (folder / "why" / "causes.csv").write_text("agent,cause\n")
+    with pytest.raises(ImagineBenchError, match="not a table of causes"):
+        read_failures(folder)
+
+
+def learner(name: str, spec: TaskSpec) -> Agent:
+    entry = registry.agent_entry(name)
+    encoder = encoders.own(spec, "clean", entry.encoder_kind)
+    context = AgentContext(
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=encoder, seeds=SeedTree(1000).child(name)
+    )
+    return registry.make_agent(name, context)
+
+
+@pytest.mark.parametrize("name", ["dqn", "imagination", "imagination_uncertainty", "factored", "count_table"])
+def test_an_agent_says_what_it_reads_and_expects(name: str) -> None:
+    agent, states = learner(name, SPEC), np.array(states_of(SPEC.rules))
+    before = agent.state()
+    frames = frames_to_ask_with(agent, SPEC, appearance="clean", purpose="evaluation")
+    asked = frames.any(axis=(1, 2, 3))
+    assert not misread(agent, frames[asked], states[asked]).any()
+    held = beliefs(agent, SPEC.rules, frames, np.random.default_rng(0), privileged=False)
+    assert held.action.shape == (192,) and (held.model is None) == (name == "dqn")
+    if held.model is not None:
+        assert held.model.macrostates.shape[:2] == held.model.reward.shape == (192, 6)
+        assert held.model.macrostates.shape[:3] == held.model.p_continues.shape
+        assert (held.model.p_continues >= 0).all() and (held.model.p_continues.sum(axis=2) < 1.0001).all()
+    after = agent.state()
+    assert {**before.values, "meters": 0} == {
+        **after.values,
+        "meters": 0,
+    } and before.arrays.keys() == after.arrays.keys()
+    assert all(np.array_equal(array, after.arrays[name]) for name, array in before.arrays.items())

@@ -1,0 +1,180 @@
+"""Each failure has one cause: agents made to fail for exactly one known reason are charged exactly that."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.capabilities import ExpectedOutcomes
+from imagine_bench.interfaces import Outcome, State, TaskSpec
+from imagine_bench.judge.causes import CAUSES, Attribution, Course, _at, _place
+from imagine_bench.rules import fewest_actions, states_of
+from imagine_bench.store.results import Beliefs
+
+SPEC = registry.task("arrow_puzzle")
+RULES = SPEC.rules
+STATES = states_of(RULES)
+ALL = np.array([[*state, action] for state in STATES for action in range(RULES.n_actions)])
+NONE = np.zeros((0, 5), dtype=np.int64)
+ILLEGAL = {s: next(a for a in range(6) if not RULES.is_legal(RULES.outcomes(s, a)[0].macrostate)) for s in STATES}
+OPTIMAL = {s: RULES.optimal_action(s) for s in STATES}
+FAR = [s for s in RULES.start_states if fewest_actions(RULES, s) >= 2]
+
+
+def model_of(spec: TaskSpec, wrong: Callable[[State, int], bool] = lambda state, action: False) -> ExpectedOutcomes:
+    """The rules as an agent's model, but for pairs about which it is wrong: there it expects nothing good to follow."""
+    states = states_of(spec.rules)
+    shape = (len(states), spec.n_actions)
+    found: dict[str, Any] = {"macrostates": np.zeros((*shape, 2, len(states[0])), dtype=np.int64)}
+    found |= {"p_continues": np.zeros((*shape, 2)), "reward": np.full(shape, -9.0)}
+    for row, state in enumerate(states):
+        for action in range(spec.n_actions):
+            if not wrong(state, action):
+                outcomes = spec.rules.outcomes(state, action)
+                found["reward"][row, action] = sum(o.probability * o.reward for o in outcomes)
+                for branch, outcome in enumerate(outcomes):
+                    found["macrostates"][row, action, branch] = outcome.macrostate
+                    found["p_continues"][row, action, branch] = outcome.probability * (not outcome.terminated)
+    return ExpectedOutcomes(**found)
+
+
+def does(choice: dict[State, int], model: ExpectedOutcomes | None, states: tuple[State, ...] = STATES) -> Beliefs:
+    return Beliefs(action=np.array([choice[state] for state in states], dtype=np.int16), model=model)
+
+
+def course(start: State, actions: list[int], **changes: Any) -> Course:
+    """What comes of macro-actions by the rules, which leave nothing to chance here."""
+    states, terminated = [start], False
+    for action in actions:
+        (outcome,) = RULES.outcomes(states[-1], action)
+        states.append(outcome.macrostate)
+        terminated = outcome.terminated
+    quiet = [False] * len(actions)
+    known = {"states": states, "actions": actions, "terminated": terminated, "faults": quiet, "misread": quiet}
+    return Course(**{**known, "seed": 5, **changes})
+
+
+def cause(agent: Beliefs, tried: NDArray[np.int64], happened: Course, spec: TaskSpec = SPEC) -> str:
+    return Attribution(spec, agent, tried).cause(happened)
+
+
+@pytest.mark.parametrize("start", FAR[::4])
+@pytest.mark.parametrize("modelled", [True, False])
+def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) -> None:
+    agent = does(OPTIMAL, model_of(SPEC) if modelled else None)
+    first = OPTIMAL[start]
+    second = ILLEGAL[RULES.outcomes(start, first)[0].macrostate]
+    blind = course(start, [first, second], misread=[False, True])
+    assert cause(agent, ALL, blind) == "misread"
+    seeing = dataclasses.replace(blind, misread=[True, False])
+    assert cause(agent, ALL, seeing) == ("planning" if modelled else "values"), "it was not the frame that was misread"
+
+
+@pytest.mark.parametrize("start", FAR[::4])
+def test_what_was_never_experienced_is_charged_to_experience(start: State) -> None:
+    """It knows every transition but those that solve a puzzle, and would do all others right."""
+
+    def solving(state: State, action: int) -> bool:
+        return any(outcome.success for outcome in RULES.outcomes(state, action))
+
+    tried = np.array([row for row in ALL.tolist() if not solving(tuple(row[:-1]), row[-1])])
+    failed = course(start, [ILLEGAL[start]])
+    for model in (model_of(SPEC, solving), None):
+        agent = does(dict.fromkeys(STATES, 0), model)
+        assert cause(agent, tried, failed) == "unexperienced"
+    agent = does(dict.fromkeys(STATES, 0), model_of(SPEC, solving))
+    assert cause(agent, ALL, failed) == "model", "it was experienced, and the model is wrong all the same"
+    assert cause(does(dict.fromkeys(STATES, 0), None), ALL, failed) == "values"
+    assert cause(does(dict.fromkeys(STATES, 0), model_of(SPEC)), NONE, failed) == "planning", "the model needs no more"
+
+
+@pytest.mark.parametrize("start", FAR[::4])
+def test_a_policy_not_greedy_in_its_right_model_is_planning(start: State) -> None:
+    failed = course(start, [ILLEGAL[start]])
+    assert cause(does(ILLEGAL, model_of(SPEC)), ALL, failed) == "planning"
+    assert cause(does(ILLEGAL, None), ALL, failed) == "values"
+
+
+@pytest.mark.parametrize("start", FAR[::4])
+def test_a_slip_of_physics_is_charged_to_physics(start: State) -> None:
+    bad = RULES.outcomes(start, ILLEGAL[start])[0].macrostate
+    slipped = course(start, [OPTIMAL[start]], states=[start, bad], terminated=True, faults=[True])
+    assert cause(does(OPTIMAL, model_of(SPEC)), ALL, slipped) == "fault"
+    assert cause(does(OPTIMAL, None), ALL, slipped) == "fault"
+
+
+class Coin:
+    """One state, in which action 0 wins with probability 0.6 and loses else, and action 1 always loses."""
+
+    n_actions, states, start_states = 2, ((0,), (1,), (2,)), ((0,),)
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        lost = Outcome(0.4, (2,), -5.0, terminated=True, success=False)
+        won = Outcome(0.6, (1,), 50.0, terminated=True, success=True)
+        return (dataclasses.replace(lost, probability=1.0),) if action else (lost, won)
+
+    def is_terminal(self, macrostate: State) -> bool:
+        return macrostate != (0,)
+
+
+def test_bad_luck_is_nobodys_fault() -> None:
+    spec = dataclasses.replace(SPEC, rules=Coin(), horizon=3, action_names=("toss", "lose"))  # type: ignore[arg-type]
+    tried = np.array([[0, 0], [0, 1]])
+    quiet = {"states": [(0,), (2,)], "terminated": True, "faults": [False], "misread": [False]}
+    for model in (model_of(spec), None):
+        agent = does({(0,): 0, (1,): 0, (2,): 0}, model, Coin.states)
+        assert cause(agent, tried, Course(actions=[0], seed=1, **quiet), spec) == "unlucky"
+        found = [cause(agent, tried, Course(actions=[1], seed=seed, **quiet), spec) for seed in range(400)]
+        wrong = "planning" if model else "values"
+        assert set(found) == {wrong, "unlucky"}, "another action would have met the same chance"
+        assert abs(found.count(wrong) / 400 - 0.6) < 0.08
+
+
+def test_a_start_from_which_no_plan_fits_is_unlucky() -> None:
+    start = max(RULES.start_states, key=lambda state: fewest_actions(RULES, state))
+    short = dataclasses.replace(SPEC, horizon=fewest_actions(RULES, start) - 1)
+    actions = [0, 1] * 5
+    failed = course(start, actions[: short.horizon])
+    assert cause(does(OPTIMAL, model_of(SPEC)), ALL, failed, short) == "unlucky"
+
+
+def test_every_failure_has_exactly_one_cause() -> None:
+    """Agents wrong in every way at once: none of their failures is without a cause, or charged where none can be."""
+    rng = np.random.default_rng(3)
+    counted = dict.fromkeys(CAUSES, 0)
+    for number in range(30):
+        choice = {state: int(rng.integers(6)) for state in STATES}
+        doubt = rng.random(2)
+        model = None if number % 3 == 0 else model_of(SPEC, lambda state, action, p=doubt[0]: rng.random() < p)
+        found = Attribution(SPEC, does(choice, model), ALL[rng.random(len(ALL)) < doubt[1]])
+        for start in RULES.start_states:
+            state, actions = start, list[int]()
+            while len(actions) < SPEC.horizon and not RULES.is_terminal(state):
+                actions.append(int(rng.integers(6)) if rng.random() < 0.3 else choice[state])
+                state = RULES.outcomes(state, actions[-1])[0].macrostate
+            if not RULES.judge(start, 0, state).success:
+                misread = (rng.random(len(actions)) < 0.2).tolist()
+                happened = course(start, actions, misread=misread)
+                counted[found.cause(happened)] += 1
+                seeing = dataclasses.replace(happened, misread=[False] * len(actions))
+                assert not found._solves(seeing, None, faults=True) and found.cause(seeing) != "misread"
+    assert all(counted[name] for name in ("misread", "unexperienced", "model", "planning", "values"))
+    assert counted["fault"] == counted["unlucky"] == 0, "the rules leave nothing to chance, and always a way"
+
+
+def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        shares = rng.dirichlet(np.ones(4))
+        outcomes = [Outcome(float(p), (i,), 0.0, terminated=False, success=False) for i, p in enumerate(shares)]
+        for outcome in outcomes:
+            before, probability = _place(outcomes, outcome.macrostate)
+            assert _at(outcomes, before + probability * rng.random()) is outcome
+        drawn = np.random.default_rng(9).choice(4, p=shares)
+        assert _at(outcomes, np.random.default_rng(9).random()) is outcomes[drawn], "as an environment draws"
