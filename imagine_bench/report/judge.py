@@ -13,16 +13,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
+from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
 from imagine_bench.judge.models.scores import COVERAGES
-from imagine_bench.judge.models.study import Cell, Judgement, kept
+from imagine_bench.judge.models.study import Judgement, kept, shown
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
 from imagine_bench.report.sections import Cell as TableCell
 from imagine_bench.statistics import difference, holm, interval, iqm
-from imagine_bench.store.codec import read_arrays
 from imagine_bench.store.files import csv_text, read_json
 
 COLUMNS = {
@@ -31,12 +31,18 @@ COLUMNS = {
     "reward_error": "reward error", "end_error": "end error", "value_loss": "value loss", "regret": "regret of 1 of 5",
     "auroc_epistemic": "AUROC, wrong", "auroc_never": "AUROC, never seen", "worth_of_refusing": "worth of refusing",
     "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
+    "encoder_frames": "frames beforehand",
 }  # fmt: skip
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "regret", "auroc_epistemic", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
+_SHARES = {"total_variation", "tv_5", "tv_10", "nothing", "outcome_ece", "end_error", "auroc_epistemic", "auroc_never"}
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
+_WHOLE = 1_000  # from here on no decimals are shown
+_TELLING = 0.1  # total variation
 Cells = Mapping[tuple[str, int], Sequence[dict[str, Any]]]
 """Kept cells, one a seed, by model and transitions."""
+Pictures = Mapping[str, dict[str, Any]]
+"""What :func:`.judge.models.study.shown` gives."""
 
 
 def judgement_report(folder: Path, judgement: Judgement) -> str:
@@ -62,14 +68,15 @@ def scores(cells: Sequence[dict[str, Any]], name: str) -> list[float]:
     return [math.nan if value is None else float(value) for value in values]
 
 
-def mean_cell(values: Sequence[float]) -> TableCell:
-    """Interquartile mean over seeds with its 95 % interval; a dash where no seed has a number."""
+def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
+    """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
     there = [value for value in values if not math.isnan(value)]
     if not there:
         return TableCell(text=DASH)
-    low, high = interval(there)
+    low, high = interval(there, share=share)
     shown = "" if math.isnan(low) or low == high else f"[{number(low)}, {number(high)}]"
-    return TableCell(text=number(iqm(there)), interval=shown)
+    value = iqm(there)
+    return TableCell(text=f"{value:,.0f}" if value >= _WHOLE else number(value), interval=shown)
 
 
 def _title(model: str) -> str:
@@ -78,7 +85,11 @@ def _title(model: str) -> str:
 
 def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list[Any]]:
     return [
-        [_title(model), f"{size:,}", *(mean_cell(scores(cells[model, size], name)) for name in names)]
+        [
+            _title(model),
+            f"{size:,}",
+            *(mean_cell(scores(cells[model, size], name), share=name in _SHARES) for name in names),
+        ]
         for model, size in itertools.product(judgement.models, judgement.sizes)
         if (model, size) in cells
     ]
@@ -88,6 +99,7 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     spec = registry.task(judgement.task)
     made = read_json(folder / "judgement.json", "a judgement")
     errors = read_json(folder / "reader.json", "a reader's errors")
+    pictures = shown(folder, judgement)
     largest = [model for model in judgement.models if (model, judgement.sizes[-1]) in cells]
     table = Table(
         name="judgement", header=["world model", "transitions", *COLUMNS.values()], why_dash=_WHY_DASH,
@@ -102,11 +114,11 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
         "fog as something."
     ]
     sections = [
-        Section(title="Every score", words=words, tables=[table], images=_futures(folder, judgement, largest)),
+        Section(title="Every score", words=words, tables=[table], images=_futures(judgement, pictures)),
         Section(title="Does it know?", images=[_risk_image(judgement, cells, largest)]),
         Section(title="By depth", images=[_depth_image(judgement, cells, largest)]),
         Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
-        _where_section(spec, judgement, cells, largest, folder),
+        _where_section(spec, judgement, cells, largest, pictures),
     ]
     return Page(
         title=f"{spec.title}: world models against the exact truth",
@@ -139,11 +151,15 @@ def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[
 def _csv(cells: Cells) -> str:
     names = ["model", "transitions", "seed", *COLUMNS]
     rows = [
-        [model, size, cell["seed"], *(f"{scores([cell], name)[0]:.6g}" for name in COLUMNS)]
+        [model, size, cell["seed"], *(_plain(scores([cell], name)[0]) for name in COLUMNS)]
         for (model, size), each in cells.items()
         for cell in each
     ]
     return csv_text([names, *rows])
+
+
+def _plain(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"
 
 
 def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Table:
@@ -175,17 +191,31 @@ def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: st
 
 
 def _risk_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
-    last = judgement.sizes[-1]
-    curves = {model: [cell["risk"] for cell in cells[model, last] if cell["risk"]] for model in models}
-    series = {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+    size = _telling_size(judgement, cells, models)
+    series = _risks(cells, models, size)
     shares = [100.0 * share for share in COVERAGES]
     return image(
         "risk_coverage",
         lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
         alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
         caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
-        f"uncertainty are not here. After {last:,} transitions, mean over seeds.",
+        f"uncertainty are not here. After {size:,} transitions, where most of them still err, mean over seeds.",
     )  # fmt: skip
+
+
+def _risks(cells: Cells, models: Sequence[str], size: int) -> dict[str, list[float]]:
+    """Mean risk by coverage of each model that learned and says how sure it is."""
+    own = {model: cells.get((model, size), ()) for model in models if not registry.world_model_entry(model).privileged}
+    curves = {model: [cell["risk"] for cell in each if cell["risk"]] for model, each in own.items()}
+    return {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+
+
+def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> int:
+    """The most transitions after which more than one model is wrong in a tenth of all; else the fewest."""
+    for size in judgement.sizes[::-1]:
+        if sum(curve[-1] > _TELLING for curve in _risks(cells, models, size).values()) > 1:
+            return size
+    return judgement.sizes[0]
 
 
 def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
@@ -199,15 +229,9 @@ def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> I
     )  # fmt: skip
 
 
-def _arrays(folder: Path, judgement: Judgement, model: str) -> dict[str, Any] | None:
-    path = folder / Path(Cell(model, judgement.seeds[0], judgement.sizes[-1]).file).with_suffix(".npz")
-    return dict(read_arrays(path)) if path.exists() else None
-
-
-def _futures(folder: Path, judgement: Judgement, models: Sequence[str]) -> list[Image]:
+def _futures(judgement: Judgement, found: Pictures) -> list[Image]:
     """One rollout, real and as each model imagines it."""
     names = registry.task(judgement.task).action_names
-    found = {model: arrays for model in models if (arrays := _arrays(folder, judgement, model)) is not None}
     if not found:
         return []
     one = next(iter(found.values()))
@@ -227,7 +251,9 @@ def _futures(folder: Path, judgement: Judgement, models: Sequence[str]) -> list[
     ]
 
 
-def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], folder: Path) -> Section:
+def _where_section(
+    spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], pictures: Pictures
+) -> Section:
     """Total variation by what may make it hard, and the worst ten transitions of each model."""
     last = judgement.sizes[-1]
     groups: dict[tuple[str, str], dict[str, TableCell]] = {}
@@ -235,7 +261,7 @@ def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: S
         wheres = [cell["where"] for cell in cells[model, last]]
         for kind, name in {(kind, name): None for where in wheres for kind, each in where.items() for name in each}:
             values = [where[kind][name] for where in wheres if name in where[kind]]
-            groups.setdefault((kind, name), {})[model] = mean_cell(values)
+            groups.setdefault((kind, name), {})[model] = mean_cell(values, share=True)
     rows: list[list[str | TableCell]] = [
         [kind, name, *(found.get(model, DASH) for model in models)] for (kind, name), found in groups.items()
     ]
@@ -244,15 +270,14 @@ def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: S
         caption=f"Total variation of one step after {last:,} transitions; of a coordinate, that of it alone.",
     )  # fmt: skip
     images = []
-    for model in models:
-        arrays = _arrays(folder, judgement, model)
-        if arrays is not None and not arrays["worst_right"].all():
+    for model, arrays in pictures.items():
+        if not arrays["worst_right"].all():
             titles = [spec.action_names[action] for action in arrays["worst_actions"][:, 0]]
             strips: list[tuple[str, Any, Any]] = [
                 ("before", list(arrays["worst_before"]), None), ("real", list(arrays["worst_real"][:, 0]), None),
                 ("imagined", list(map(_rgb, arrays["worst_imagined"][:, 0])), arrays["worst_right"][:, 0].tolist()),
             ]  # fmt: skip
-            name = f"worst_{model}"
+            name = f"worst_{file_name(model)}"
             images.append(Image.of(png(transition_sheet(titles, strips)), name=name, alt=f"Worst of {_title(model)}",
                                    caption=f"The ten worst transitions of {_title(model)}."))  # fmt: skip
     return Section(title="Where it fails", tables=[table], images=images)
