@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,7 @@ from imagine_bench.seeding import SeedTree
 
 from ..networks.weights import initialise
 from .discrete_encoder import DiscreteEncoder, discover
-from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
+from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae, image_shape
 from .network import EncoderNetwork
 from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
@@ -152,6 +152,8 @@ def train_encoder(
         ArtefactError: The unfinished training is damaged or another one.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
+    if recipe.kind == "codes":
+        recipe = replace(recipe, frames=recipe.frames * max(image_shape(spec.preprocessing)[0], 3) // 3)
     require_known("appearance", appearance, APPEARANCES)
     progress = progress or (lambda stage, done: None)
     prepare_torch("cpu")
