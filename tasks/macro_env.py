@@ -56,7 +56,7 @@ class EnvState:
     begun: bool
     latest: MacroResult | None = field(repr=False)
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
-    steps: int = 0  #: macro-actions of the episode
+    steps: int = 0
     under_way: tuple[Any, ...] = field(default=(), repr=False)  #: observations that lag keeps back
 
 
@@ -144,9 +144,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._human_camera: Renderer | None = None
         self._window = Window(spec.title) if self.render_mode == "human" else None
         self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
-        self._begun, self._macrostate = False, self._starts[0]
+        self._begun, self._macrostate, self._people = False, self._starts[0], self._mocap()
         self._latest: MacroResult | None = None
-        self._people = self._mocap()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 

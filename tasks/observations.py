@@ -33,8 +33,9 @@ class Observer:
     """Observations of a world: one part as it is, several, separated by commas, as a dict.
 
     ``frame`` is the agent's camera and ``human`` the whole scene, uint8 (size, size, 3). ``state`` is the macrostate, a
-    one-hot vector for each coordinate, zeros where it is hidden, float32. ``proprio`` is float32 (16,): seven joints (rad), each finger's
-    distance from the grip's middle (m), and the point between them: position (m) and quaternion (w, x, y, z).
+    one-hot vector for each coordinate, zeros where it is hidden, float32. ``proprio`` is float32 (16,): seven joints
+    (rad), each finger's distance from the grip's middle (m), and the point between them: position (m) and quaternion
+    (w, x, y, z).
 
     Args:
         choice: Names in :data:`PARTS`.

@@ -57,9 +57,22 @@ class FrameSet:
         return self.images[rows].float() / 255.0
 
 
+def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
+    """All that frames of a task may show: every macrostate, and where something is hidden, those with -1 for it."""
+    states, sight = states_of(spec.rules), spec.sight
+    seen = [] if sight is None else [what for step in (0, 1) for s in states for _, what in sight.seen(s, step)]
+    return np.array(list(dict.fromkeys((*states, *seen))), dtype=np.int64)
+
+
+def classes_of(spec: TaskSpec) -> tuple[int, ...]:
+    """How many values each coordinate shows; one more, the last, where it may be hidden. Length M."""
+    hidden = [-1 in column for column in shown_states(spec).T.tolist()]
+    return tuple(len(values) + also for values, also in zip(spec.macrostate_values, hidden, strict=True))
+
+
 def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
-    """Frames of macrostates drawn uniformly from all that the rules know. Shapes (n, 64, 64, 3) and (n, M)."""
-    states = np.array(states_of(spec.rules), dtype=np.int64)
+    """Frames of macrostates drawn uniformly from all that frames show. Shapes (n, 64, 64, 3) and (n, M)."""
+    states = shown_states(spec)
     macrostates = states[rng.integers(len(states), size=n)]
     return spec.render_macrostates(macrostates, appearance, rng), macrostates
 
@@ -72,7 +85,7 @@ def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator,
     for start in range(0, n, _CHUNK):
         frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
         images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
-        labels.append(macrostates)
+        labels.append(macrostates % classes_of(spec))
         progress("frames", min(start + _CHUNK, n) / n)
     return FrameSet(images=torch.cat(images), macrostates=np.concatenate(labels))
 
@@ -175,7 +188,7 @@ def train_encoder(
         clock |= {stage: at - earlier_s for stage, at in clock.items()}
     _round_to_half(network)
     clock["training"] = time.process_time()
-    cardinalities = tuple(len(values) for values in spec.macrostate_values)
+    cardinalities = classes_of(spec)
     latents = latents_of(network, data)
     probe, linear = (empty_probe(network.latent_size, cardinalities, hidden) for hidden in (PROBE_HIDDEN, 0))
     for reader in (probe.to_empty(device="cpu"), linear.to_empty(device="cpu")):
@@ -197,7 +210,7 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
         recipe=recipe,
         preprocessing=spec.preprocessing,
         macrostate_names=spec.macrostate_names,
-        cardinalities=tuple(len(values) for values in spec.macrostate_values),
+        cardinalities=classes_of(spec),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
         f"--recipe {recipe.name} --seed {seed}{_shorter(spec, recipe)}",

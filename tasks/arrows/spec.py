@@ -121,7 +121,7 @@ def _spec(world: Arrows) -> TaskSpec:
         macrostate_names=(*(f"{cube} arrow" for cube in cubes), "pointed cube"),
         macrostate_values=(_DIRECTIONS,) * world.cubes + (cubes,),
         preprocessing=gray_name(world.cubes),
-        encoder="arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}",
+        encoder=("arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}") + world.looks,
         rules=rules,
         sight=world.sight(),
         facts=functools.partial(facts, rules, rules.horizon),

@@ -74,7 +74,15 @@ class Dials:
         for name in options:
             if name not in (*names, *others):
                 raise UnknownNameError("keyword argument", name, (*names, *others))
-        return cls(**{name: options.pop(name) for name in names if name in options})
+        world = cls(**{name: options.pop(name) for name in names if name in options})
+        if world.distractors:
+            raise InvalidValueError(f"No environment shows distractors={world.distractors} yet; leave it out.")
+        return world
+
+    @property
+    def looks(self) -> str:
+        """What the name of encoders says of dials that change frames."""
+        return "" if self.gesture in ("always", 1.0) else "_hidden"
 
     def sight(self, always_shown: Callable[[State], bool] = lambda macrostate: False) -> GestureSight | None:
         """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""

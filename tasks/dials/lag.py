@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 
@@ -16,6 +17,8 @@ class Lag:
         self.macro_actions, self.kept = macro_actions, tuple[Any, ...]()
 
     def deliver(self, observation: Any) -> Any:
-        """Take in the observation of this moment, once each, and return the one that is due."""
+        """Take in the observation of this moment, once each, and return the one that is due, the caller's own."""
+        if not self.macro_actions:
+            return observation
         self.kept = (*self.kept, observation)[-1 - self.macro_actions :]
-        return self.kept[0]
+        return copy.deepcopy(self.kept[0])
