@@ -54,6 +54,7 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
         env = make(id_, gesture=gesture, observation="state")
         walks = [walk(env, 8, seed) for seed in range(60)]
         seen = np.array([[state[-n_gestures:].any() for state, _ in each] for each in walks])
+        assert all(len(truth) - 1 + state[-n_gestures:].any() == state.sum() for each in walks for state, truth in each)
         carried = np.array([[id_ == IDS[1] and 2 in state[:-1] for _, state in each] for each in walks])
         if gesture == 0.3:
             free = seen[~carried]
@@ -65,7 +66,9 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
 
 @pytest.mark.parametrize("id_", IDS)
 def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
-    now, late = walk(make(id_), 7), walk(make(id_, lag=3), 7)
+    lagging = make(id_, lag=3)
+    walk(lagging, 2, seed=8)  # nothing of an earlier episode is seen
+    now, late = walk(make(id_), 7), walk(lagging, 7)
     for step, (frame, macrostate) in enumerate(late):
         np.testing.assert_array_equal(frame, now[max(0, step - 3)][0])
         np.testing.assert_array_equal(macrostate, now[step][1])
