@@ -26,7 +26,7 @@ from .encoders.network import EncoderNetwork
 from .encoders.perception import prepare_torch
 from .encoders.probe import Latents, accuracy, train_probe
 from .encoders.recipes import Recipe
-from .encoders.training import draw_frames
+from .encoders.training import classes_of, draw_frames
 
 _CERTAIN = -20.0  # log variance of a latent that is known
 _FRAMES, _PROBE_STEPS = 4000, 2000
@@ -113,7 +113,7 @@ def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path:
     offered = OfferedNetwork(offer, 0).offered
     sizes = tuple(map(int, getattr(offered, "code_sizes", ())))
     network = OfferedNetwork(offer, np.asarray(offered.encode(frames[:1])).shape[-1])
-    cardinalities = tuple(len(values) for values in spec.macrostate_values)
+    cardinalities = classes_of(spec)
     probe = empty_probe(network.latent_size, cardinalities, PROBE_HIDDEN).to_empty(device="cpu")
     card = EncoderCard(
         task=spec.id, appearance=appearance, recipe=recipe, preprocessing=spec.preprocessing,

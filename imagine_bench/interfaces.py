@@ -225,9 +225,9 @@ class TaskSpec:
         return len(self.action_names)
 
     def value_names(self, macrostate: Sequence[int] | Macrostate) -> tuple[str, ...]:
-        """The names of a macrostate's values, one a coordinate, "not seen" for -1. Length M."""
+        """The names of a macrostate's values, one a coordinate, "not seen" for any other. Length M."""
         pairs = zip(self.macrostate_values, macrostate, strict=True)
-        return tuple("not seen" if value < 0 else names[int(value)] for names, value in pairs)
+        return tuple(names[int(value)] if 0 <= value < len(names) else "not seen" for names, value in pairs)
 
 
 def appearance_of_tests(appearance: str) -> str:

@@ -53,7 +53,7 @@ def sample_sheet(
         for column, image in enumerate(images):
             sheet.paste(_enlarged(image), (_LABEL + column * cell, top))
     for column, (right, found) in enumerate(zip(macrostates, read, strict=True)):
-        values = [spec.macrostate_values[i][value].replace("_", " ") for i, value in enumerate(found)]
+        values = [value.replace("_", " ") for value in spec.value_names(found)]
         words = " · ".join(value.split()[-1] for value in values)
         names = "\n".join(textwrap.wrap(words, width=_CAPTION_LETTERS))
         color = _INK if (right == found).all() else _WRONG

@@ -66,15 +66,15 @@ def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
 
 def classes_of(spec: TaskSpec) -> tuple[int, ...]:
     """How many values each coordinate shows; one more, the last, where it may be hidden. Length M."""
-    hidden = [-1 in column for column in shown_states(spec).T.tolist()]
+    hidden = [bool(lowest < 0) for lowest in shown_states(spec).min(axis=0)]
     return tuple(len(values) + also for values, also in zip(spec.macrostate_values, hidden, strict=True))
 
 
 def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
-    """Frames of macrostates drawn uniformly from all that frames show. Shapes (n, 64, 64, 3) and (n, M)."""
+    """Frames (n, 64, 64, 3) of macrostates drawn uniformly from all that frames show, and their classes (n, M)."""
     states = shown_states(spec)
     macrostates = states[rng.integers(len(states), size=n)]
-    return spec.render_macrostates(macrostates, appearance, rng), macrostates
+    return spec.render_macrostates(macrostates, appearance, rng), macrostates % classes_of(spec)
 
 
 def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator, progress: Progress) -> FrameSet:
@@ -85,7 +85,7 @@ def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator,
     for start in range(0, n, _CHUNK):
         frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
         images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
-        labels.append(macrostates % classes_of(spec))
+        labels.append(macrostates)
         progress("frames", min(start + _CHUNK, n) / n)
     return FrameSet(images=torch.cat(images), macrostates=np.concatenate(labels))
 

@@ -7,7 +7,7 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.agents.encoders.training import classes_of, shown_states
+from imagine_bench.agents.encoders.training import classes_of, draw_frames, shown_states
 
 from imagine_bench import registry
 
@@ -135,6 +135,9 @@ def test_frames_of_macrostates_hide_what_the_environment_hides():
         np.testing.assert_array_equal(env.agent_view(), frame)
         again = spec.render_macrostates(np.array([like]), "clean", np.random.default_rng(2))[0]
         assert not np.array_equal(again, frame)
+        labels = draw_frames(spec, "clean", 50, np.random.default_rng(0))[1]
+        assert (labels >= 0).all() and labels[:, -1].max() == len(spec.macrostate_values[-1])
+        assert spec.value_names(labels[labels[:, -1].argmax()])[-1] == "not seen"
         assert spec.value_names(hidden[0])[-1] == "not seen" and spec.encoder.endswith("_hidden")
 
 
