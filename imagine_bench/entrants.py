@@ -80,6 +80,7 @@ class WorldModelEntry:
     description: str = "A world model."  #: One sentence for a reader who knows none of this
     encoder_kind: str | None = None  #: Which of the task's encoders it sees through, ``"latents"`` or ``"codes"``
     privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
+    by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
 
 
 class Entrant(NamedTuple):

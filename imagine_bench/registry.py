@@ -204,6 +204,11 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
+    "mdn_thesis": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.latent:make_thesis", title="VAE + MDN, thesis' settings", encoder_kind="latents",
+        description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
+        by_default=False,
+    ),
     "structured": WorldModelEntry(
         make=f"{_WORLD_MODELS}.structured:make", title="structured", encoder_kind="codes",
         description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
@@ -374,7 +379,9 @@ def task_entry(name: str) -> TaskEntry:
         line: TaskEntry = offered(base, TASKS, TASK_GROUP)
         with _guests_faults(f"Task {name} ({line.spec})", own=base in TASKS):
             options = {**line.options, **_options(base, line, said)}
-            entry = dataclasses.replace(line, options=options, env_id=load(line.spec)(**options).env_id)
+            spec: TaskSpec = load(line.spec)(**options)
+            horizon = line.horizon and spec.horizon
+            entry = dataclasses.replace(line, options=options, env_id=spec.env_id, horizon=horizon)
     register_env(entry)
     return entry
 

@@ -55,8 +55,10 @@ def states_of(rules: Rules) -> tuple[State, ...]:
     return getattr(rules, "states", None) or tuple(tabulate(rules).index)
 
 
-def tabulate(rules: Rules) -> RuleTables:
+def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
     """Write the machine out as arrays: what it lists, or what is reached from its starts, where ends have empty rows.
+
+    Macrostates that are more than ``depth`` macro-actions away have empty rows, too.
 
     Raises:
         InvalidValueError: The outcome probabilities of some (macrostate, action) do not sum to 1, or an outcome is a
@@ -65,12 +67,14 @@ def tabulate(rules: Rules) -> RuleTables:
     from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
 
     listed = getattr(rules, "states", None)
-    index = {state: row for row, state in enumerate(listed or rules.start_states)}
-    queue, queued = list(index), set(index)
+    index = {state: row for row, state in enumerate(dict.fromkeys(listed or rules.start_states))}
+    queue, steps = list(index), dict.fromkeys(index, 0)
     pairs: list[tuple[int, int, float, float]] = []  # action, row, reward, success
     goes_on: list[tuple[float, int, int, int]] = []  # probability, action, row, next row
     for state in queue:  # grows
         row = index[state]
+        if steps[state] == depth:
+            break
         for action in range(rules.n_actions):
             total = reward = success = 0.0
             for outcome in rules.outcomes(state, action):
@@ -82,8 +86,8 @@ def tabulate(rules: Rules) -> RuleTables:
                 column = index.setdefault(after, len(index))
                 if not outcome.terminated:
                     goes_on.append((share, action, row, column))
-                    if after not in queued:
-                        queued.add(after)
+                    if after not in steps:
+                        steps[after] = steps[state] + 1
                         queue.append(after)
             if abs(total - 1.0) > _TIE_TOLERANCE:
                 raise InvalidValueError(f"Outcomes of action {action} in macrostate {state} sum to {total}, not 1.")

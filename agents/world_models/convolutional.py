@@ -19,7 +19,7 @@ from imagine_bench.world_models import Imagined
 from ..encoders.perception import prepare_torch
 from ..networks.weights import initialise
 
-_STEPS, _BATCH, _RATE, _CHUNK = 600, 32, 2e-3, 256
+_STEPS, _BATCH, _RATE, _CHUNK = 1_200, 32, 2e-3, 256
 _REWARD = 10.0  # units of reward that the network's output is in
 
 
@@ -41,7 +41,7 @@ class NextFrame(nn.Module):
         seen = self.down(frames)
         hidden = self.middle(torch.cat([seen.flatten(1), functional.one_hot(actions, self.n_actions)], dim=1))
         drawn, mask = self.up(torch.cat([seen, hidden.view_as(seen)], dim=1)).chunk(2, dim=1)
-        mask = mask.sigmoid()  # where it paints over what was there
+        mask = (mask - 3.0).sigmoid()  # where it paints over what was there: at first almost nowhere
         reward, logit = self.outcome(hidden).unbind(dim=1)
         return (1.0 - mask) * frames + mask * drawn.sigmoid(), reward, logit
 

@@ -64,7 +64,7 @@ class Judge:
 
     task: str = "arrow_puzzle"
     """Task whose world is imagined."""
-    models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite)")] = None
+    models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite but slow ones)")] = None
     """World models; 'imagine-bench list' names them."""
     sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
         100,
@@ -92,8 +92,9 @@ class Judge:
         from imagine_bench.judge.models.study import Judgement, judge  # noqa: PLC0415 - as above
         from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
 
+        usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
         judgement = Judgement(
-            task=self.task, models=self.models or tuple(registry.WORLD_MODELS), sizes=self.sizes, seeds=self.seeds,
+            task=self.task, models=self.models or usual, sizes=self.sizes, seeds=self.seeds,
             samples=self.samples, appearance=self.appearance, policy=self.policy,
         )  # fmt: skip
         folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)

@@ -99,7 +99,7 @@ def transition_sheet(
         draw.multiline_text((left_px(column), 8), lines, font=font(12, bold=True), fill=INK, spacing=3)
     for row, (name, images, verdicts) in enumerate(rows):
         top = HEADER_PX + row * height
-        label = "\n".join(textwrap.wrap(name, width=13))
+        label = "\n".join(textwrap.wrap(name, width=12, break_long_words=False))
         draw.multiline_text((8, top + 40), label, font=font(13, bold=True), fill=INK, spacing=4)
         for column, image in enumerate(images):
             left = left_px(column)

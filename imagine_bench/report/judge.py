@@ -31,10 +31,14 @@ COLUMNS = {
     "reward_error": "reward error", "end_error": "end error", "value_loss": "value loss", "regret": "regret of 1 of 5",
     "auroc_epistemic": "AUROC, wrong", "auroc_never": "AUROC, never seen", "worth_of_refusing": "worth of refusing",
     "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
+    "encoder_frames": "frames beforehand",
 }  # fmt: skip
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "regret", "auroc_epistemic", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
+_SHARES = {"total_variation", "tv_5", "tv_10", "nothing", "outcome_ece", "end_error", "auroc_epistemic", "auroc_never"}
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
+_WHOLE = 1_000  # from here on no decimals are shown
+_TELLING = 0.1  # total variation
 Cells = Mapping[tuple[str, int], Sequence[dict[str, Any]]]
 """Kept cells, one a seed, by model and transitions."""
 
@@ -62,14 +66,15 @@ def scores(cells: Sequence[dict[str, Any]], name: str) -> list[float]:
     return [math.nan if value is None else float(value) for value in values]
 
 
-def mean_cell(values: Sequence[float]) -> TableCell:
-    """Interquartile mean over seeds with its 95 % interval; a dash where no seed has a number."""
+def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
+    """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
     there = [value for value in values if not math.isnan(value)]
     if not there:
         return TableCell(text=DASH)
-    low, high = interval(there)
+    low, high = interval(there, share=share)
     shown = "" if math.isnan(low) or low == high else f"[{number(low)}, {number(high)}]"
-    return TableCell(text=number(iqm(there)), interval=shown)
+    value = iqm(there)
+    return TableCell(text=f"{value:,.0f}" if value >= _WHOLE else number(value), interval=shown)
 
 
 def _title(model: str) -> str:
@@ -78,7 +83,11 @@ def _title(model: str) -> str:
 
 def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list[Any]]:
     return [
-        [_title(model), f"{size:,}", *(mean_cell(scores(cells[model, size], name)) for name in names)]
+        [
+            _title(model),
+            f"{size:,}",
+            *(mean_cell(scores(cells[model, size], name), share=name in _SHARES) for name in names),
+        ]
         for model, size in itertools.product(judgement.models, judgement.sizes)
         if (model, size) in cells
     ]
@@ -139,11 +148,15 @@ def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[
 def _csv(cells: Cells) -> str:
     names = ["model", "transitions", "seed", *COLUMNS]
     rows = [
-        [model, size, cell["seed"], *(f"{scores([cell], name)[0]:.6g}" for name in COLUMNS)]
+        [model, size, cell["seed"], *(_plain(scores([cell], name)[0]) for name in COLUMNS)]
         for (model, size), each in cells.items()
         for cell in each
     ]
     return csv_text([names, *rows])
+
+
+def _plain(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"
 
 
 def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Table:
@@ -175,17 +188,31 @@ def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: st
 
 
 def _risk_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
-    last = judgement.sizes[-1]
-    curves = {model: [cell["risk"] for cell in cells[model, last] if cell["risk"]] for model in models}
-    series = {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+    size = _telling_size(judgement, cells, models)
+    series = _risks(cells, models, size)
     shares = [100.0 * share for share in COVERAGES]
     return image(
         "risk_coverage",
         lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
         alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
         caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
-        f"uncertainty are not here. After {last:,} transitions, mean over seeds.",
+        f"uncertainty are not here. After {size:,} transitions, where most of them still err, mean over seeds.",
     )  # fmt: skip
+
+
+def _risks(cells: Cells, models: Sequence[str], size: int) -> dict[str, list[float]]:
+    """Mean risk by coverage of each model that learned and says how sure it is."""
+    own = {model: cells.get((model, size), ()) for model in models if not registry.world_model_entry(model).privileged}
+    curves = {model: [cell["risk"] for cell in each if cell["risk"]] for model, each in own.items()}
+    return {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+
+
+def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> int:
+    """The most transitions after which more than one model is wrong in a tenth of all; else the fewest."""
+    for size in judgement.sizes[::-1]:
+        if sum(curve[-1] > _TELLING for curve in _risks(cells, models, size).values()) > 1:
+            return size
+    return judgement.sizes[0]
 
 
 def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
@@ -235,7 +262,7 @@ def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: S
         wheres = [cell["where"] for cell in cells[model, last]]
         for kind, name in {(kind, name): None for where in wheres for kind, each in where.items() for name in each}:
             values = [where[kind][name] for where in wheres if name in where[kind]]
-            groups.setdefault((kind, name), {})[model] = mean_cell(values)
+            groups.setdefault((kind, name), {})[model] = mean_cell(values, share=True)
     rows: list[list[str | TableCell]] = [
         [kind, name, *(found.get(model, DASH) for model in models)] for (kind, name), found in groups.items()
     ]

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.certificates.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
 from imagine_bench.store.encoders import bundled
@@ -36,6 +37,7 @@ def describe(name: str) -> str:
         "chance level": f"{100 * facts.chance_level:.1f} % of episodes solved by blind choice",
         "optimum": f"{100 * facts.optimum:.1f} %, with a return of {facts.optimal_return:.2f}",
         "plan lengths": f"{_plan_lengths(spec)}; mean {facts.mean_plan_length:.2f}",
+        **certificate_rows(certificate(spec)),
         "encoders": _encoders(spec),
     }
     return _page(spec.title, spec.description, rows)

@@ -45,7 +45,7 @@ class Dials:
         value, kind = getattr(self, name), type(low)
         right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
         if not right or not low <= value <= high:
-            words = f"{'an integer' if kind is int else 'a number'} from {low:g} to {high:g}"
+            words = f"an integer from {low} to {high}" if kind is int else f"a number from {low:g} to {high:g}"
             also = f", or {' or '.join(GESTURES)}" if name == "gesture" else ""
             raise InvalidValueError(f"{name} is {brief(value)}; give {words}{also}.")
         return kind(value)

@@ -115,7 +115,8 @@ class PickWorld(World):
         else happened is not what they asked for, so they withdraw.
         """
         before, poses = self._objects()[0], self.object_poses()
-        result = yield from self._act(action, before, capture_motion_hz)
+        stays = before == intended[:N_OBJECTS]
+        result = yield from self._act(action, before, stays, capture_motion_hz)
         self.update()
         self.executor.rest(self.data, held_object(self._objects()[0]))
         self.update()
@@ -127,17 +128,17 @@ class PickWorld(World):
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
-    def _act(self, action: int, objects: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
-        """What the robot does, possible or not: what it cannot do it reaches out for in vain."""
+    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> Motion[MacroResult]:
+        """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
         held, executor = held_object(objects), self.executor
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
-            if held is not None and self._read_gesture() == OPEN_PALM:
+            if held is not None and self._read_gesture() == OPEN_PALM and not stays:
                 return executor.hand_over(self.data, index=held, palm_m=palm_m, capture_motion_hz=capture_motion_hz)
             place_m = np.array([*PALM_M[:2], PALM_M[2] + _VAIN_M])
-        elif HANDED_OVER not in objects and held == action:
+        elif HANDED_OVER not in objects and held == action and not stays:
             return executor.place(self.data, index=action, capture_motion_hz=capture_motion_hz)
-        elif HANDED_OVER not in objects and held is None:
+        elif HANDED_OVER not in objects and held is None and not stays:
             return executor.pick(self.data, index=action, capture_motion_hz=capture_motion_hz)
         else:
             x_m, y_m, z_m = standing_m(action)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
-from imagine_bench.interfaces import Outcome
+from imagine_bench.interfaces import Outcome, TaskSpec
+from imagine_bench.rules import facts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,3 +52,38 @@ class Wheels:
             return Outcome(share, reached, -5.0, terminated=True, success=False)
         done = reached[reached[-1]] == 0
         return Outcome(share, reached, 50.0 if done else -1.0, terminated=done, success=done)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Glimpse:
+    """What frames show of :class:`Wheels`: the finger always, in the first frame only, or with a probability."""
+
+    finger: str | float = "always"
+    lag: int = 0
+
+    def seen(self, macrostate, step):
+        hidden = (*macrostate[:-1], -1)
+        if self.finger in ("always", "first"):
+            return ((1.0, macrostate if self.finger == "always" or step == 0 else hidden),)
+        return ((self.finger, macrostate), (1 - self.finger, hidden))
+
+
+def spec_of(rules, horizon, sight=None):
+    """A task of such a machine, for what needs no scene."""
+    wheels = [f"wheel {i}" for i in range(rules.n)]
+    return TaskSpec(
+        id="wheels",
+        title="Wheels",
+        description="Wheels.",
+        env_id="none",
+        horizon=horizon,
+        action_names=tuple(f"turn {name} {way}" for name in wheels for way in ("forth", "back")),
+        macrostate_names=(*wheels, "finger"),
+        macrostate_values=(*[tuple("0123")] * rules.n, tuple(map(str, range(rules.n)))),
+        preprocessing="gray_strips",
+        encoder="none",
+        rules=rules,
+        facts=lambda: facts(rules, horizon),
+        render_macrostates=None,
+        sight=sight,
+    )

@@ -110,7 +110,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     for seed in judgement.seeds:
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
-    cells = [Cell(m, s, n) for m in judgement.models for s in judgement.seeds for n in judgement.sizes]
+    cells = [Cell(m, s, n) for s in judgement.seeds for m in judgement.models for n in judgement.sizes]
     waiting = [cell for cell in cells if not (folder / cell.file).exists()]
     failed: dict[str, None] = {}
     with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:

@@ -1,0 +1,184 @@
+"""The best deterministic policy without memory: one action for each thing that a frame can show.
+
+A mixed-integer programme over occupancies: ``x[t, w, a]`` is the probability of doing ``a`` in ``w`` after ``t``
+macro-actions, where ``w`` is the macrostates whose frames are still to come and what is shown now; ``p[o, a]`` in
+{0, 1} is the policy, and ``x[t, w, a] <= u[t, w] p[o(w), a]`` with ``u`` a bound on how probable ``w`` can be made.
+HiGHS solves it by branch and bound; what it finds is then improved one action at a time.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from imagine_bench.interfaces import Rules, Sight, State
+
+_Seen = tuple[tuple[State, ...], State]
+"""The macrostates whose frames are still to come, the newest last, and what is shown now."""
+MOST, SOLVED = 30_000, 8_000
+"""Occupancies up to which a policy is looked for, and up to which the programme is solved."""
+NODES = 20
+_GAIN = 1e-7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Memoryless:
+    """The success probability of the best policy found, and what no other can exceed."""
+
+    value: float
+    bound: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layer:
+    """What may be after t macro-actions."""
+
+    most: dict[_Seen, float]  # the largest probability that it can be given; at the start the only one
+    links: dict[tuple[_Seen, int], list[tuple[float, _Seen]]]  # by (what is, action): where the episode goes on
+    wins: dict[tuple[_Seen, int], float]
+
+
+def _layers(rules: Rules, sight: Sight, horizon: int) -> Iterator[_Layer]:
+    most: dict[_Seen, float] = defaultdict(float)
+    for start in rules.start_states:
+        for share, shown in sight.seen(start, 0):
+            most[(start,), shown] += share / len(rules.start_states)
+    for step in range(horizon):
+        links: dict[tuple[_Seen, int], list[tuple[float, _Seen]]] = {}
+        wins: dict[tuple[_Seen, int], float] = {}
+        after: dict[_Seen, float] = defaultdict(float)
+        for now, weight in most.items():
+            reached: dict[_Seen, float] = defaultdict(float)
+            for action in range(rules.n_actions):
+                links[now, action] = list(_next(rules, sight, now, action, step))
+                outcomes = rules.outcomes(now[0][-1], action)
+                wins[now, action] = sum(o.probability for o in outcomes if o.terminated and o.success)
+                for share, then in links[now, action]:
+                    reached[then] = max(reached[then], share)
+            for then, share in reached.items():
+                after[then] += weight * share
+        yield _Layer(most=most, links=links, wins=wins)
+        most = {then: min(weight, 1.0) for then, weight in after.items()}
+
+
+def _next(rules: Rules, sight: Sight, now: _Seen, action: int, step: int) -> Iterator[tuple[float, _Seen]]:
+    window, shown = now
+    frame = step + 1 - sight.lag
+    for outcome in rules.outcomes(window[-1], action):
+        if outcome.terminated:
+            continue
+        longer = (*window, outcome.macrostate) if sight.lag and step else (outcome.macrostate,)
+        if frame < 1:
+            yield outcome.probability, (longer, shown)
+        else:
+            for share, what in sight.seen(longer[0], frame):
+                yield outcome.probability * share, (longer[1:] if sight.lag else longer, what)
+
+
+def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: float, nodes: int = NODES) -> Memoryless:
+    """Solve the programme, or say after so many nodes of the search what was found and what is proved.
+
+    ``bound`` is the optimum with memory: a policy without it that reaches it is the best, and where the programme is
+    too large, no other bound is proved. A value of 0 says that none was looked for.
+    """
+    layers: list[_Layer] = []
+    for layer in _layers(rules, sight, horizon):
+        layers.append(layer)
+        if sum(len(each.links) for each in layers) > MOST:
+            return Memoryless(value=0.0, bound=bound)
+    choices = _choices(layers)
+    value = _climb(layers, choices, {})
+    if value < bound - _GAIN and sum(len(each.links) for each in layers) <= SOLVED:
+        policy, proved = _solve(layers, choices, nodes)
+        value, bound = max(value, _climb(layers, choices, policy)), min(bound, proved)
+    return Memoryless(value=value, bound=float(max(bound, value)))
+
+
+def _climb(layers: list[_Layer], choices: dict[tuple[State, int], int], policy: dict[State, int]) -> float:
+    """Change a policy, one action at a time, while that helps; its value then."""
+    policy = {**{shown: action for shown, action in reversed(choices)}, **policy}
+    value, better = _value(layers, policy), True
+    while better:
+        better = False
+        for shown, action in choices:
+            other = policy | {shown: action}
+            if action != policy[shown] and (found := _value(layers, other)) > value + _GAIN:
+                policy, value, better = other, found, True
+    return value
+
+
+def _choices(layers: list[_Layer]) -> dict[tuple[State, int], int]:
+    """A column for each (what is shown, action), but for actions that can only end an episode without a success."""
+    useful: dict[State, set[int]] = defaultdict(set)
+    everything: dict[State, None] = {}
+    n_actions = 1 + max(action for _, action in layers[0].links)
+    for layer in layers:
+        for (now, action), links in layer.links.items():
+            everything.setdefault(now[1])
+            if links or layer.wins[now, action]:
+                useful[now[1]].add(action)
+    pairs = ((shown, action) for shown in everything for action in sorted(useful[shown]) or range(n_actions))
+    return {pair: column for column, pair in enumerate(pairs)}
+
+
+def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: int) -> tuple[dict[State, int], float]:
+    """The best policy found and the bound proved."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # noqa: PLC0415 - loads for long
+    from scipy.sparse import coo_array  # noqa: PLC0415
+
+    used = [[pair for pair in layer.links if (pair[0][1], pair[1]) in choices] for layer in layers]
+    column = [{} for _ in layers]  # type: list[dict[tuple[_Seen, int], int]]
+    total = len(choices)
+    for here, pairs in zip(column, used, strict=True):
+        here.update((pair, total + i) for i, pair in enumerate(pairs))
+        total += len(pairs)
+    entries: list[tuple[float, int, int]] = []
+    low: list[float] = []
+    high: list[float] = []
+    gain, most = np.zeros(total), np.ones(total)
+    for shown in dict.fromkeys(shown for shown, _ in choices):  # one action each
+        entries += [(1.0, len(low), at) for (what, _), at in choices.items() if what == shown]
+        low.append(1.0)
+        high.append(1.0)
+    for step, layer in enumerate(layers):
+        flow = {now: len(low) + i for i, now in enumerate(layer.most)}
+        low += [weight if step == 0 else 0.0 for weight in layer.most.values()]
+        high += low[-len(flow) :]
+        entries += [(1.0, flow[pair[0]], at) for pair, at in column[step].items()]
+        for pair, at in column[step - 1].items() if step else ():
+            entries += [(-share, flow[then], at) for share, then in layers[step - 1].links[pair]]
+        for pair, at in column[step].items():  # nothing is done that the policy does not say
+            weight = layer.most[pair[0]]
+            entries += [(1.0, len(low), at), (-weight, len(low), choices[pair[0][1], pair[1]])]
+            low.append(-np.inf)
+            high.append(0.0)
+            gain[at], most[at] = layer.wins[pair], weight
+    values, rows, columns = zip(*entries, strict=True)
+    matrix = coo_array((values, (rows, columns)), shape=(len(low), total)).tocsr()
+    found = milp(
+        -gain,
+        integrality=np.arange(total) < len(choices),
+        bounds=Bounds(0.0, most),
+        constraints=LinearConstraint(matrix, np.array(low), np.array(high)),
+        options={"node_limit": nodes, "mip_rel_gap": 0.0},
+    )
+    policy = {} if found.x is None else {shown: action for (shown, action), at in choices.items() if found.x[at] > 0.5}
+    bound = 1.0 if found.mip_dual_bound is None else min(1.0, -found.mip_dual_bound)
+    return policy, bound
+
+
+def _value(layers: list[_Layer], policy: dict[State, int]) -> float:
+    """The success probability of a policy, exactly."""
+    now, won = layers[0].most, 0.0
+    for layer in layers:
+        after: dict[_Seen, float] = defaultdict(float)
+        for here, weight in now.items():
+            pair = here, policy[here[1]]
+            won += weight * layer.wins[pair]
+            for share, then in layer.links[pair]:
+                after[then] += weight * share
+        now = after
+    return won

@@ -1,0 +1,93 @@
+"""Every registered world model keeps the contract, and learns and draws from what it is given alone."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.agents.world_models import convolutional, latent
+from imagine_bench.agents.world_models.structured import StructuredModel
+
+from imagine_bench import registry
+from imagine_bench.data.collect import collect, policy_of
+from imagine_bench.data.episodes import Episodes
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+from imagine_bench.world_models import Imagined, WorldModel, require_imagined
+
+LEARNED = [name for name, entry in registry.WORLD_MODELS.items() if not entry.privileged]
+
+
+@functools.cache
+def data() -> Episodes:
+    spec = registry.task("arrow_puzzle")
+    policy = policy_of("uniform", spec, 1000)
+    return collect(spec, policy, episodes=80, seed=1000, execution="kinematic", appearance="clean")[0]
+
+
+def made(name: str) -> WorldModel:
+    entry, spec = registry.WORLD_MODELS[name], registry.task("arrow_puzzle")
+    path = None if entry.encoder_kind is None else encoders.own(spec, "clean", entry.encoder_kind)
+    context = AgentContext(
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models")
+    )
+    model: WorldModel = registry.load(entry.make)(context)
+    return model
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], WorldModel]:
+    """Models that were fitted in a few updates."""
+    monkeypatch.setattr(latent, "UPDATES", 3)
+    monkeypatch.setattr(convolutional, "_STEPS", 3)
+
+    def fitted(name: str) -> WorldModel:
+        model = made(name)
+        model.fit(data(), np.random.default_rng(1))
+        return model
+
+    return fitted
+
+
+def imagined(model: WorldModel, history: int = 1, depth: int = 3) -> Imagined:
+    frames = np.stack([data().frames[row : row + history] for row in (0, 2, 4, 6, 8)])
+    actions = np.random.default_rng(2).integers(6, size=(5, history - 1 + depth))
+    found = model.imagine(frames, actions, 4, np.random.default_rng(3))
+    return require_imagined(found, name="it", rows=5, depth=depth, samples=4)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_each_keeps_the_contract(name: str, quick: Callable[[str], WorldModel]) -> None:
+    model, again = quick(name), quick(name)
+    first, second = imagined(model), imagined(again)
+    for field, array in vars(first).items():
+        assert np.array_equal(array, getattr(second, field)), field
+    assert np.array_equal(imagined(model).pictures, first.pictures), "it was changed by imagining"
+    assert imagined(model, history=2, depth=1).pictures.shape[2] == 1
+    if first.p_ended is not None:
+        assert (np.diff(first.p_ended, axis=2) >= -1e-6).all(), "what is over begins again"
+    assert isinstance(model.parameters(), int)
+
+
+@pytest.mark.parametrize("name", ["mdn_dropout", "mdn_ensemble", "mdn_thesis", "gaussian"])
+def test_latent_models_offer_three_uncertainties(name: str, quick: Callable[[str], WorldModel]) -> None:
+    found = imagined(quick(name))
+    assert found.epistemic is not None and found.aleatoric is not None and found.modal is not None
+    assert (found.epistemic > 0).all() and (found.aleatoric > 0).all()
+    assert (found.modal == 0).all() == (name == "gaussian")
+
+
+def test_the_structured_model_knows_what_it_never_tried() -> None:
+    model = made("structured")
+    assert isinstance(model, StructuredModel)
+    model.fit(data(), np.random.default_rng(1))
+    little = made("structured")
+    little.fit(data().first(5), np.random.default_rng(1))
+    much, few = (imagined(each).epistemic for each in (model, little))
+    assert much is not None and few is not None and few.mean() > much.mean() + 0.1
+    found: Any = imagined(model)
+    assert found.aleatoric is None  # it has no such noise, and says so

@@ -1,0 +1,207 @@
+"""What says a world: names, values, and worlds that there are not."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrows.description import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
+from imagine_bench.tasks.dials.dials import GESTURES
+
+from imagine_bench import registry
+from imagine_bench.entrants import file_name, parse_options
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError
+from imagine_bench.protocols.control import protocol
+
+KINDS = {name: str(kind) for name, kind in {**Arrows.__base__.__annotations__, **Arrows.__annotations__}.items()}
+KEPT = {
+    ("ArrowPuzzle", "clean"): ("f59f3c47a32ff7f2", "d9f5eeb372d00e0a"),
+    ("ArrowPuzzle", "strong"): ("d5a66fefe14d69be", "5167ba48bf5a69bf"),
+    ("ArrowPuzzleHard", "clean"): ("e2becfb9223315ed", "56430409473e6d42"),
+    ("ArrowPuzzleHard", "strong"): ("7d895163e92aec91", "81df6f09e3f64fd8"),
+    ("ArrowPuzzleToward", "clean"): ("b24f672a386968cc", "0c05e79b1ce3f18c"),
+    ("ArrowPuzzleToward", "strong"): ("360a19014851253e", "a2569884b6dd6907"),
+    ("ArrowPuzzleClockwise", "clean"): ("b1f3d08c32f1f61a", "83370b891c07e3b5"),
+    ("ArrowPuzzleClockwise", "strong"): ("a2dbe02bbace033f", "b5a6ef6705f86b50"),
+    ("PickPlace", "clean"): ("b816c3c8a7639696", "737594c1acba46cd"),
+    ("PickPlace", "strong"): ("90d7888150abf724", "90ebcab3548f2414"),
+}
+"""Of each task as it was before there was a family (commit d67df46): what a walk did and drew, and its frames."""
+
+
+def walked(name, appearance):
+    """Hashes of macrostates, rewards, ends and the generator at last, and of the frames, of 60 macro-actions."""
+    options = {"execution": "kinematic", "appearance": appearance, "disable_env_checker": True}
+    env = gymnasium.make(f"imagine_bench/{name}-v0", **options)
+    what, frames = hashlib.sha256(), hashlib.sha256()
+    frame, info = env.reset(seed=11)
+    for action in np.random.default_rng(7).integers(env.action_space.n, size=60).tolist():
+        frames.update(frame.tobytes())
+        what.update(info["macrostate"].tobytes())
+        frame, reward, terminated, truncated, info = env.step(action)
+        what.update(repr((reward, terminated, truncated)).encode())
+        if terminated or truncated:
+            frame, info = env.reset()
+    what.update(json.dumps(env.unwrapped.np_random.bit_generator.state, sort_keys=True).encode())
+    env.close()
+    return what.hexdigest()[:16], frames.hexdigest()[:16]
+
+
+@pytest.mark.parametrize("appearance", ["clean", "strong"])
+def test_the_points_of_the_family_are_as_they_were(appearance):
+    """To the bit; frames where the renderer draws pick-and-place, whose scene has no part in this, as it did then."""
+    same_renderer = walked("PickPlace", appearance) == KEPT["PickPlace", appearance]
+    for (name, look), (what, frames) in KEPT.items():
+        if look == appearance:
+            found = walked(name, look)
+            assert found[0] == what and (found[1] == frames or not same_renderer), name
+
+
+def drawn(rng):
+    """A world with any values, or None where they contradict each other."""
+    cubes = int(rng.integers(1, 7))
+    pattern = "".join(map(str, rng.integers(4, size=cubes).tolist()))
+    choices = {
+        "cubes": cubes,
+        "goal": str(rng.choice([*GOALS, pattern])),
+        "forbid": str(rng.choice([*FORBIDS, "neighbours+agent", "equal+agent"])),
+        "coupling": str(rng.choice(COUPLINGS)),
+        "shuffle": int(rng.integers(2**32)),
+        "horizon": int(rng.integers(1, 1001)),
+        "slip": float(rng.uniform(0, 0.99)),
+        "fickle": float(rng.choice([0.25, 1.0, rng.uniform()])),
+        "gesture": [*GESTURES, float(rng.uniform())][rng.integers(3)],
+        "lag": int(rng.integers(11)),
+        "distractors": int(rng.integers(5)),
+    }
+    named = {name: value for name, value in choices.items() if name == "cubes" or rng.random() < 0.5}
+    try:
+        return Arrows(**named)
+    except InvalidValueError:
+        return None
+
+
+def test_a_canonical_name_says_its_world_and_only_it():
+    rng = np.random.default_rng(0)
+    worlds = [world for world in (drawn(rng) for _ in range(2000)) if world is not None]
+    assert len(worlds) > 1000
+    for world in worlds:
+        _, _, said = str(world).partition(":")
+        again = Arrows(**parse_options(said, KINDS, "")) if said else Arrows()
+        assert again == world and str(again) == str(world) and again.hash == world.hash
+    assert len({str(world) for world in worlds}) == len(set(worlds)) == len({world.hash for world in worlds})
+    assert len({file_name(str(world)) for world in worlds}) == len(set(worlds))
+
+
+@pytest.mark.parametrize(
+    ("said", "name"),
+    [
+        ("arrows:slip=1e-1,cubes=5", "arrows:cubes=5,slip=0.1"),
+        ("arrows:cubes=3,coupling=none,fickle=1", "arrows:fickle=1.0"),
+        ("arrows:horizon=10", "arrow_puzzle"),
+        ("arrows:forbid=equal+agent,horizon=10", "arrow_puzzle_hard"),
+        ("arrow_puzzle:cubes=1,horizon=2", "arrow_puzzle_easy"),
+        ("arrow_puzzle:slip=0.1", "arrows:horizon=10,slip=0.1"),
+        ("arrow_puzzle:horizon=null", "arrows"),
+        ("pick_place:fickle=0.5,slip=0.1", "pick_place:slip=0.1,fickle=0.5"),
+        ("pick_place:slip=0", "pick_place"),
+        ("arrows:goal=120,forbid=none", "arrows:goal=120,forbid=none"),
+    ],
+)
+def test_one_world_has_one_name(said, name):
+    spec = registry.task(said)
+    assert registry.task_name(said) == spec.id == registry.task(spec.id).id == name
+    assert registry.task_entry(said).env_id == spec.env_id
+    assert gymnasium.spec(spec.env_id).kwargs == dict(registry.task_entry(spec.id).options) or said != name
+    assert protocol(said, "smoke", agents=("random",)).task == name
+    assert protocol(said, "smoke", agents=("random",)).hash == protocol(name, "smoke", agents=("random",)).hash
+
+
+def test_a_world_may_lie_in_a_file(tmp_path):
+    file = tmp_path / "world.json"
+    file.write_text('{"cubes": 4, "goal": "0123", "slip": 0.1}')
+    assert registry.task_name(f"arrows:@{file}") == "arrows:cubes=4,goal=0123,slip=0.1"
+    for content in ("[1]", "{", '{"cubes": 9}', '{"cube": 3}', '{"goal": 12}'):
+        file.write_text(content)
+        with pytest.raises(ImagineBenchError):
+            registry.task(f"arrows:@{file}")
+
+
+@pytest.mark.parametrize(
+    ("said", "complaint"),
+    [
+        ("cubes=7", "cubes is 7; give an integer from 1 to 6"),
+        ("cubes=2.0", "cubes is 2.0; give an integer"),
+        ("slip=1.5", "slip is 1.5; give a number from 0 to 0.99"),
+        ("slip=NaN", "slip is nan"),
+        ("fickle=x", "fickle is 'x'; give a number from 0 to 1"),
+        ("gesture=never", "gesture is 'never'; give a number from 0 to 1, or always or first"),
+        ("goal=0123", "Goal '0123' does not fit 3 cubes; give a pattern of 3 digits from 0 to 3"),
+        ("goal=019", "Goal '019' does not fit"),
+        ("goal=up", "No goal 'up'. Known: pointed, toward_agent, clockwise, all, a pattern of 3 digits"),
+        ("forbid=equal+none", "contradicts or repeats itself"),
+        ("cubes=4,forbid=equal", "forbid=equal leaves no legal turn with 4 cubes, for an arrow has only 4 directions"),
+        ("cubes=1,fickle=0.1", "fickle=0.1 needs another cube"),
+        (
+            "goal=all",
+            "no start from which its goal can be reached: of 192 macrostates 72 are legal and 0 of them goals",
+        ),
+        ("goal=toward_agent,forbid=agent", "192 are legal and 0 of them goals"),
+        ("cubez=3", "No option of task arrows 'cubez'. Did you mean 'cubes'? Known: "),
+        ("cubes", "'cubes' is not of the form name=value"),
+        ("cubes=2,cubes=3", "names 'cubes' twice"),
+        ("", "'' is not of the form name=value"),
+        ("@nowhere.json", "nowhere.json cannot be read"),
+    ],
+)
+def test_bad_worlds_end_with_one_sentence(said, complaint):
+    for ask in (registry.task, registry.task_entry, protocol):
+        with pytest.raises(ImagineBenchError) as caught:
+            ask(f"arrows:{said}")
+        assert complaint in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_names_of_other_tasks_are_refused():
+    with pytest.raises(UnknownNameError, match=r"No task 'arows'. Did you mean 'arrows'"):
+        registry.task("arows:cubes=3")
+    with pytest.raises(UnknownNameError, match=r"No option of task pick_place 'cubes'. Known: slip"):
+        registry.task("pick_place:cubes=3")
+    for id_ in ("Arrows", "ArrowPuzzle", "PickPlace"):
+        with pytest.raises(UnknownNameError, match="No keyword argument 'cubez'"):
+            gymnasium.make(f"imagine_bench/{id_}-v0", cubez=3)
+    with pytest.raises(InvalidValueError, match="No environment shows lag=2 yet"):
+        gymnasium.make("imagine_bench/Arrows-v0", lag=2)
+
+
+def test_turns_are_coupled_to_the_right_and_shuffled():
+    plain, coupled, shuffled = Arrows(), Arrows(coupling="neighbour"), Arrows(coupling="neighbour", shuffle=4)
+    assert plain.turns[:2] == ((Turn(0, clockwise=True),), (Turn(0, clockwise=False),))
+    assert coupled.turns[3] == (Turn(1, clockwise=False), Turn(2, clockwise=False))
+    assert coupled.turns[4] == (Turn(2, clockwise=True),)
+    assert set(shuffled.turns) == set(coupled.turns) and shuffled.turns != coupled.turns
+    assert Arrows(shuffle=4).turns != Arrows(shuffle=5).turns
+    named, spec = registry.task("arrows").action_names, registry.task("arrows:shuffle=4")
+    assert set(spec.action_names) == set(named) and spec.action_names != named
+
+
+@pytest.mark.parametrize(
+    "world", [{"cubes": 5, "slip": 0.1}, {"cubes": 1}, {"horizon": 3}, {"cubes": 6, "goal": "pointed"}]
+)
+def test_gymnasium_makes_worlds_that_end_at_their_horizon(world):
+    spec = registry.task("arrows:" + ",".join(f"{name}={value}" for name, value in world.items()))
+    one = gymnasium.make("imagine_bench/Arrows-v0", **world, execution="kinematic")
+    many = gymnasium.make_vec("imagine_bench/Arrows-vector-v0", num_envs=2, **world, execution="kinematic")
+    named = gymnasium.make(spec.env_id, execution="kinematic")
+    there, back = 0, spec.action_names.index(spec.action_names[0].replace("clockwise", "counter-clockwise"))
+    frames = [env.reset(seed=3)[0] for env in (one, named)]
+    assert np.array_equal(*frames) and np.array_equal(many.reset(seed=3)[0][0], frames[0])
+    for step in range(spec.horizon):
+        action = (there, back)[step % 2]
+        (*_, cut, _), (*_, also, _) = one.step(action), named.step(action)
+        assert cut == also == (step == spec.horizon - 1)
+    assert many.unwrapped._horizon == spec.horizon
+    for env in (one, many, named):
+        env.close()
