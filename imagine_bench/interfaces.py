@@ -225,8 +225,9 @@ class TaskSpec:
         return len(self.action_names)
 
     def value_names(self, macrostate: Sequence[int] | Macrostate) -> tuple[str, ...]:
-        """The names of a macrostate's values, one a coordinate. Length M."""
-        return tuple(names[int(value)] for names, value in zip(self.macrostate_values, macrostate, strict=True))
+        """The names of a macrostate's values, one a coordinate, "not seen" for -1. Length M."""
+        pairs = zip(self.macrostate_values, macrostate, strict=True)
+        return tuple("not seen" if value < 0 else names[int(value)] for names, value in pairs)
 
 
 def appearance_of_tests(appearance: str) -> str:

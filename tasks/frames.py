@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Rules
-from imagine_bench.rules import require_macrostates
+from imagine_bench.rules import require_macrostates, states_of
 
+from .dials.gesture import HIDDEN
 from .macro_env import FRAME_PX, agent_camera
 from .rendering import Renderer
 from .scenes.appearance import Appearance
@@ -32,15 +33,23 @@ def frames_of(
 ) -> Frame:
     """Frames (N, 64, 64, 3), uint8, of macrostates (N, M) in the kinematic mode, each placed and varied anew.
 
+    A gesture of -1 is hidden.
+
     Raises:
         UnknownNameError: No such appearance.
         InvalidValueError: Macrostates of another shape or type, or none of the rules'.
     """
+    macrostates = np.asarray(macrostates)
+    hidden = macrostates[..., -1] == HIDDEN
+    if hidden.any():  # the hand is somewhere
+        like = {state[:-1]: state for state in states_of(rules)}
+        macrostates = np.array([like.get(tuple(row[:-1]), row) if row[-1] == HIDDEN else row for row in macrostates])
     macrostates = require_macrostates(rules, macrostates)
     world, camera = _frame_renderer(make_world, appearance_level(appearance), threading.get_ident())
     frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
     for row, macrostate in enumerate(macrostates.tolist()):
         world.place(tuple(macrostate), rng)
+        world.hide_gesture(bool(hidden[row]))
         world.vary(rng)
         frames[row] = world.develop(camera.frame(world.data))
     return frames

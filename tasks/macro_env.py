@@ -18,6 +18,8 @@ from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameEr
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 from imagine_bench.rules import states_of
 
+from .dials.gesture import hides
+from .dials.lag import Lag
 from .motion.executor import MacroResult, finish
 from .motion.executor import Motion as Acting
 from .observations import Observer
@@ -54,6 +56,8 @@ class EnvState:
     begun: bool
     latest: MacroResult | None = field(repr=False)
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
+    steps: int = 0
+    under_way: tuple[Any, ...] = field(default=(), repr=False)  #: observations that lag keeps back
 
 
 class MacroEnv(gymnasium.Env[Any, np.int64]):
@@ -125,6 +129,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts, self.horizon = spec.rules.start_states, spec.horizon
+        self._sight, self._lag, self._steps = spec.sight, Lag(spec.sight.lag if spec.sight else 0), 0
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         self._make_world, self.world = make_world, make_world(appearance_level(appearance))
@@ -139,9 +144,8 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._human_camera: Renderer | None = None
         self._window = Window(spec.title) if self.render_mode == "human" else None
         self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
-        self._begun, self._macrostate = False, self._starts[0]
+        self._begun, self._macrostate, self._people = False, self._starts[0], self._mocap()
         self._latest: MacroResult | None = None
-        self._people = self._mocap()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -164,9 +168,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun, self._latest = True, None
+        self._begun, self._latest, self._steps, self._lag.kept = True, None, 0, ()
         self.world.place(start, self.np_random)
-        self.world.vary(self.np_random)
+        self._vary()
         reading = self.world.read()
         self._macrostate = reading.macrostate
         legal = self._rules.is_legal(reading.macrostate)
@@ -192,6 +196,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         if not self._begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
         chosen = self.checked(action)
+        self._steps += 1
         self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
@@ -203,7 +208,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
-        self.world.vary(self.np_random, move_objects=self._execution == "kinematic")
+        self._vary(move_objects=self._execution == "kinematic")
         reading = self.world.read()
         self._macrostate, self._begun = reading.macrostate, True
         fault = fault or reading.problem
@@ -225,8 +230,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         return self._begun
 
     def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
-        """What :meth:`reset` and :meth:`step` return of environments like this as they stand, by its cameras."""
-        return self._observer.observe([(env._observer, env._macrostate) for env in envs])
+        """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
+        now = self._observer.observe([(env._observer, env.world.shown(env._macrostate)) for env in envs])
+        return [env._lag.deliver(observation) for env, observation in zip(envs, now, strict=True)]
 
     def share(self, envs: Sequence[MacroEnv]) -> Callable[[mujoco.MjData], None]:
         """Have a second process draw for :meth:`observe`, as :meth:`.Observer.share` says."""
@@ -261,6 +267,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         return EnvState(
             kind=self._kind, world=self.world.get_state(), generator=copy.deepcopy(self.np_random.bit_generator.state),
             macrostate=self._macrostate, begun=self._begun, latest=self._latest, people=self._people,
+            steps=self._steps, under_way=self._lag.kept,
         )  # fmt: skip
 
     def set_state(self, state: EnvState) -> None:
@@ -278,6 +285,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._macrostate, self._begun, self._latest, self._people = (
             state.macrostate, state.begun, state.latest, state.people,
         )  # fmt: skip
+        self._steps, self._lag.kept = state.steps, state.under_way
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
@@ -404,6 +412,12 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         if size == FRAME_PX:
             return self._agent_camera
         return Renderer(self.world.model, replace(_AGENT_VIEW, width=size, height=size))
+
+    def _vary(self, *, move_objects: bool = True) -> None:
+        """Draw how this moment looks, and where that is hidden by chance, whether the gesture is seen."""
+        if self._sight is not None:
+            self.world.hide_gesture(hides(self._sight, self.world.read().macrostate, self._steps, self.np_random))
+        self.world.vary(self.np_random, move_objects=move_objects)
 
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""

@@ -33,8 +33,9 @@ class Observer:
     """Observations of a world: one part as it is, several, separated by commas, as a dict.
 
     ``frame`` is the agent's camera and ``human`` the whole scene, uint8 (size, size, 3). ``state`` is the macrostate, a
-    one-hot vector for each coordinate, float32. ``proprio`` is float32 (16,): seven joints (rad), each finger's
-    distance from the grip's middle (m), and the point between them: position (m) and quaternion (w, x, y, z).
+    one-hot vector for each coordinate, zeros where it is hidden, float32. ``proprio`` is float32 (16,): seven joints
+    (rad), each finger's distance from the grip's middle (m), and the point between them: position (m) and quaternion
+    (w, x, y, z).
 
     Args:
         choice: Names in :data:`PARTS`.
@@ -105,7 +106,7 @@ class Observer:
 
     def _one_hot(self, macrostate: tuple[int, ...]) -> NDArray[np.float32]:
         one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
-        one_hot[self._offsets[:-1] + macrostate] = 1.0
+        one_hot[[first + value for first, value in zip(self._offsets, macrostate, strict=False) if value >= 0]] = 1.0
         return one_hot
 
     def _proprio(self) -> NDArray[np.float32]:

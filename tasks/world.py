@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
+from .dials.gesture import HIDDEN
 from .motion import orientation
 from .motion.executor import MacroResult, Motion, at_rest, finish
 from .motion.sensing import Sensing
@@ -72,6 +73,7 @@ class World(abc.ABC):
         self._photographer = None if level.pool is None else Photographer(level)
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
+        self._people = [model.material(name).id for name in ("skin", "cloth")]
         self._read_at: tuple[bytes, bytes] | None = None
         self._latest_objects: tuple[tuple[int, ...], str | None] = ((), None)
         self._rest_qpos, self._rest_ctrl = at_rest(model)
@@ -121,6 +123,14 @@ class World(abc.ABC):
         self._gesture(gesture)
         self.update()
 
+    def hide_gesture(self, hidden: bool) -> None:
+        """Let no camera see people's hands and arms, or let all; where they are stays as it is."""
+        self.model.mat_rgba[self._people, 3] = 0.0 if hidden else 1.0
+
+    def shown(self, macrostate: tuple[int, ...]) -> tuple[int, ...]:
+        """What cameras see of a macrostate: its gesture is -1 where it is hidden."""
+        return (*macrostate[:-1], HIDDEN) if self.model.mat_rgba[self._people[0], 3] == 0.0 else macrostate
+
     def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
         """Draw this frame's light, colors, camera and hands as the appearance says.
 
@@ -141,7 +151,7 @@ class World(abc.ABC):
 
     def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
         (objects, _), gesture = self._objects(), self._read_gesture()
-        shot = photographer.draw(objects, gesture, rng)
+        shot = photographer.draw(objects, self.shown((*objects, gesture))[-1], rng)  # light would tell what is hidden
         for index, (value, fragment) in enumerate(zip(objects, shot.objects, strict=True)):
             if move_objects:
                 x, y, _, yaw = fragment.offset

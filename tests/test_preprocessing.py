@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from imagine_bench.errors import UnknownNameError
-from imagine_bench.preprocessing import gray_strips, join_strips, preprocess, small_rgb, whole_rgb
+from imagine_bench.preprocessing import gray_cells, gray_name, join_cells, preprocess, small_rgb, whole_rgb
 
 
 def test_strips_hold_the_columns_of_their_cube():
     frames = np.zeros((1, 64, 64, 3), dtype=np.uint8)
     frames[:, :, :, :] = np.arange(64, dtype=np.uint8)[None, None, :, None]  # gray level = column
-    strips = gray_strips(frames)
+    strips = gray_cells(frames)
     assert strips.shape == (1, 3, 64, 22) and strips.dtype == np.float32
     for strip, start in zip(strips[0], (0, 21, 42), strict=True):
         np.testing.assert_allclose(strip[0] * 255, np.arange(start, start + 22), atol=1e-3)
@@ -19,7 +19,17 @@ def test_strips_hold_the_columns_of_their_cube():
 def test_joined_strips_are_the_gray_frame():
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
     gray = frames @ np.array([0.299, 0.587, 0.114]) / 255
-    np.testing.assert_allclose(join_strips(gray_strips(frames)), gray, atol=1e-6)
+    np.testing.assert_allclose(join_cells(gray_cells(frames)), gray, atol=1e-6)
+
+
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_joined_cells_are_cut_into_the_same_cells(cubes):
+    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    cells = preprocess(gray_name(cubes))(frames)
+    assert cells.shape[:2] == (2, cubes) and cells.dtype == np.float32
+    assert cells.min() >= 0.0 and cells.max() <= 1.0
+    again = np.rint(255 * join_cells(cells)).astype(np.uint8)[..., None].repeat(3, axis=-1)
+    np.testing.assert_allclose(preprocess(gray_name(cubes))(again), cells, atol=1 / 255)
 
 
 def test_whole_rgb_moves_channels_first():

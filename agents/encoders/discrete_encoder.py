@@ -39,7 +39,7 @@ _LEAST_SHARE = 0.02  # share of the images that makes a value
 _NEIGHBOURS = 16
 _LONELY = 0.05  # share of the images in the sparsest surroundings, which link nothing: they may lie between clouds
 _LEAST_GAP = 0.13  # of the root mean square of a factor's gaps; clouds with a narrower one between them are merged
-_IMAGES = 6000  # more find no other factors
+_IMAGES = 2000  # a channel, of three or more; more find no other factors
 _DEPENDENCE_IMAGES = 3000
 _CERTAIN = -20.0  # log variance of a latent that is known
 _DARK = 0.01  # of full scale; the median brightness is not taken for less
@@ -110,12 +110,12 @@ def smoothed(images: Tensor) -> Tensor:
 def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
     """Find the factors of unlabelled images (N, C, H, W) in [0, 1] and their values.
 
-    ``generator`` draws the 6000 images that are looked at, where there are more, and the exemplars.
+    ``generator`` draws the images that are looked at, 6000 or 2000 a channel, where there are more, and the exemplars.
 
     Raises:
         InvalidValueError: Nothing in the images ever changes, or no factor has more than one value.
     """
-    chosen = images[torch.randperm(len(images), generator=generator)[:_IMAGES]]
+    chosen = images[torch.randperm(len(images), generator=generator)[: _IMAGES * max(images.shape[1], 3)]]
     pixels = torch.cat([smoothed(chunk) for chunk in chosen.split(500)]).double().numpy()  # [N, X]
     found = [factor for group in pixel_groups(pixels) if (factor := _factor(pixels, group)) is not None]
     if not found:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
-from imagine_bench.preprocessing import PREPROCESSING, join_strips, preprocess
+from imagine_bench.preprocessing import PREPROCESSING, join_cells, preprocess
 
 from .discrete_encoder import DiscreteEncoder
 from .network import EncoderNetwork
@@ -213,8 +213,8 @@ def image_shape(preprocessing: str) -> tuple[int, int, int]:
 
 def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
     """One image of the whole view from preprocessed images: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
-    if preprocessing == "gray_strips":
-        return join_strips(images)
+    if preprocessing.startswith("gray"):
+        return join_cells(images)
     return np.ascontiguousarray(np.moveaxis(images, 1, -1), dtype=np.float32)
 
 

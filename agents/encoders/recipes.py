@@ -24,7 +24,7 @@ class Recipe:
     pixel_std: float = 1.0  #: standard deviation of Gaussian pixels, in units of the contrast
     beta: float = 4.0  #: weight of the KL term against a SUM over pixels
     kl_warmup: float = 0.0  #: fraction of the steps over which beta grows from 0
-    frames: int = 100_000
+    frames: int = 100_000  #: for codes, up to three channels; more take in proportion
     held_out_frames: int = 10_000  #: fresh frames for the probe's accuracy
     steps: int = 50_000  # 1000 epochs of 50 batches
     batch: int = 2000

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,7 @@ from imagine_bench.seeding import SeedTree
 
 from ..networks.weights import initialise
 from .discrete_encoder import DiscreteEncoder, discover
-from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae
+from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae, image_shape
 from .network import EncoderNetwork
 from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
@@ -57,9 +57,22 @@ class FrameSet:
         return self.images[rows].float() / 255.0
 
 
+def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
+    """All that frames of a task may show: every macrostate, and where something is hidden, those with -1 for it."""
+    states, sight = states_of(spec.rules), spec.sight
+    seen = [] if sight is None else [what for step in (0, 1) for s in states for _, what in sight.seen(s, step)]
+    return np.array(list(dict.fromkeys((*states, *seen))), dtype=np.int64)
+
+
+def classes_of(spec: TaskSpec) -> tuple[int, ...]:
+    """How many values each coordinate shows; one more, the last, where it may be hidden. Length M."""
+    hidden = [-1 in column for column in shown_states(spec).T.tolist()]
+    return tuple(len(values) + also for values, also in zip(spec.macrostate_values, hidden, strict=True))
+
+
 def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
-    """Frames of macrostates drawn uniformly from all that the rules know. Shapes (n, 64, 64, 3) and (n, M)."""
-    states = np.array(states_of(spec.rules), dtype=np.int64)
+    """Frames of macrostates drawn uniformly from all that frames show. Shapes (n, 64, 64, 3) and (n, M)."""
+    states = shown_states(spec)
     macrostates = states[rng.integers(len(states), size=n)]
     return spec.render_macrostates(macrostates, appearance, rng), macrostates
 
@@ -72,7 +85,7 @@ def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator,
     for start in range(0, n, _CHUNK):
         frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
         images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
-        labels.append(macrostates)
+        labels.append(macrostates % classes_of(spec))
         progress("frames", min(start + _CHUNK, n) / n)
     return FrameSet(images=torch.cat(images), macrostates=np.concatenate(labels))
 
@@ -152,6 +165,8 @@ def train_encoder(
         ArtefactError: The unfinished training is damaged or another one.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
+    if recipe.kind == "codes":
+        recipe = replace(recipe, frames=recipe.frames * max(image_shape(spec.preprocessing)[0], 3) // 3)
     require_known("appearance", appearance, APPEARANCES)
     progress = progress or (lambda stage, done: None)
     prepare_torch("cpu")
@@ -173,7 +188,7 @@ def train_encoder(
         clock |= {stage: at - earlier_s for stage, at in clock.items()}
     _round_to_half(network)
     clock["training"] = time.process_time()
-    cardinalities = tuple(len(values) for values in spec.macrostate_values)
+    cardinalities = classes_of(spec)
     latents = latents_of(network, data)
     probe, linear = (empty_probe(network.latent_size, cardinalities, hidden) for hidden in (PROBE_HIDDEN, 0))
     for reader in (probe.to_empty(device="cpu"), linear.to_empty(device="cpu")):
@@ -195,7 +210,7 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
         recipe=recipe,
         preprocessing=spec.preprocessing,
         macrostate_names=spec.macrostate_names,
-        cardinalities=tuple(len(values) for values in spec.macrostate_values),
+        cardinalities=classes_of(spec),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
         f"--recipe {recipe.name} --seed {seed}{_shorter(spec, recipe)}",

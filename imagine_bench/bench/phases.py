@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import closing
 
 from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
+from imagine_bench.bench.lanes import episodes_in_lanes, lanes_pay
 from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen, demonstrator
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
@@ -135,6 +136,14 @@ def test(run: Run) -> EvaluationCounts:
         train_in_model(run)
         counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
     purpose, privileged = evaluation_split(run.spec.seed), run.entry.privileged
+    seeds = [episode_seed(purpose, 0, each) for each in range(counters.test.episodes, run.protocol.evaluation_episodes)]
+    if lanes_pay(run, len(seeds)):
+        start_s = time.process_time()
+        for played in episodes_in_lanes(run, seeds):
+            counters.test.add(played)
+            counters.test.cpu_s += time.process_time() - start_s
+            run.made_progress("testing")
+            start_s = time.process_time()
     while counters.test.episodes < run.protocol.evaluation_episodes:
         play_test_episode(counters.test, run.test_env, run.agent, privileged=privileged, purpose=purpose)
         run.made_progress("testing")

@@ -90,6 +90,7 @@ class Judge:
     def __call__(self) -> None:
         """Judge and report."""
         from imagine_bench.judge.models.study import Judgement, judge  # noqa: PLC0415 - as above
+        from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as above
         from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
 
         usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
@@ -99,6 +100,7 @@ class Judge:
         )  # fmt: skip
         folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
         print(judgement_report(folder, judgement))
+        print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
             raise RunFailedError("\n".join(failed))
 

@@ -28,6 +28,7 @@ class RunSpec(Generic[P_co]):
     dataset: Path | None = None  #: The folder of the dataset that comes first, or None
     until: int | None = None  #: Budget after which it pauses, or None to the end
     checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
+    cores: int = 1  #: How many it may use; they change no result
 
     @property
     def work(self) -> int:

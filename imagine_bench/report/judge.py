@@ -13,16 +13,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
+from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
 from imagine_bench.judge.models.scores import COVERAGES
-from imagine_bench.judge.models.study import Cell, Judgement, kept
+from imagine_bench.judge.models.study import Judgement, kept, shown
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
 from imagine_bench.report.sections import Cell as TableCell
 from imagine_bench.statistics import difference, holm, interval, iqm
-from imagine_bench.store.codec import read_arrays
 from imagine_bench.store.files import csv_text, read_json
 
 COLUMNS = {
@@ -41,6 +41,8 @@ _WHOLE = 1_000  # from here on no decimals are shown
 _TELLING = 0.1  # total variation
 Cells = Mapping[tuple[str, int], Sequence[dict[str, Any]]]
 """Kept cells, one a seed, by model and transitions."""
+Pictures = Mapping[str, dict[str, Any]]
+"""What :func:`.judge.models.study.shown` gives."""
 
 
 def judgement_report(folder: Path, judgement: Judgement) -> str:
@@ -97,6 +99,7 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     spec = registry.task(judgement.task)
     made = read_json(folder / "judgement.json", "a judgement")
     errors = read_json(folder / "reader.json", "a reader's errors")
+    pictures = shown(folder, judgement)
     largest = [model for model in judgement.models if (model, judgement.sizes[-1]) in cells]
     table = Table(
         name="judgement", header=["world model", "transitions", *COLUMNS.values()], why_dash=_WHY_DASH,
@@ -111,11 +114,11 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
         "fog as something."
     ]
     sections = [
-        Section(title="Every score", words=words, tables=[table], images=_futures(folder, judgement, largest)),
+        Section(title="Every score", words=words, tables=[table], images=_futures(judgement, pictures)),
         Section(title="Does it know?", images=[_risk_image(judgement, cells, largest)]),
         Section(title="By depth", images=[_depth_image(judgement, cells, largest)]),
         Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
-        _where_section(spec, judgement, cells, largest, folder),
+        _where_section(spec, judgement, cells, largest, pictures),
     ]
     return Page(
         title=f"{spec.title}: world models against the exact truth",
@@ -226,15 +229,9 @@ def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> I
     )  # fmt: skip
 
 
-def _arrays(folder: Path, judgement: Judgement, model: str) -> dict[str, Any] | None:
-    path = folder / Path(Cell(model, judgement.seeds[0], judgement.sizes[-1]).file).with_suffix(".npz")
-    return dict(read_arrays(path)) if path.exists() else None
-
-
-def _futures(folder: Path, judgement: Judgement, models: Sequence[str]) -> list[Image]:
+def _futures(judgement: Judgement, found: Pictures) -> list[Image]:
     """One rollout, real and as each model imagines it."""
     names = registry.task(judgement.task).action_names
-    found = {model: arrays for model in models if (arrays := _arrays(folder, judgement, model)) is not None}
     if not found:
         return []
     one = next(iter(found.values()))
@@ -254,7 +251,9 @@ def _futures(folder: Path, judgement: Judgement, models: Sequence[str]) -> list[
     ]
 
 
-def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], folder: Path) -> Section:
+def _where_section(
+    spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], pictures: Pictures
+) -> Section:
     """Total variation by what may make it hard, and the worst ten transitions of each model."""
     last = judgement.sizes[-1]
     groups: dict[tuple[str, str], dict[str, TableCell]] = {}
@@ -271,15 +270,14 @@ def _where_section(spec: TaskSpec, judgement: Judgement, cells: Cells, models: S
         caption=f"Total variation of one step after {last:,} transitions; of a coordinate, that of it alone.",
     )  # fmt: skip
     images = []
-    for model in models:
-        arrays = _arrays(folder, judgement, model)
-        if arrays is not None and not arrays["worst_right"].all():
+    for model, arrays in pictures.items():
+        if not arrays["worst_right"].all():
             titles = [spec.action_names[action] for action in arrays["worst_actions"][:, 0]]
             strips: list[tuple[str, Any, Any]] = [
                 ("before", list(arrays["worst_before"]), None), ("real", list(arrays["worst_real"][:, 0]), None),
                 ("imagined", list(map(_rgb, arrays["worst_imagined"][:, 0])), arrays["worst_right"][:, 0].tolist()),
             ]  # fmt: skip
-            name = f"worst_{model}"
+            name = f"worst_{file_name(model)}"
             images.append(Image.of(png(transition_sheet(titles, strips)), name=name, alt=f"Worst of {_title(model)}",
                                    caption=f"The ten worst transitions of {_title(model)}."))  # fmt: skip
     return Section(title="Where it fails", tables=[table], images=images)

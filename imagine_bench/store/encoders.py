@@ -106,11 +106,12 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 
 
 def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
-    """The task's own encoder of a kind; that of another package's task is trained once.
+    """The task's own encoder of a kind; one of looks that none is bundled for is trained once.
 
     Raises as :func:`resolve`, and BusyError: another process trains it.
     """
-    if not registry.is_own(spec.id) and bundled_name(spec.encoder, appearance, kind) not in bundled():
+    looks_bundled = registry.is_own(spec.id) and any(name.startswith(f"{spec.encoder}-") for name in bundled())
+    if not looks_bundled and bundled_name(spec.encoder, appearance, kind) not in bundled():
         path, recipe = cached(spec, appearance, kind), "codes" if kind == "codes" else "default"
         settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
         what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"

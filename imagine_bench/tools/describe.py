@@ -27,7 +27,7 @@ def describe(name: str) -> str:
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
     chance = "some macro-actions have several outcomes" if is_random(spec.rules) else "none: each has one outcome"
     rows = {
-        "Gymnasium id": spec.env_id,
+        "Gymnasium id": _made_by(spec),
         "observation": f"64 x 64 RGB frame, for encoders preprocessed as {spec.preprocessing}",
         "macro-actions": f"{spec.n_actions}: {'; '.join(spec.action_names)}",
         "macrostate": "; ".join(factors),
@@ -55,6 +55,13 @@ def _plan_lengths(spec: TaskSpec) -> str:
     if len(lengths) > _MOST:
         return f"{min(lengths):g} to {max(lengths):g}"
     return ", ".join(f"{length:g} ({lengths[length]} starts)" for length in sorted(lengths))
+
+
+def _made_by(spec: TaskSpec) -> str:
+    """Its id, or that of its family, which needs no look-up first, and the keywords."""
+    base, _, said = spec.id.partition(":")
+    known = said and registry.has_task(base)
+    return f"{registry.task_entry(base).env_id}, with {said.replace(',', ', ')}" if known else spec.env_id
 
 
 def _encoders(spec: TaskSpec) -> str:

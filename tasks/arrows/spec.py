@@ -17,6 +17,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
+from imagine_bench.preprocessing import gray_name
 from imagine_bench.rules import facts
 
 from .description import Arrows
@@ -119,9 +120,10 @@ def _spec(world: Arrows) -> TaskSpec:
         ),
         macrostate_names=(*(f"{cube} arrow" for cube in cubes), "pointed cube"),
         macrostate_values=(_DIRECTIONS,) * world.cubes + (cubes,),
-        preprocessing="gray_strips",
-        encoder="arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}",
+        preprocessing=gray_name(world.cubes),
+        encoder=("arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}") + world.looks,
         rules=rules,
+        sight=world.sight(),
         facts=functools.partial(facts, rules, rules.horizon),
         render_macrostates=functools.partial(_rendered, rules),
         reference=name if name in _IN_THESIS else None,

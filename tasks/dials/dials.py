@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
+from imagine_bench.interfaces import State
+
+from .gesture import GestureSight
 
 GESTURES = ("always", "first")
 
@@ -72,11 +75,17 @@ class Dials:
             if name not in (*names, *others):
                 raise UnknownNameError("keyword argument", name, (*names, *others))
         world = cls(**{name: options.pop(name) for name in names if name in options})
-        world.require_shown()
+        if world.distractors:
+            raise InvalidValueError(f"No environment shows distractors={world.distractors} yet; leave it out.")
         return world
 
-    def require_shown(self) -> None:
-        """Raise InvalidValueError for a dial that environments do not carry out."""
-        for name in ("gesture", "lag", "distractors"):
-            if (value := getattr(self, name)) != getattr(Dials, name):
-                raise InvalidValueError(f"No environment shows {name}={value} yet; leave it out.")
+    @property
+    def looks(self) -> str:
+        """What the name of encoders says of dials that change frames."""
+        return "" if self.gesture in ("always", 1.0) else "_hidden"
+
+    def sight(self, always_shown: Callable[[State], bool] = lambda macrostate: False) -> GestureSight | None:
+        """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""
+        if self.gesture in ("always", 1.0) and not self.lag:
+            return None
+        return GestureSight(gesture=self.gesture, lag=self.lag, always_shown=always_shown)

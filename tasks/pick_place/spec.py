@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 
-from .rules import N_OBJECTS, PickPlace, PickPlaceRules
+from .rules import HANDED_OVER, N_OBJECTS, PickPlace, PickPlaceRules
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
@@ -101,6 +101,8 @@ def _spec(world: PickPlace) -> TaskSpec:
     rules, dials = PickPlaceRules(world), str(world).partition(":")[2].replace(",", ", ")
     return replace(
         SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
+        encoder=SPEC.encoder + world.looks,
+        sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
         rules=rules, facts=functools.partial(facts, rules, HORIZON), reference=None, targets=None,
     )  # fmt: skip
 

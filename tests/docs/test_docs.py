@@ -19,7 +19,7 @@ from doc_cells import ROOT
 from doc_tables import PAGES
 
 from imagine_bench.cli import Bench, Command
-from imagine_bench.registry import REGRESSIONS, TASKS
+from imagine_bench.registry import REGRESSIONS, has_task
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
 COMMAND = re.compile(r"(?:^|`)imagine-bench ([a-z]+ [^`\n#]+)", re.MULTILINE)
@@ -72,7 +72,9 @@ def test_commands_could_be_carried_out() -> None:
             command = tyro.cli(Command, args=shlex.split(said), config=(tyro.conf.OmitArgPrefixes,))
         except SystemExit:
             pytest.fail(f"{page} names a command that is not understood: imagine-bench {said}")
-        assert getattr(command, "task", None) in (None, "my_task", *TASKS, *REGRESSIONS), f"{page}: {said}"
+        assert getattr(command, "task", None) in (None, "my_task", *REGRESSIONS) or has_task(command.task), (
+            f"{page}: {said}"
+        )
         if isinstance(command, Bench) and not (command.dataset or str(command.encoder).endswith(".safetensors")):
             command.planned()
             benches += 1
@@ -115,7 +117,7 @@ def test_pages_are_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 100
     read = [page for page in PAGES[1:] if page != thesis_elements.PAGE]  # that one is looked up
     assert not [page for page in read if words(page) > 1200]
-    assert sum(words(page) for page in read) <= 15_350
+    assert sum(words(page) for page in read) <= 16_045
 
 
 def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:

@@ -8,10 +8,12 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
 from imagine_bench.bench.launchers.jobs import ONE_THREAD, Failure, Job, carry_out, require_workers
+from imagine_bench.machine import usable_cores
 from imagine_bench.protocols.runs import OnProgress, Progress
 
 _POLL_S = 0.5
@@ -19,7 +21,7 @@ _PATIENCE_S = 5.0
 
 
 class LocalPool:
-    """``workers`` processes of this machine at a time, at least 1, each with one thread; none outlives this process."""
+    """``workers`` processes of this machine at a time, at least 1, sharing its cores; none outlives this process."""
 
     def __init__(self, workers: int) -> None:
         require_workers(workers)
@@ -27,13 +29,14 @@ class LocalPool:
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job, ``workers`` at a time, in order; see :class:`Launcher`."""
+        cores = max(usable_cores() // max(min(self._workers, len(jobs)), 1), 1)
         waiting = list(jobs)[::-1]
         running: list[_Child] = []
         failures: list[Failure] = []
         try:
             while waiting or running:
                 while waiting and len(running) < self._workers:
-                    running.append(_Child(waiting.pop()))
+                    running.append(_Child(waiting.pop(), cores))
                 wait([source for child in running for source in child.sources], timeout=_POLL_S)
                 for child in running:
                     child.forward(on_progress)
@@ -53,13 +56,14 @@ class LocalPool:
 class _Child:
     """A job in a process of its own."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, cores: int) -> None:
         self._job = job
+        given = replace(job, spec=replace(job.spec, cores=cores))
         self._reason: str | None = None
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._receiver, sender = context.Pipe(duplex=False)
         name = f"{job.spec.agent}/{job.folder.name}"
-        self.process: BaseProcess = context.Process(target=_work, args=(job, sender), name=name, daemon=True)
+        self.process: BaseProcess = context.Process(target=_work, args=(given, sender), name=name, daemon=True)
         with _environment(ONE_THREAD), _interrupts_ignored():
             self.process.start()
         sender.close()

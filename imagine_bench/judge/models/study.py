@@ -34,13 +34,13 @@ from imagine_bench.machine import describe_environment
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.store.codec import write_arrays
+from imagine_bench.store.codec import read_arrays, write_arrays
 from imagine_bench.store.files import make_folder, read_json, read_sealed, sealed, with_null, write_json
 from imagine_bench.world_models import WorldModel
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
-_FORMAT = 1
+_FORMAT = 2
 _READ = 1_000  # frames that the reader is measured on
 _READER = "imagine_bench.agents.world_models.reader"
 
@@ -171,10 +171,21 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
     found = {
         **cell._asdict(), "data": dataset.episodes.hash, **scores,
         **by_depth(world.rollouts, answers["rollouts"]), **ranking_scores(world.spec, world.ranked, answers["ranked"]),
+        "futures": {
+            "real": [_named(world.spec, shares(course)) for course in world.rollouts.truth[0]],
+            "imagined": [_named(world.spec, answers["rollouts"].distribution(0, step)) for step in range(asking.DEPTH)],
+        },
         "fit_s": fit_s, "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps,
         "parameters": int(call(cell.model, "parameters", model.parameters)), **price,
     }  # fmt: skip
     return found, _pictures(model, world, scores["worst"], seeds)
+
+
+def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
+    """Probabilities by what macrostates are called."""
+    return {
+        "no picture" if state[0] < 0 else ", ".join(spec.value_names(state)): share for state, share in outcomes.items()
+    }
 
 
 def make(
@@ -301,3 +312,17 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = [Cell(m, s, n) for m in judgement.models for s in judgement.seeds for n in judgement.sizes]
     return [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
+
+
+def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
+    """By model, the pictures and the cell that are kept of the first seed and the most transitions.
+
+    Raises:
+        ArtefactError: A file is damaged.
+    """
+    cells = {model: Cell(model, judgement.seeds[0], judgement.sizes[-1]).file for model in judgement.models}
+    return {
+        model: {**read_arrays((folder / file).with_suffix(".npz")), **read_sealed(folder / file, "a judged cell")}
+        for model, file in cells.items()
+        if (folder / file).exists()
+    }

@@ -24,7 +24,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, UnknownNameError
-from imagine_bench.preprocessing import gray_strips
+from imagine_bench.preprocessing import gray_cells
 
 
 def made_vae(recipe: Recipe, seed: int = 0) -> Vae:
@@ -36,7 +36,7 @@ def made_vae(recipe: Recipe, seed: int = 0) -> Vae:
 
 def images(n: int, seed: int = 0) -> Tensor:
     frames, _ = draw_frames(arrow_spec(), "mild", n, np.random.default_rng(seed))
-    return torch.from_numpy(gray_strips(frames))
+    return torch.from_numpy(gray_cells(frames))
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_thesis_recipe_trains() -> None:
     recipe = replace(CHAPTER_5["thesis"], frames=300, held_out_frames=100, steps=120, batch=32, probe_steps=10)
     encoder = train_encoder(arrow_spec(), recipe=recipe, appearance="clean", seed=0)
     frames, _ = draw_frames(arrow_spec(), "clean", 200, np.random.default_rng(5))
-    strips = torch.from_numpy(gray_strips(frames))
+    strips = torch.from_numpy(gray_cells(frames))
     untrained = made_vae(recipe)
     target = untrained.target(strips)
     constant = (target - target.mean(dim=0)).square().mean()
@@ -447,6 +447,6 @@ def test_saving_that_was_killed_is_done_again(
 
 def test_view_joins_strips_and_keeps_colors() -> None:
     frames, _ = draw_frames(arrow_spec(), "mild", 2, np.random.default_rng(0))
-    assert np.allclose(view(gray_strips(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
+    assert np.allclose(view(gray_cells(frames), "gray_strips"), frames[..., 0] / 255.0, atol=1e-5)
     colors = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
     assert np.array_equal(view(colors, "small_rgb")[1, 5, 7], colors[1, :, 5, 7])

@@ -13,6 +13,7 @@ import pytest
 from doc_cells import ROOT
 from fake_reader import BlindReader
 from guest_packages import install
+from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -90,11 +91,16 @@ def test_a_model_of_theirs_is_judged(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert len(list(folder.glob("nearest-seed*.json"))) == 2 and not list(folder.glob("raises-*"))
     page = (folder / "report" / "index.html").read_text()
     assert all(words in page for words in ("nearest frame", "risk_coverage", "Where it fails"))
+    recorded = contents(folder / "judgement.rrd")
+    assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= recorded.keys()
+    assert times(folder / "judgement.rrd", "/exact/frame", "depth") == set(range(11))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*-seed*.json")}
     assert judge(_judgement("nearest", "copy", "exact"), tmp_path, workers=1) == (folder, [])
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*-seed*.json")} == before
     scored = {(cell["model"], cell["transitions"]): cell for cell in kept(folder, _judgement("copy", "exact"))}
     assert scored["exact", 60]["value_loss"] == 0.0 < scored["copy", 60]["value_loss"]
+    futures = scored["exact", 60]["futures"]
+    assert [pytest.approx(each) for each in futures["real"]] == futures["imagined"]
     assert scored["copy", 20]["data"] == scored["exact", 60]["data"]
 
 

@@ -1,0 +1,71 @@
+"""A judgement to step through: the truth and what each model imagines of it, side by side.
+
+Timeline ``depth``, the macro-actions imagined so far; entities ``/real/...`` and ``/<model>/...``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from imagine_bench import registry
+from imagine_bench.entrants import file_name
+from imagine_bench.judge.models.study import Judgement, shown
+from imagine_bench.recording.stream import recording_file
+
+
+def record_judgement(folder: Path, judgement: Judgement) -> Path | None:
+    """Record one rollout of every model that was fitted to most data: pictures, and outcomes with probabilities.
+
+    Returns the file, or None where no model was judged.
+    """
+    spec, found = registry.task(judgement.task), shown(folder, judgement)
+    if not found:
+        return None
+    one = next(iter(found.values()))
+    strips = {"real": ("the truth", one["futures_before"], one["futures_real"][0], one["futures"]["real"])}
+    for model, each in found.items():
+        title = registry.world_model_entry(model).title
+        strips[file_name(model)] = (
+            title,
+            each["futures_before"],
+            each["futures_imagined"][0],
+            each["futures"]["imagined"],
+        )
+    with recording_file(
+        folder / "judgement.rrd", spec.id, _layout({name: each[0] for name, each in strips.items()})
+    ) as to:
+        for depth in range(1 + len(one["futures"]["real"])):
+            to.stream.set_time("depth", sequence=depth)
+            action = "the start" if not depth else spec.action_names[one["futures_actions"][0][depth - 1]]
+            to.text("/action", f"**{depth}. {action}**" if depth else action)
+            for name, (_, before, pictures, outcomes) in strips.items():
+                to.log(f"/{name}/frame", rr.Image(before[0] if depth == 0 else pictures[depth - 1]))
+                to.text(f"/{name}/outcomes", _words(outcomes[depth - 1] if depth else {}))
+    return folder / "judgement.rrd"
+
+
+def _words(outcomes: Mapping[str, float]) -> str:
+    """Outcomes, the likeliest first."""
+    rows = sorted(outcomes.items(), key=lambda pair: -pair[1])
+    return "\n".join(f"- {share:.0%} {words}" for words, share in rows)
+
+
+def _layout(titles: Mapping[str, str]) -> rrb.Blueprint:
+    columns: list[Any] = [
+        rrb.Vertical(
+            rrb.Spatial2DView(origin=f"/{name}/frame", name=title),
+            rrb.TextDocumentView(origin=f"/{name}/outcomes", name="outcomes"),
+        )
+        for name, title in titles.items()
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.TextDocumentView(origin="/action", name="macro-action"), rrb.Horizontal(*columns),
+                     row_shares=[1, 8]),
+        rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="depth"),
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+"""One to six cubes: placed and read back, turned with no neighbour moved, turned in twos, and slipping."""
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrows.description import Arrows
+from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.scenes.appearance import appearance
+from imagine_bench.tasks.scenes.layout import layout
+
+
+def _world(level="clean", **fields):
+    return ArrowWorld(appearance(level), Arrows(**fields))
+
+
+@pytest.mark.parametrize("level", ["clean", "strong"])
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_macrostates_are_read_back_for_any_number(cubes, level):
+    world, rng = _world(level, cubes=cubes), np.random.default_rng(cubes)
+    for _ in range(300):
+        state = (*rng.integers(4, size=cubes).tolist(), int(rng.integers(cubes)))
+        world.place(state, rng)
+        world.vary(rng)
+        reading = world.read()
+        assert reading.macrostate == state
+        assert reading.problem is None
+
+
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_a_turn_of_any_cube_moves_no_neighbour(cubes):
+    world, rng = _world(cubes=cubes, forbid="none"), np.random.default_rng(cubes)
+    world.place((0,) * cubes + (0,), rng)
+    for cube in range(cubes):
+        state, before = world.read().macrostate, world.object_poses()
+        wanted = (*state[:cube], 1, *state[cube + 1 :])
+        assert world.execute(2 * cube, wanted, 0.0).fault is None
+        assert world.read().macrostate == wanted
+        shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
+        assert np.delete(shift_m, cube).max(initial=0.0) < 1e-3
+
+
+def test_coupled_cubes_are_turned_in_one_macro_action():
+    world = _world(cubes=4, coupling="neighbour")
+    world.place((0, 0, 0, 0, 2), np.random.default_rng(0))
+    result = world.execute(2, (0, 1, 1, 0, 2), 20.0)
+    assert result.fault is None
+    assert world.read().macrostate == (0, 1, 1, 0, 2)
+    assert (np.diff(result.time_s) >= 0).all() and result.time_s[-1] == pytest.approx(result.sim_time_s)
+
+
+@pytest.mark.parametrize("action", [0, 1, 2, 3])
+def test_a_cube_that_slips_stays_though_it_was_gripped(action):
+    world = _world(cubes=2, forbid="none", slip=0.2)
+    state = (1, 3, 0)
+    world.place(state, np.random.default_rng(0))
+    before = world.object_poses()
+    result = world.execute(action, state, 50.0)
+    assert result.fault is None
+    assert world.read().macrostate == state
+    assert np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1).max() < 4e-3  # squared in the fingers
+    assert world.executor.executor.opening_m(result.qpos).min() < 0.0275  # the fingers did close on it
+
+
+def test_the_same_slip_gives_the_same_bits():
+    ends = []
+    for _ in range(2):
+        world = _world(cubes=6, forbid="none")
+        world.place((0, 1, 2, 3, 0, 1, 5), np.random.default_rng(3))
+        world.execute(7, (0, 1, 2, 3, 0, 1, 5), 0.0)
+        ends.append(world.data.qpos.copy())
+    np.testing.assert_array_equal(*ends)
+
+
+def test_columns_of_cubes_are_apart_so_a_finger_is_clear():
+    for cubes in range(2, 7):
+        places = layout(cubes)
+        columns_m = [y_m for _, y_m in places.slots_xy_m]
+        assert max(np.diff(columns_m)) < -0.044
+        assert [tip[1] for tip in places.fingertips_m] == pytest.approx(columns_m)

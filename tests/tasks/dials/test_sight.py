@@ -1,0 +1,146 @@
+"""What the dials gesture and lag leave to be seen: of every world, alone, in lanes, and as macrostates."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.agents.encoders.training import classes_of, shown_states
+
+from imagine_bench import registry
+
+KINEMATIC = {"execution": "kinematic"}
+NAMES = {"imagine_bench/Arrows": "arrows", "imagine_bench/PickPlace": "pick_place"}
+IDS = tuple(NAMES)
+
+
+def make(id_, **options):
+    return gymnasium.make(f"{id_}-v0", **{**KINEMATIC, **options}).unwrapped
+
+
+def walk(env, steps, seed=0):
+    """Observations, macrostates and generator states of an episode of random macro-actions, ends ignored."""
+    observation, info = env.reset(seed=seed)
+    seen, actions = [(observation, info["macrostate"])], np.random.default_rng(seed)
+    for _ in range(steps):
+        observation, _, _, _, info = env.step(int(actions.integers(env.action_space.n)))
+        seen.append((observation, info["macrostate"]))
+    return seen
+
+
+@pytest.mark.parametrize("appearance", ["clean", "strong", "photo"])
+def test_frames_tell_nothing_of_a_hidden_gesture(appearance):
+    """Of pictures of everything else alike, both the agent's and people's are equal to the bit."""
+    seen = []
+    for pointed in range(3):
+        env = make(IDS[0], gesture=0.0, appearance=appearance, observation="frame,human,state", size=96)
+        seen.append(env.reset(seed=3, options={"macrostate": (0, 1, 2, pointed)}))
+    for observation, info in seen[1:]:
+        assert info["macrostate"][-1] != seen[0][1]["macrostate"][-1]
+        for name, picture in observation.items():
+            np.testing.assert_array_equal(picture, seen[0][0][name])
+    shown, _ = make(IDS[0], appearance=appearance).reset(seed=3, options={"macrostate": (0, 1, 2, 0)})
+    hidden, _ = make(IDS[0], appearance=appearance, gesture=0.0).reset(seed=3, options={"macrostate": (0, 1, 2, 0)})
+    assert (shown != hidden).any(axis=-1).sum() > 50
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_a_gesture_is_seen_as_often_as_said(id_):
+    """By the one-hot gesture: always, at first only, or within 3.5 standard deviations of a probability."""
+    n_gestures = len(registry.task(NAMES[id_]).macrostate_values[-1])
+    for gesture in ("always", "first", 0.3):
+        env = make(id_, gesture=gesture, observation="state")
+        walks = [walk(env, 8, seed) for seed in range(60)]
+        seen = np.array([[state[-n_gestures:].any() for state, _ in each] for each in walks])
+        assert all(len(truth) - 1 + state[-n_gestures:].any() == state.sum() for each in walks for state, truth in each)
+        carried = np.array([[id_ == IDS[1] and 2 in state[:-1] for _, state in each] for each in walks])
+        if gesture == 0.3:
+            free = seen[~carried]
+            assert abs(free.mean() - 0.3) <= 3.5 * np.sqrt(0.3 * 0.7 / free.size) and seen[carried].all()
+        else:
+            expected = np.ones_like(seen) if gesture == "always" else np.arange(9)[None] == carried * np.arange(9)
+            np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
+    lagging = make(id_, lag=3)
+    walk(lagging, 2, seed=8)  # nothing of an earlier episode is seen
+    now, late = walk(make(id_), 7), walk(lagging, 7)
+    for step, (frame, macrostate) in enumerate(late):
+        np.testing.assert_array_equal(frame, now[max(0, step - 3)][0])
+        np.testing.assert_array_equal(macrostate, now[step][1])
+
+
+@pytest.mark.parametrize("id_", IDS)
+@pytest.mark.parametrize("dials", [{"gesture": "first"}, {"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}])
+def test_lanes_and_singles_are_equal(id_, dials):
+    vector = gymnasium.make_vec(f"{id_}-vector-v0", num_envs=4, threads=1, **KINEMATIC, **dials)
+    sync = gymnasium.make_vec(
+        f"{id_}-v0", num_envs=4, vectorization_mode="sync", **KINEMATIC, **dials,
+        vector_kwargs={"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP},
+    )  # fmt: skip
+    draw = np.random.default_rng(1)
+    pairs = [(vector.reset(seed=5)[0], sync.reset(seed=5)[0])]
+    for _ in range(25):
+        actions = draw.integers(vector.single_action_space.n, size=4)
+        mine, theirs = vector.step(actions), sync.step(actions)
+        pairs += [(mine[index], theirs[index]) for index in range(4)]
+        np.testing.assert_array_equal(mine[4]["macrostate"], theirs[4]["macrostate"])
+    for one, other in pairs:
+        np.testing.assert_array_equal(one, other)
+    vector.close()
+    sync.close()
+
+
+def test_a_state_holds_old_frames_and_what_is_hidden():
+    first, second = (make(IDS[0], gesture=0.5, lag=2, fickle=0.4) for _ in range(2))
+    walk(first, 4)
+    state = pickle.loads(pickle.dumps(first.get_state()))
+    second.reset(seed=9)
+    second.set_state(state)
+    for action in (0, 3, 1, 5, 2, 2):
+        np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
+    assert first.get_state().steps == second.get_state().steps == 10
+
+
+def test_dials_at_rest_change_and_draw_nothing():
+    for id_ in IDS:
+        plain, at_rest = make(id_), make(id_, gesture=1.0, lag=0)
+        for (frame, _), (other, _) in zip(walk(plain, 5), walk(at_rest, 5), strict=True):
+            np.testing.assert_array_equal(frame, other)
+        assert plain.np_random.bit_generator.state == at_rest.np_random.bit_generator.state
+
+
+def test_frames_of_macrostates_hide_what_the_environment_hides():
+    """A palm that carries is seen, any other gesture may be hidden; both look as in the environment."""
+    for name, id_ in (("arrows:gesture=first", IDS[0]), ("pick_place:gesture=first", IDS[1])):
+        spec, env = registry.task(name), make(id_, gesture=0.0)
+        states = shown_states(spec)
+        hidden = states[states[:, -1] == -1]
+        assert len(hidden) and set(map(tuple, hidden)) == {
+            (*state[:-1], -1) for state in spec.rules.states if 2 not in state[:-1] or name.startswith("arrows")
+        }
+        classes = classes_of(spec)
+        assert (
+            classes[-1] == len(spec.macrostate_values[-1]) + 1
+            and classes[:-1] == classes_of(registry.task(NAMES[id_]))[:-1]
+        )
+        like = next(state for state in spec.rules.states if state[:-1] == tuple(hidden[0][:-1]))
+        frame = spec.render_macrostates(hidden[:1], "clean", np.random.default_rng(2))[0]
+        env.reset(options={"macrostate": like})
+        env.world.place(like, np.random.default_rng(2))
+        np.testing.assert_array_equal(env.agent_view(), frame)
+        again = spec.render_macrostates(np.array([like]), "clean", np.random.default_rng(2))[0]
+        assert not np.array_equal(again, frame)
+        assert spec.value_names(hidden[0])[-1] == "not seen" and spec.encoder.endswith("_hidden")
+
+
+def test_a_hidden_palm_still_takes_what_is_handed_over():
+    env = make(IDS[1], gesture=0.0, execution="physics")
+    env.reset(seed=0, options={"macrostate": (1, 0, 0, 3)})
+    _, reward, terminated, _, info = env.step(3)
+    assert terminated and info["is_success"] and not info["fault"] and reward == 5.0
+    assert tuple(info["macrostate"]) == (2, 0, 0, 3) and env.world.shown((2, 0, 0, 3)) == (2, 0, 0, 3)
