@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,6 +12,7 @@ import numpy as np
 from imagine_bench import reference, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
 from imagine_bench.report.missing import known_agent, known_task
+from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
@@ -19,7 +22,8 @@ BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 _SUMMARY_COLUMNS = (
     *("agent", "episodes", "seeds", "success_iqm", "low_95", "high_95", "interval_over", "thesis_mean", "thesis_std"),
     *("difference_to_dqn", "difference_low_95", "difference_high_95", "p", "p_holm", "detectable_difference"),
-    *("gain", "gain_low_95", "gain_high_95", "thesis_gain", "area", "area_low_95", "area_high_95"),
+    *("gain", "gain_low_95", "gain_high_95", "thesis_gain", "alone", "dqn_alone", "p_mcnemar", "p_mcnemar_holm"),
+    *("probability_of_improvement", "excess_macro_actions", "area", "area_low_95", "area_high_95"),
 )
 
 
@@ -45,7 +49,11 @@ class Comparison:
     detectable: float  # the smallest difference that this cell would have shown with probability 80 %; NaN likewise
     gain: statistics.Estimate  # (P_aug - P_base) / P_base of the means over seeds, with its interval
     thesis_gain: float | None  # the thesis' gain at this budget, or None
-    paired: statistics.PairedTests | None  # with one seed, the tests of the two agents from the same starts
+    # the tests of the two agents' runs from the same starts, seed by seed; None where it is not known which were solved
+    paired: statistics.PairedTests | None
+    paired_p: float  # of these, by Holm over all comparisons; NaN where not known
+    paired_detectable: float  # the smallest difference that they would have shown with probability 80 %; NaN likewise
+    improvement: float  # probability that a run of the agent scores more than one of DQN
 
     @property
     def shown(self) -> int:
@@ -118,6 +126,8 @@ class ReportData:
     futures: dict[str, FuturesSummary]
     reached: dict[str, tuple[int | None, ...]]
     areas: dict[str, dict[int, statistics.Estimate]]
+    # mean macro-actions of solved tests beyond the fewest that the rules allow from their starts; NaN where not kept
+    excess: dict[str, dict[int, float]]
     timing: dict[str, Timing]
     prices: dict[str, dict[int, Price]]
     frames_before: dict[str, int | None]
@@ -167,6 +177,7 @@ def collect(result: BenchResult) -> ReportData:
         futures={agent: summary for agent in agents if is_here and (summary := _futures(result.of(agent)))},
         reached={agent: _reached(result, agent, spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
+        excess={agent: _excess(result.of(agent), spec) for agent in agents} if is_here else {},
         timing={agent: _timing(result.of(agent), learns=known_agent(agent).learns) for agent in agents},
         prices={agent: _prices(result.of(agent)) for agent in agents},
         frames_before={agent: _frames_before(result, agent) for agent in agents},
@@ -201,6 +212,9 @@ def summary_csv(data: ReportData) -> str:
             versus = data.comparisons.get(agent, {}).get(budget)
             columns = (*versus.difference, versus.p_adjusted, versus.detectable, *versus.gain[:3]) if versus else ()
             row += [*columns, versus.thesis_gain] if versus else [""] * 10
+            row += [*(versus.paired or [""] * 3), versus.paired_p, versus.improvement] if versus else [""] * 5
+            excess = data.excess.get(agent, {}).get(budget, math.nan)
+            row.append("" if math.isnan(excess) else excess)
             rows.append(row + list(data.areas[agent][budget][:3] if agent in data.areas else [""] * 3))
     return csv_text(rows)
 
@@ -256,24 +270,44 @@ def _comparisons(result: BenchResult, thesis: dict[str, dict[int, float]]) -> di
     pairs = [(rates[agent][:, index], rates[BASE_AGENT][:, index]) for agent, index in cells]
     found = [statistics.difference(*pair, trials=trials) for pair in pairs]
     adjusted = statistics.holm([each.p for each in found]).tolist()
+    alike = [_paired(result.of(agent), result.of(BASE_AGENT), index) for agent, index in cells]
+    alike_p = statistics.holm([math.nan if each is None else each.p for each in alike]).tolist()
+    count = trials * len(result.protocol.seeds)
     comparisons: dict[str, dict[int, Comparison]] = {agent: {} for agent in treated}
-    for (agent, index), pair, difference, p_adjusted in zip(cells, pairs, found, adjusted, strict=True):
+    every = zip(cells, pairs, found, adjusted, alike, alike_p, strict=True)
+    for (agent, index), pair, difference, p_adjusted, paired, paired_p in every:
         comparisons[agent][budgets[index]] = Comparison(
             difference=difference,
             p_adjusted=p_adjusted,
             detectable=statistics.detectable(*pair, cells=len(cells), trials=trials),
             gain=statistics.gain(*pair, trials=trials),
             thesis_gain=thesis[agent].get(budgets[index]),
-            paired=_paired(result.of(agent), result.of(BASE_AGENT), index),
+            paired=paired,
+            paired_p=paired_p,
+            paired_detectable=(
+                math.nan if paired is None else statistics.detectable_paired(paired, count, cells=len(cells))
+            ),
+            improvement=statistics.probability_of_improvement(*pair),
         )
     return comparisons
 
 
 def _paired(treated: tuple[RunResult, ...], base: tuple[RunResult, ...], index: int) -> statistics.PairedTests | None:
-    one, other = (runs[0].checkpoints[index].solved for runs in (treated, base))
-    if len(treated) > 1 or one is None or other is None:
-        return None
-    return statistics.mcnemar(one, other)
+    texts = [[run.checkpoints[index].solved or "" for run in runs] for runs in (treated, base)]
+    return statistics.mcnemar(*map("".join, texts)) if all(map(all, texts)) else None
+
+
+def _excess(runs: tuple[RunResult, ...], spec: TaskSpec) -> dict[int, float]:
+    fewest = functools.cache(lambda start: fewest_actions(spec.rules, start))
+    beyond: dict[int, list[int]] = {}
+    for run in runs:
+        for row in run.checkpoints:
+            each = beyond.setdefault(row.episodes, [])
+            if row.kept is not None:
+                solved = row.kept.success
+                lengths, starts = row.kept.lengths[solved].tolist(), map(tuple, row.kept.starts[solved].tolist())
+                each += [length - fewest(start) for length, start in zip(lengths, starts, strict=True)]
+    return {budget: float(np.mean(each)) if each else math.nan for budget, each in beyond.items()}
 
 
 def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:

@@ -157,7 +157,7 @@ def causes_figure(found: Failures) -> Figure:
     figure.supxlabel("real training episodes", fontsize=10.5)
     figure.supylabel("test episodes that failed (%)", fontsize=10.5)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=9)
     return figure
 
 

@@ -125,6 +125,20 @@ def detectable_words(comparisons: Mapping[str, Mapping[int, Comparison]]) -> str
     )
 
 
+def paired_words(comparisons: Mapping[str, Mapping[int, Comparison]]) -> str:
+    """What a table of tests from the same starts says, and how small a difference it could have shown."""
+    every = [each for by_budget in comparisons.values() for each in by_budget.values()]
+    sizes = [each.paired_detectable for each in every if each.paired is not None]
+    if not sizes:
+        return ""
+    return (
+        f"Of the same starts and seeds. p: McNemar's exact test after Holm's correction for all {len(every)} cells. It "
+        "tells these trained agents apart, not two ways of training, which need the intervals over seeds above. A "
+        f"difference of {percent(min(sizes))} to {percent(max(sizes))} points, by cell, would have been shown with "
+        "probability 80 %. Below: how often a run of the agent is ahead of one of DQN, ties half."
+    )
+
+
 def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
     areas = {agent: by_budget[budget] for agent, by_budget in data.areas.items()}
@@ -156,7 +170,7 @@ def _verdict(data: ReportData, agent: str) -> str:
     if math.isnan(difference.low):
         return f"{head}; {_alone(comparisons[budget].paired)}one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
-    chance = _chance(comparisons[budget].p_adjusted)
+    chance = chance_words(comparisons[budget].p_adjusted)
     verdict = {1: "it is ahead", -1: "it is behind", 0: "no difference is shown"}[comparisons[budget].shown]
     return f"{head} ({interval}; {chance}, corrected): at this budget {verdict}. {_over_budgets(comparisons)}"
 
@@ -165,12 +179,13 @@ def _alone(paired: PairedTests | None) -> str:
     if paired is None:
         return ""
     return (
-        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({_chance(paired.p)}, "
+        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({chance_words(paired.p)}, "
         "McNemar's exact test of these two trained agents); "
     )
 
 
-def _chance(p: float) -> str:
+def chance_words(p: float) -> str:
+    """A p-value in words."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 

@@ -7,9 +7,18 @@ from collections.abc import Callable, Mapping
 
 from imagine_bench import statistics
 from imagine_bench.report import plots
-from imagine_bench.report.data import ReportData, Score
+from imagine_bench.report.data import Comparison, ReportData, Score
 from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
-from imagine_bench.report.text import agent_words, detectable_words, interval_text, lasting, percent, signed_percent
+from imagine_bench.report.text import (
+    agent_words,
+    chance_words,
+    detectable_words,
+    interval_text,
+    lasting,
+    paired_words,
+    percent,
+    signed_percent,
+)
 
 
 def compared(data: ReportData) -> Section:
@@ -51,7 +60,7 @@ def success(data: ReportData, interval_words: str) -> Section:
         f"interquartile mean over {seeds} (independent trainings, the same {protocol.evaluation_episodes:,} test "
         f"starts for all); bands: {interval_words}.{thesis}",
     )  # fmt: skip
-    tables = (_scores(data, interval_words), _prices(data), *_thesis_only(data), _seeds(data))
+    tables = (_scores(data, interval_words), _prices(data), *_excess(data), *_thesis_only(data), _seeds(data))
     return Section(title="Success against real experience", images=(figure,), tables=tables)
 
 
@@ -208,8 +217,42 @@ def gain(data: ReportData) -> Section:
                 caption=detectable_words(data.comparisons),
             ),
             Table(name="gains", header=_heads("gain (%) after", data), rows=gains, why_dash=why_dash),
+            _paired(data),
         ),
     )
+
+
+def _paired(data: ReportData) -> Table:
+    """Tests of the same starts, solved by one of two agents alone."""
+    rows: list[list[str | Cell]] = []
+    for agent, by_budget in data.comparisons.items():
+        cells = [_alone(each, {"agent": agent, "paired": budget}) for budget, each in by_budget.items()]
+        rows.append([agent_words(agent).title, *cells])
+    return Table(
+        name="paired", header=_heads("solved alone : by DQN alone, after", data), rows=rows,
+        caption=paired_words(data.comparisons), why_dash="which tests were solved was not kept",
+    )  # fmt: skip
+
+
+def _alone(versus: Comparison, data: dict[str, object]) -> Cell:
+    note = f"ahead in {percent(versus.improvement)} % of pairs of runs"
+    if versus.paired is None:
+        return Cell(text=DASH, note=note, data=data)
+    text, p = f"{versus.paired.first:,} : {versus.paired.second:,}", chance_words(versus.paired_p)
+    return Cell(text=text, interval=f"({p})", note=note, data=data)
+
+
+def _excess(data: ReportData) -> list[Table]:
+    """Macro-actions beyond the shortest plan, where test episodes were kept."""
+    if not any(not math.isnan(value) for by_budget in data.excess.values() for value in by_budget.values()):
+        return []
+    rows = [[agent_words(a).title, *map("{:.2f}".format, each.values())] for a, each in data.excess.items()]
+    rows = [[DASH if cell == "nan" else cell for cell in row] for row in rows]
+    return [Table(
+        name="excess", header=_heads("macro-actions beyond the shortest plan, after", data), rows=rows,
+        caption="Means over the tests that were solved; the shortest plan from each start is exact, from the rules.",
+        why_dash="nothing was solved",
+    )]  # fmt: skip
 
 
 def threshold(data: ReportData) -> Section:
