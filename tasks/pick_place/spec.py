@@ -103,7 +103,7 @@ def _spec(world: PickPlace) -> TaskSpec:
         SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
         encoder=SPEC.encoder + world.looks,
         sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
-        rules=rules, facts=functools.partial(facts, rules, HORIZON), reference=None, targets=None,
+        rules=rules, facts=functools.partial(facts, rules, HORIZON), reference=None,
     )  # fmt: skip
 
 
