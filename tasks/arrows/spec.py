@@ -89,7 +89,8 @@ def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str
     """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
     from ..frames import frames_of  # noqa: PLC0415
 
-    return frames_of(_maker(Arrows(cubes=rules.world.cubes)), rules, macrostates, appearance, rng)
+    scene = Arrows(cubes=rules.world.cubes, distractors=rules.world.distractors)
+    return frames_of(_maker(scene), rules, macrostates, appearance, rng)
 
 
 def spec_of(**world: Any) -> TaskSpec:
