@@ -151,10 +151,9 @@ def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
 def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The scores of one model, fitted once, and a few of its pictures beside the truth."""
     world = prepare(judgement, folder)
-    entry = registry.world_model_entry(cell.model)
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     dataset = data_of(judgement, folder, cell.seed)
-    model, price = make(entry, world, judgement.appearance, seeds)
+    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds)
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
@@ -189,19 +188,20 @@ def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
 
 
 def make(
-    entry: registry.WorldModelEntry, world: _World, appearance: str, seeds: SeedTree
+    name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree
 ) -> tuple[WorldModel, dict[str, Any]]:
     """A new model, and what was spent on it beforehand: the encoder's name and frames."""
+    entry = registry.world_model_entry(name)
     if entry.privileged:
-        return registry.load(entry.make)(world.spec, world.gallery), {"encoder": "", "encoder_frames": 0}
-    path = None if entry.encoder_kind is None else encoders.own(world.spec, appearance, entry.encoder_kind)
+        return registry.make_world_model(name, spec, gallery), {"encoder": "", "encoder_frames": 0}
+    path = None if entry.encoder_kind is None else encoders.own(spec, appearance, entry.encoder_kind)
     context = AgentContext(
-        n_actions=world.spec.n_actions, preprocessing=world.spec.preprocessing, encoder=path, seeds=seeds,
-        config_group=world.spec.config_group,
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=seeds,
+        config_group=spec.config_group,
     )  # fmt: skip
     card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
     price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
-    return registry.load(entry.make)(context), price
+    return registry.make_world_model(name, context), price
 
 
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
