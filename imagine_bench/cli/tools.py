@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, only, shown
+from imagine_bench.cli.options import ANY, NEWEST, listed, only, require_values, shown
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
@@ -130,6 +130,10 @@ class Speed:
 
     turns: int = 2_000
     """Macro-actions of the fidelity measurement."""
+    worlds: Annotated[tuple[str, ...] | None, listed("STR", "(default: none)")] = None
+    """Worlds, such as arrows:cubes=5, whose fidelity is measured and nothing else."""
+    appearances: Annotated[tuple[str, ...], listed("STR")] = APPEARANCES[:1]
+    """Appearance levels at which it is."""
     out: Path = Path("runs/speed.json")
     """Where the figures are kept, with the machine's description."""
 
@@ -137,7 +141,9 @@ class Speed:
         """Measure."""
         from imagine_bench.tools.speed import speed_report  # noqa: PLC0415 - nothing else needs it
 
-        if not speed_report(self.out, self.turns):
+        require_values("worlds", self.worlds)
+        require_values("appearances", self.appearances)
+        if not speed_report(self.out, self.turns, worlds=self.worlds or (), appearances=self.appearances):
             sys.exit(1)
 
 

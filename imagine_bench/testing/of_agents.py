@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import play
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -72,11 +73,19 @@ def _acts(one: CheckedAgent) -> None:
         for frame, state in zip(frames, states, strict=True)
     ]
     before = copy.deepcopy(agent.state())
-    once, again = ([agent.act(each, explore=False) for each in given] for _ in range(2))
+    once, again = (_first_actions(agent, given) for _ in range(2))
     if one.entry.learns:
         require(once == again, "asked twice with explore=False, it acts otherwise")
         require(_same(before, agent.state()), "acting with explore=False changes its state")
     require(all(isinstance(value, (int, float)) for value in agent.diagnostics().values()), "diagnostics: no numbers")
+
+
+def _first_actions(agent: Agent, given: Sequence[Observation]) -> list[int]:
+    actions = []
+    for each in given:
+        begin_episode(agent)
+        actions.append(agent.act(each, explore=False))
+    return actions
 
 
 def _goes_on(one: CheckedAgent) -> None:

@@ -133,5 +133,7 @@ def test_nonsense_is_refused() -> None:
         Judgement(task="pick_place", models=("oracle",))
     with pytest.raises(InvalidValueError, match="ascending numbers"):
         Judgement(task="pick_place", models=("copy",), sizes=(30, 20))
+    with pytest.raises(InvalidValueError, match=r"hide or delay a part .* without the dials gesture and lag"):
+        Judgement(task="arrows:cubes=2,lag=1", models=("copy",))
     with pytest.raises(InvalidValueError, match="samples is 0"):
         Judgement(task="pick_place", models=("copy",), samples=0)
