@@ -158,7 +158,7 @@ def read(path: Path) -> Episodes:
         lacks = [name for name in (*_TYPES, _MASK, _IMAGE) if name not in info["features"]]
         if lacks:
             raise InvalidValueError(
-                f"it has no {lacks[0]}, which 'imagine-bench dataset' writes; it is of something else"
+                f"it has no {lacks[0]}, which 'imagine-bench dataset' writes"
             )
     with reading(folder / _FINAL, "the last frames of episodes"):
         ends = pq.read_table(folder / _FINAL)
