@@ -29,6 +29,12 @@ HELD_OUT: Mapping[str, str] = {"photo": "photo_held_out"}
 EXECUTIONS = ("physics", "kinematic")
 SENSES = ("true", "nominal")
 DEVICES = ("cpu", "cuda")
+OBSERVATIONS = ("frame", "human", "state", "proprio")
+"""Parts of what an environment of ours can show of one moment."""
+PROPRIO_SIZE = 16
+"""Joints, fingers, and the tool's position and quaternion."""
+FRAME_PX, OBSERVATION_SIZES_PX = 64, (32, 256)
+"""Edge of a frame; smallest and largest edge of an image that is observed instead."""
 
 
 PHYSICS_RANGES: Mapping[str, tuple[float, float]] = {
@@ -85,9 +91,20 @@ class PhysicsSettings:
 class Observation:
     """What an agent is given before it acts."""
 
-    frame: Frame  #: the camera image. Shape (64, 64, 3), uint8.
+    #: the camera image, uint8. Shape (64, 64, 3), or as the protocol says (size, size, 3), or (0, 0, 3) for none
+    frame: Frame
     #: the true state, only for agents registered as privileged; None for every other
     macrostate: Macrostate | None = None
+    #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
+    more: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, seen: Any, macrostate: Macrostate | None = None) -> Observation:
+        """From what an environment gives: a frame, or parts by name."""
+        if not isinstance(seen, Mapping):
+            return cls(frame=seen, macrostate=macrostate)
+        more = {name: part for name, part in seen.items() if name != "frame"}
+        return cls(frame=seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)), macrostate=macrostate, more=more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,6 +273,8 @@ class AgentContext:
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
     #: the rules' optimal action, only for agents registered as privileged; None for every other
     optimal_action: Callable[[State], int] | None = None
+    #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`
+    observation: Mapping[str, tuple[int, ...]] = field(default_factory=lambda: {"frame": (FRAME_PX, FRAME_PX, 3)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,9 +20,21 @@ Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
 
 
-def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
+def observation(seen: Any, info: Info, *, privileged: bool) -> Observation:
     """What an agent may see of a step: the macrostate only if it is registered as privileged."""
-    return Observation(frame=frame, macrostate=np.asarray(info["macrostate"]) if privileged else None)
+    return Observation.of(seen, np.asarray(info["macrostate"]) if privileged else None)
+
+
+class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """An observation of one part, as a dict of that part."""
+
+    def __init__(self, env: Env, name: str) -> None:
+        super().__init__(env)
+        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """See above."""
+        return {self._name: observation}
 
 
 def play(

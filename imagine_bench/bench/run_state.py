@@ -12,12 +12,12 @@ from typing import Any
 import gymnasium
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Env
+from imagine_bench.bench.evaluation import ByName, Env
 from imagine_bench.bench.queries import Teacher, require_able
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Agent
+from imagine_bench.interfaces import OBSERVATIONS, Agent
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.store import encoders, run_folder
@@ -32,13 +32,15 @@ _REPORT_EVERY_S = 0.25
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
     """The environment of a task as a protocol has it, for training or for tests; ``options`` are more of its own."""
-    return gymnasium.make(
+    env = gymnasium.make(
         registry.task_entry(task).env_id,
         **protocol.world,
         appearance=protocol.appearance_in_tests if testing else protocol.appearance,
         **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
+    alone = protocol.observation in OBSERVATIONS[1:]
+    return ByName(env, protocol.observation) if alone else env
 
 
 @contextmanager

@@ -157,9 +157,7 @@ def read(path: Path) -> Episodes:
             raise InvalidValueError(f"it is of version {info['codebase_version']}")
         lacks = [name for name in (*_TYPES, _MASK, _IMAGE) if name not in info["features"]]
         if lacks:
-            raise InvalidValueError(
-                f"it has no {lacks[0]}, which 'imagine-bench dataset' writes"
-            )
+            raise InvalidValueError(f"it has no {lacks[0]}, which 'imagine-bench dataset' writes")
     with reading(folder / _FINAL, "the last frames of episodes"):
         ends = pq.read_table(folder / _FINAL)
     with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
