@@ -151,7 +151,8 @@ class Attribution:
 
     def _drawn(self, course: Course) -> list[float]:
         """The uniform number of each step until the horizon."""
-        drawn: list[float] = np.random.default_rng(course.seed).random(self._horizon).tolist()
+        rng = np.random.default_rng(course.seed)
+        drawn: list[float] = rng.random(self._horizon).tolist()
         for step, (state, action) in enumerate(zip(course.states, course.actions, strict=False)):
             if state in self._rows and not course.faults[step]:
                 before, probability = _place(self._rules.outcomes(state, action), course.states[step + 1])
