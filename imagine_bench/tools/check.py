@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import play
+from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
 from imagine_bench.rules import facts, states_of
@@ -85,7 +86,7 @@ def checked_agent(name: str, task: str) -> CheckedAgent:
         config_group=spec.config_group,
         hyperparameters="minimal",
         overrides=registry.own_settings(name, {}),
-        optimal_action=spec.rules.optimal_action if entry.privileged else None,
+        optimal_policy=optimal_policy_of(spec) if entry.privileged else None,
     )
     return CheckedAgent(name, entry, spec, context)
 
