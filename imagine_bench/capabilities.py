@@ -39,6 +39,23 @@ class ImaginedRollout:
 
 
 @runtime_checkable
+class EpisodeRememberer(Protocol):
+    """An agent that remembers what it saw earlier in an episode: :meth:`Agent.act` takes its observation in."""
+
+    def begin_episode(self) -> None:
+        """Forget the episode so far: the next observation is another's first. No part of :meth:`Agent.state`.
+
+        Called before every episode of training and of tests, and before an agent is asked about a frame on its own.
+        """
+
+
+def begin_episode(agent: object) -> None:
+    """Tell an agent, if it remembers, that its next observation is the first of an episode."""
+    if isinstance(agent, EpisodeRememberer):
+        agent.begin_episode()
+
+
+@runtime_checkable
 class ValueReader(Protocol):
     """An agent that has action values."""
 

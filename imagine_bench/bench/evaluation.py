@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.seeding import Purpose, episode_seed
@@ -35,6 +36,7 @@ def play(
     """
     frame, info = env.reset(seed=seed)
     _require_sound(env, frame, 0.0)
+    begin_episode(agent)
     before, over = Observation.of(frame, info, privileged=privileged), False
     while not over:
         if before_acting is not None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.bench.run_state import Run
+from imagine_bench.capabilities import EpisodeRememberer
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.store.counters import Played
@@ -23,10 +24,11 @@ _LANES_PER_CORE = 4
 def lanes_pay(run: Run, episodes: int) -> bool:
     """Whether the episodes of a test are played in lanes.
 
-    They are where simulating takes the time, the run has several cores, and an agent's actions follow from what it is
-    shown alone: in tests, those of every learner do.
+    They are where simulating takes the time, the run has several cores, and an agent's actions follow from the one
+    observation that it is shown: in tests, those of every learner do that does not remember its episode.
     """
-    simulated = run.protocol.execution == "physics" and run.entry.learns
+    markov = run.entry.learns and not isinstance(run.agent, EpisodeRememberer)
+    simulated = run.protocol.execution == "physics" and markov
     offered = registry.vector_id(registry.task_entry(run.task.id).env_id) in gymnasium.registry
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.data.folder import Apart, Dataset, read_apart
@@ -131,6 +132,7 @@ def _episode(
 ) -> dict[str, Any]:
     """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""
     frame, info = env.reset(seed=seed, options=options)
+    begin_episode(player[0])
     mask, faults, ended = np.ones(int(env.action_space.n), dtype=np.int8), 0, False  # type: ignore[attr-defined]
     kept: dict[str, list[Any]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
     seen: dict[str, list[Any]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}

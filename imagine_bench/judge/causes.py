@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor
+from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, SeedTree
@@ -96,6 +96,7 @@ def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator,
     for row, state in enumerate(states):
         if not rules.is_terminal(state):
             seen = Observation(frame=frames[row], macrostate=np.array(state) if privileged else None)
+            begin_episode(agent)
             action[row] = agent.act(seen, explore=False)
     model = agent.predict_outcomes(frames, rng) if isinstance(agent, OutcomePredictor) else None
     if model is not None:

@@ -16,7 +16,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, ValueReader
+from imagine_bench.capabilities import Imaginer, ValueReader, begin_episode
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
@@ -105,6 +105,7 @@ class _EpisodeRecorder:
     def record(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
         frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
+        begin_episode(self._agent)
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
             self._recording.stream.set_time("imagined_depth", sequence=0)
         self._log_frame(env.unwrapped, episode, frame)

@@ -6,36 +6,80 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
+from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, shown
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
 from imagine_bench.report.sections import Cell as TableCell
+from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, interval, iqm
 from imagine_bench.store.files import csv_text, read_json
 
-COLUMNS = {
-    "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps", "missed": "missed outcomes",
-    "invented": "invented", "nothing": "no picture", "outcome_ece": "calibration error", "outcome_brier": "Brier",
-    "reward_error": "reward error", "end_error": "end error", "value_loss": "value loss", "regret": "regret of 1 of 5",
-    "auroc_epistemic": "AUROC, wrong", "auroc_never": "AUROC, never seen", "worth_of_refusing": "worth of refusing",
-    "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
-    "encoder_frames": "frames beforehand",
+QUESTIONS = {
+    "Which outcomes, how likely?": {
+        "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps",
+        "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
+        "outcome_ece": "calibration error", "outcome_brier": "Brier", "reward_error": "reward error",
+        "reward_ece": "its calibration", "reward_brier": "its Brier", "end_error": "end error",
+        "end_ece": "its calibration", "end_brier": "its Brier",
+    },
+    "What do mistakes cost?": {
+        "value_loss": "value loss", "worst_value_loss": "from the worst start", "regret": "regret of 1 of 5",
+    },
+    "Does it know?": {
+        "auroc_wrong": "AUROC, wrong", "auroc_never": "never seen", "auroc_either": "either",
+        "auroc_noisy": "aleatoric, noisy", "auroc_several": "modal, several", "filter_keeps": "its filter keeps",
+        "filter_error": "error of that", "filter_skill": "skill of its threshold", "best_skill": "of the best one",
+        "worth_of_refusing": "worth of refusing", "worth_of_filter": "worth of its filter",
+    },
+    "Does it notice?": {
+        "notice_slip": "transitions until a slip", "notice_coupling": "until a coupling",
+        "counterfactual": "counterfactuals wrong",
+    },
+    "What does it cost?": {
+        "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
+        "encoder_frames": "frames beforehand",
+    },
 }  # fmt: skip
-SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "regret", "auroc_epistemic", "fit_s")
+"""Scores by question: what a column of theirs is called."""
+COLUMNS = {name: words for columns in QUESTIONS.values() for name, words in columns.items()}
+_WORDS = {
+    "Which outcomes, how likely?": "Total variation to the exact distribution, 0 for equal ones and 1 for those that "
+    "share nothing; missed and invented outcomes a transition; the share of pictures that show nothing of this world. "
+    "A reward counts as the nearest that the rules give.",
+    "What do mistakes cost?": "V* - V of the policy that is optimal in the model, mean over starts, and the exact "
+    "return that the sequence ranked first of five leaves to the best. In units of reward.",
+    "Does it know?": "AUROC of the epistemic uncertainty for transitions imagined wrongly, never seen in the data, or "
+    "either; of the aleatoric for random ones; of the modal for several outcomes. Skill: the share of wrong ones that "
+    "a filter discards, less that of right ones. Worth: reward a start that planning gains without the macro-actions "
+    "it knows least of (the best share, chosen with the truth), and without those that its own filter discards.",
+    "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
+    f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
+    f"{LENGTH} unchanged transitions; {LENGTH}: never. Counterfactuals: what it imagines of two macro-actions with the "
+    "same draws that cannot both be.",
+    "What does it cost?": "On one core. What was spent on an encoder beforehand is in frames.",
+}
+SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
-_SHARES = {"total_variation", "tv_5", "tv_10", "nothing", "outcome_ece", "end_error", "auroc_epistemic", "auroc_never"}
+_SHARES = {
+    *("total_variation", "tv_5", "tv_10", "nothing", "outcome_ece", "reward_ece", "end_error", "end_ece"),
+    *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
+    *(name for name in COLUMNS if name.startswith("auroc")),
+}
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
 _WHOLE = 1_000  # from here on no decimals are shown
 _TELLING = 0.1  # total variation
@@ -50,7 +94,7 @@ def judgement_report(folder: Path, judgement: Judgement) -> str:
     cells = by_model(kept(folder, judgement))
     page = write_page(folder / "report", _page(folder, judgement, cells))
     head = ["world model", "transitions", *(COLUMNS[name] for name in SHORT)]
-    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT)]
+    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT, judgement.sizes)]
     return "\n".join([*aligned([head, *rows]), "", f"Report: {page}"])
 
 
@@ -83,14 +127,14 @@ def _title(model: str) -> str:
     return registry.world_model_entry(model).title
 
 
-def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list[Any]]:
+def _rows(judgement: Judgement, cells: Cells, names: Sequence[str], sizes: Sequence[int]) -> list[list[Any]]:
     return [
         [
             _title(model),
             f"{size:,}",
             *(mean_cell(scores(cells[model, size], name), share=name in _SHARES) for name in names),
         ]
-        for model, size in itertools.product(judgement.models, judgement.sizes)
+        for model, size in itertools.product(judgement.models, sizes)
         if (model, size) in cells
     ]
 
@@ -98,27 +142,25 @@ def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list
 def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     spec = registry.task(judgement.task)
     made = read_json(folder / "judgement.json", "a judgement")
-    errors = read_json(folder / "reader.json", "a reader's errors")
-    pictures = shown(folder, judgement)
-    largest = [model for model in judgement.models if (model, judgement.sizes[-1]) in cells]
-    table = Table(
-        name="judgement", header=["world model", "transitions", *COLUMNS.values()], why_dash=_WHY_DASH,
-        rows=_rows(judgement, cells, tuple(COLUMNS)),
+    pictures, last = shown(folder, judgement), judgement.sizes[-1:]
+    largest = [model for model in judgement.models if (model, *last) in cells]
+    short = Table(
+        name="short", header=["world model", "transitions", *(COLUMNS[name] for name in SHORT)], why_dash=_WHY_DASH,
+        rows=_rows(judgement, cells, SHORT, last),
         caption=f"Interquartile means over {len(judgement.seeds)} seeds of data and model, with 95 % intervals. 0 is "
-        "best in every error; value loss, regret and worth are in units of reward.",
+        "best in every error; value loss is in units of reward.",
     )  # fmt: skip
-    words = [
-        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
-        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
-        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
-        "fog as something."
-    ]
+    images = [*_futures(judgement, pictures), _risk_image(judgement, cells, largest)]
+    by_question = {title: _question_section(title, judgement, cells) for title in QUESTIONS}
+    outcomes, costs, *others = by_question.values()
     sections = [
-        Section(title="Every score", words=words, tables=[table], images=_futures(judgement, pictures)),
-        Section(title="Does it know?", images=[_risk_image(judgement, cells, largest)]),
-        Section(title="By depth", images=[_depth_image(judgement, cells, largest)]),
-        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
+        Section(title="In short", words=[_reader_words(folder)], tables=[short], images=images),
+        Section(title="How much data does it need?", images=[_curve_image(judgement, cells)]),
+        replace(outcomes, images=[_depth_image(judgement, cells, largest)]),
+        replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
         _where_section(spec, judgement, cells, largest, pictures),
+        *others,
+        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
     ]
     return Page(
         title=f"{spec.title}: world models against the exact truth",
@@ -128,6 +170,43 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
         answers=_answers(judgement, cells, largest), sections=sections,
         facts=flat("", made), settings={}, protocol=flat("", dataclasses.asdict(judgement)), recordings=[],
         files={"scores.csv": _csv(cells)},
+    )  # fmt: skip
+
+
+def _reader_words(folder: Path) -> str:
+    errors = read_json(folder / "reader.json", "a reader's errors")
+    return (
+        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
+        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
+        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
+        "fog as something."
+    )
+
+
+def _question_section(title: str, judgement: Judgement, cells: Cells) -> Section:
+    """The scores that answer one question, after every number of transitions."""
+    names = tuple(QUESTIONS[title])
+    table = Table(
+        name=title.lower().strip("?").replace(" ", "_").replace(",", ""), why_dash=_WHY_DASH,
+        header=["world model", "transitions", *QUESTIONS[title].values()],
+        rows=_rows(judgement, cells, names, judgement.sizes), folded="After every number of transitions",
+    )  # fmt: skip
+    return Section(title=title, words=[_WORDS[title]], tables=[table])
+
+
+def _by_start(spec: TaskSpec, judgement: Judgement, cells: Cells) -> Table:
+    """Value loss by the fewest macro-actions that a start needs, after every number of transitions."""
+    needs = [fewest_actions(spec.rules, state) for state in spec.rules.start_states]
+    rows: list[list[str | TableCell]] = []
+    for (model, size), each in cells.items():
+        losses = np.array([cell["value_loss_by_start"] for cell in each])  # [seeds, starts]
+        if losses.size:
+            groups = [losses[:, [need == n for need in needs]].mean(axis=1).tolist() for n in sorted(set(needs))]
+            rows.append([_title(model), f"{size:,}", *map(mean_cell, groups)])
+    return Table(
+        name="value_loss_by_start", folded="By start", rows=rows,
+        header=["world model", "transitions", *(f"{n} ({needs.count(n)} starts)" for n in sorted(set(needs)))],
+        caption="Mean value loss from starts by the fewest macro-actions to a success.",
     )  # fmt: skip
 
 
@@ -183,11 +262,41 @@ def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Tabl
 def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> Figure:
     figure = Figure(figsize=(9.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for (model, values), color in zip(series.items(), itertools.cycle(_COLORS)):
-        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
-    axes.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.03, 1.05))
+    _draw(axes, series, x, ylim=(-0.03, 1.05), xlabel=xlabel, ylabel=ylabel)
     axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
+
+
+def _draw(axes: Axes, series: Mapping[str, Sequence[float]], x: Sequence[float], **settings: Any) -> None:
+    """A line a model, each in the color that it has in every figure."""
+    for model, values in series.items():
+        color = _COLORS[list(registry.world_models()).index(model) % len(_COLORS)]
+        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
+    axes.set(**settings)
+
+
+def _curve_image(judgement: Judgement, cells: Cells) -> Image:
+    """Two scores by the transitions that models learned from."""
+    shown_, sizes = {"total_variation": "total variation, 1 step", "value_loss": "value loss"}, list(judgement.sizes)
+
+    def draw() -> Figure:
+        figure = Figure(figsize=(9.2, 4.0), layout="constrained")
+        for axes, (name, label) in zip(figure.subplots(1, 2), shown_.items(), strict=True):
+            series = {
+                model: [float(np.mean(scores(cells[model, size], name))) if (model, size) in cells else math.nan
+                        for size in sizes]
+                for model in judgement.models
+            }  # fmt: skip
+            _draw(axes, series, sizes, xscale="log", xlabel="transitions of the same data", ylabel=label)
+            axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+            axes.minorticks_off()
+        figure.legend(*axes.get_legend_handles_labels(), fontsize=9, ncols=4, loc="outside lower center")
+        return figure
+
+    return image(
+        "curve", draw, svg=True, alt="Total variation and value loss by the number of transitions learned from",
+        caption="Mean over seeds. Every model learns from the same transitions.",
+    )  # fmt: skip
 
 
 def _risk_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +23,7 @@ DEPTH, HISTORY = 10, 2
 """Macro-actions of each rollout, and macro-actions before them that a model is shown."""
 ROLLOUTS, RANKED, RANKED_DEPTH = 64, 5, 5
 """Rollouts; sequences that are ranked from each start, and their macro-actions."""
+COUNTERFACTUALS = 48  # macrostates in which every macro-action is imagined with the same draws
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
 
 Distribution = dict[State, float]
@@ -45,6 +46,7 @@ class Answers:
     rewards: NDArray[Any] | None  #: Shape (N, S, D).
     p_ended: NDArray[Any] | None  #: Shape (N, S, D).
     uncertainties: dict[str, NDArray[Any]]  #: Those offered, by name, each (N, D).
+    accepted: NDArray[np.bool_] | None  #: Whether a filter of its own keeps it. Shape (N, D).
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
 
@@ -91,6 +93,24 @@ def ranked(spec: TaskSpec, gallery: Gallery) -> Questions:
     return _questions(spec, gallery, asked, rng)
 
 
+def counterfactuals(spec: TaskSpec, gallery: Gallery) -> tuple[Questions, ...]:
+    """The same frames of :data:`COUNTERFACTUALS` macrostates for each macro-action in turn."""
+    rng = SeedTree(0).child("evaluation", "judge", "counterfactuals", spec.id).generator()
+    states = list(dict.fromkeys(state for state, _ in transitions(spec.rules, rng, STATES)))
+    chosen = [
+        states[index] for index in np.sort(rng.choice(len(states), min(COUNTERFACTUALS, len(states)), replace=False))
+    ]
+    first = _questions(spec, gallery, [((state,), (0,)) for state in chosen], rng)
+    return tuple(
+        replace(
+            first,
+            actions=np.full_like(first.actions, action),
+            truth=tuple(courses(spec.rules, state, [action]) for state in chosen),
+        )
+        for action in range(spec.n_actions)
+    )
+
+
 def _questions(
     spec: TaskSpec,
     gallery: Gallery,
@@ -131,6 +151,7 @@ def ask(
         states=_joined([states for states, _ in parts]),
         weights=_joined([weights_of(imagined) for _, imagined in parts]),
         **{each: _offered([getattr(part, each) for _, part in parts]) for each in ("rewards", "p_ended")},
+        accepted=_one_behind_another([part.accepted for _, part in parts]),
         uncertainties={each: np.concatenate([getattr(part, each) for _, part in parts]) for each in offered},
         cpu_s=cpu_s,
         steps=sum(int(np.prod(imagined.pictures.shape[:3])) for _, imagined in parts),
@@ -177,6 +198,11 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         np.pad(part, [(0, 0), (0, most - part.shape[1]), *[(0, 0)] * (part.ndim - 2)], constant_values=value)
         for part, value in zip(parts, fill, strict=True)
     ])  # fmt: skip
+
+
+def _one_behind_another(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:
+    there = [part for part in parts if part is not None]
+    return np.concatenate(there) if len(there) == len(parts) else None
 
 
 def _offered(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:

@@ -27,6 +27,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
 from imagine_bench.judge.models import asking
 from imagine_bench.judge.models.asking import Answers, Reader, ask, call
+from imagine_bench.judge.models.change import Streams, counterfactual_error, noticing, streams_of
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.scores import by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.models.truth import Questions, shares
@@ -40,7 +41,7 @@ from imagine_bench.world_models import WorldModel
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
-_FORMAT = 2
+_FORMAT = 3
 _READ = 1_000  # frames that the reader is measured on
 _READER = "imagine_bench.agents.world_models.reader"
 
@@ -66,6 +67,11 @@ class Judgement:
             raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
         for name in self.models:
             registry.world_model_entry(name)
+        if registry.task(self.task).sight is not None:
+            raise InvalidValueError(
+                f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
+                "all of it. Judge a task without the dials gesture and lag."
+            )
 
     @property
     def folder_name(self) -> str:
@@ -98,6 +104,8 @@ class _World:
     one_step: Questions
     rollouts: Questions
     ranked: Questions
+    counterfactuals: tuple[Questions, ...]
+    streams: dict[str, Streams] | None  #: None where not all of the world is asked about
 
 
 def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
@@ -151,10 +159,9 @@ def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
 def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The scores of one model, fitted once, and a few of its pictures beside the truth."""
     world = prepare(judgement, folder)
-    entry = registry.world_model_entry(cell.model)
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     dataset = data_of(judgement, folder, cell.seed)
-    model, price = make(entry, world, judgement.appearance, seeds)
+    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds)
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
@@ -166,11 +173,18 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
             model, cell.model, each, samples=judgement.samples, reader=world.reader, gallery=world.gallery,
             rng=seeds.child(name).generator(),
         )  # fmt: skip
+    again = [
+        ask(model, cell.model, each, samples=judgement.samples, reader=world.reader, gallery=world.gallery,
+            rng=seeds.child("counterfactuals").generator())
+        for each in world.counterfactuals
+    ]  # fmt: skip
     steps = sum(each.steps for each in answers.values())
     scores = one_step_scores(world.spec, world.one_step, answers["one_step"], visited(dataset, cell.transitions))
     found = {
         **cell._asdict(), "data": dataset.episodes.hash, **scores,
         **by_depth(world.rollouts, answers["rollouts"]), **ranking_scores(world.spec, world.ranked, answers["ranked"]),
+        **noticing(world.streams, answers["one_step"]),
+        "counterfactual": counterfactual_error(world.counterfactuals, again),
         "futures": {
             "real": [_named(world.spec, shares(course)) for course in world.rollouts.truth[0]],
             "imagined": [_named(world.spec, answers["rollouts"].distribution(0, step)) for step in range(asking.DEPTH)],
@@ -189,19 +203,20 @@ def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
 
 
 def make(
-    entry: registry.WorldModelEntry, world: _World, appearance: str, seeds: SeedTree
+    name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree
 ) -> tuple[WorldModel, dict[str, Any]]:
     """A new model, and what was spent on it beforehand: the encoder's name and frames."""
+    entry = registry.world_model_entry(name)
     if entry.privileged:
-        return registry.load(entry.make)(world.spec, world.gallery), {"encoder": "", "encoder_frames": 0}
-    path = None if entry.encoder_kind is None else encoders.own(world.spec, appearance, entry.encoder_kind)
+        return registry.make_world_model(name, spec, gallery), {"encoder": "", "encoder_frames": 0}
+    path = None if entry.encoder_kind is None else encoders.own(spec, appearance, entry.encoder_kind)
     context = AgentContext(
-        n_actions=world.spec.n_actions, preprocessing=world.spec.preprocessing, encoder=path, seeds=seeds,
-        config_group=world.spec.config_group,
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=seeds,
+        config_group=spec.config_group,
     )  # fmt: skip
     card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
     price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
-    return registry.load(entry.make)(context), price
+    return registry.make_world_model(name, context), price
 
 
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
@@ -239,10 +254,11 @@ def prepare(judgement: Judgement, folder: Path) -> _World:
 def _prepared(task: str, appearance: str, folder: Path) -> _World:
     spec = registry.task(task)
     gallery = Gallery(spec, appearance)
+    one_step = asking.one_step(spec, gallery)
     return _World(
-        spec=spec, gallery=gallery, reader=_reader(spec, appearance, folder),
-        one_step=asking.one_step(spec, gallery), rollouts=asking.rollouts(spec, gallery),
-        ranked=asking.ranked(spec, gallery),
+        spec=spec, gallery=gallery, reader=_reader(spec, appearance, folder), one_step=one_step,
+        rollouts=asking.rollouts(spec, gallery), ranked=asking.ranked(spec, gallery),
+        counterfactuals=asking.counterfactuals(spec, gallery), streams=streams_of(spec, one_step),
     )  # fmt: skip
 
 
