@@ -93,18 +93,21 @@ class Observation:
 
     #: the camera image, uint8. Shape (64, 64, 3), or as the protocol says (size, size, 3), or (0, 0, 3) for none
     frame: Frame
-    #: the true state, only for agents registered as privileged; None for every other
+    #: the true state, only for agents registered as privileged, as the next; None for every other
     macrostate: Macrostate | None = None
+    shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
     #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
     more: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, seen: Any, macrostate: Macrostate | None = None) -> Observation:
-        """From what an environment gives: a frame, or parts by name."""
-        if not isinstance(seen, Mapping):
-            return cls(frame=seen, macrostate=macrostate)
-        more = {name: part for name, part in seen.items() if name != "frame"}
-        return cls(frame=seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)), macrostate=macrostate, more=more)
+    def of(cls, seen: Any, info: Mapping[str, Any], *, privileged: bool) -> Observation:
+        """What an agent may see of a frame, or of parts by name; of ``info`` only if it is privileged."""
+        more = {name: part for name, part in seen.items() if name != "frame"} if isinstance(seen, Mapping) else {}
+        frame = seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)) if isinstance(seen, Mapping) else seen
+        if not privileged:
+            return cls(frame=frame, more=more)
+        macrostate = np.asarray(info["macrostate"])
+        return cls(frame=frame, macrostate=macrostate, shown=np.asarray(info.get("shown", macrostate)), more=more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,8 +274,9 @@ class AgentContext:
     #: single settings that replace the set's, by dotted name
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
-    #: the rules' optimal action, only for agents registered as privileged; None for every other
-    optimal_action: Callable[[State], int] | None = None
+    #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
+    #: for agents registered as privileged, None for every other
+    optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
     #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`
     observation: Mapping[str, tuple[int, ...]] = field(default_factory=lambda: {"frame": (FRAME_PX, FRAME_PX, 3)})
 

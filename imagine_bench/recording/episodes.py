@@ -127,7 +127,7 @@ class _EpisodeRecorder:
 
     def _log_frame(self, scene: Any, episode: int, seen: Any, info: dict[str, Any]) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
-        observation = Observation.of(seen, np.asarray(info["macrostate"]) if self._privileged else None)
+        observation = Observation.of(seen, info, privileged=self._privileged)
         frame = observation.frame if observation.frame.size else scene.agent_view()
         self._env_step += 1
         sequences = {"env_step": self._env_step, "episode": episode}

@@ -12,6 +12,7 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import play
 from imagine_bench.capabilities import begin_episode
+from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -42,7 +43,7 @@ def checked_agent(name: str, task: str) -> CheckedAgent:
         config_group=spec.config_group,
         hyperparameters="minimal",
         overrides=registry.own_settings(name, {}),
-        optimal_action=spec.rules.optimal_action if entry.privileged else None,
+        optimal_policy=optimal_policy_of(spec) if entry.privileged else None,
     )
     return CheckedAgent(name, entry, spec, context)
 
