@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.entrants import file_name
@@ -66,6 +67,7 @@ class Judgement:
             raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
         for name in self.models:
             registry.world_model_entry(name)
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
 
     @property
     def folder_name(self) -> str:
