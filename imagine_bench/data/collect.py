@@ -17,6 +17,7 @@ from tqdm import tqdm
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
 from imagine_bench.capabilities import begin_episode
+from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -66,7 +67,7 @@ def policy_of(name: str, spec: TaskSpec, seed: int, encoder: str | None = None) 
     names = {"oracle": (registry.DEMONSTRATOR,), "mixed": ("random", registry.DEMONSTRATOR)}.get(name, ("random",))
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=None,
-        seeds=SeedTree(seed).child("dataset", "agent"), optimal_action=spec.rules.optimal_action,
+        seeds=SeedTree(seed).child("dataset", "agent"), optimal_policy=optimal_policy_of(spec),
     )  # fmt: skip
     players = [(registry.make_agent(each, context), registry.agent_entry(each).privileged) for each in names]
     return Policy(name=name, players=players, facts={"played": POLICIES[name]})
@@ -141,8 +142,7 @@ def _episode(
             each.append(np.asarray(value))
         if ended:
             return {**seen, **kept, "success": bool(info["is_success"]), "faults": faults}
-        shown = kept["macrostates"][-1] if player[1] else None
-        action = player[0].act(Observation(frame=frame, macrostate=shown), explore=False)
+        action = player[0].act(Observation.of(frame, info, privileged=player[1]), explore=False)
         frame, reward, terminated, truncated, info = env.step(action)
         watch()
         truncated = truncated or (options is not None and not terminated)

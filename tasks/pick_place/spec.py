@@ -116,7 +116,7 @@ def _spec(world: PickPlace) -> TaskSpec:
         encoder=SPEC.encoder + world.looks,
         sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
         rules=rules, facts=functools.partial(facts, rules, HORIZON),
-        render_macrostates=functools.partial(_rendered, rules), reference=None, targets=None,
+        render_macrostates=functools.partial(_rendered, rules), reference=None,
     )  # fmt: skip
 
 
