@@ -13,6 +13,7 @@ _TOP = Path(__file__).parent.parent
 _VOCABULARY = {
     "errors",
     "seeding",
+    "appearance",
     "interfaces",
     "capabilities",
     "rules",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +15,12 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.models.ends import Gallery, key_of
 from imagine_bench.judge.models.truth import Questions, courses, lasting_actions, transitions
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.world_models import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 
 STATES = 400  # macrostates asked about at most; of more, values are not computed
+AFTER_THE_END = 200  # transitions that no training contains, at most
 FRAMES = 2  # frames of each macrostate in the questions of one step
 DEPTH, HISTORY = 10, 2
 """Macro-actions of each rollout, and macro-actions before them that a model is shown."""
@@ -64,6 +67,20 @@ def one_step(spec: TaskSpec, gallery: Gallery) -> Questions:
     rng = SeedTree(0).child("evaluation", "judge", "one_step", spec.id).generator()
     pairs = [pair for pair in transitions(spec.rules, rng, STATES) for _ in range(FRAMES)]
     return _questions(spec, gallery, [((state,), (action,)) for state, action in pairs], rng)
+
+
+def after_the_end(spec: TaskSpec, gallery: Gallery) -> Questions | None:
+    """Macro-actions in macrostates in which no episode goes on, which no training contains; None where there is none.
+
+    The scene obeys the same dynamics there (thesis 5.2.3, "Model Generalization").
+    """
+    rng = SeedTree(0).child("evaluation", "judge", "after_the_end", spec.id).generator()
+    over = [state for state in states_of(spec.rules) if spec.rules.is_terminal(state)]
+    pairs = list(itertools.product(over, range(spec.n_actions)))
+    if not pairs:
+        return None
+    chosen = np.sort(rng.choice(len(pairs), min(AFTER_THE_END, len(pairs)), replace=False))
+    return _questions(spec, gallery, [((pairs[index][0],), (pairs[index][1],)) for index in chosen], rng)
 
 
 def rollouts(spec: TaskSpec, gallery: Gallery) -> Questions:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Floats, State, TaskSpec
+from imagine_bench.interfaces import Floats, Rules, State, TaskSpec
 from imagine_bench.judge.calibration import auroc
 from imagine_bench.judge.futures import hallucinated_modes, missed_modes, total_variation
 from imagine_bench.judge.models.asking import Answers, Distribution
@@ -71,6 +71,22 @@ def one_step_scores(
         "by_question": away.round(6).tolist(),
         "worst": np.argsort(-away, kind="stable")[:10].tolist(),
     }
+
+
+def after_the_end(asked: Questions | None, answers: Answers | None, before: Answers) -> dict[str, float]:
+    """Total variation of transitions that no training contains, and whether its uncertainty tells them from others.
+
+    ``before`` are the answers about transitions that training can contain. NaN without such a question or uncertainty.
+    """
+    found = dict.fromkeys(("after_the_end", "auroc_after_the_end"), math.nan)
+    if asked is None or answers is None:
+        return found
+    away = [total_variation(shares(steps[0]), answers.distribution(row, 0)) for row, steps in enumerate(asked.truth)]
+    both = [each.uncertainties.get("epistemic") for each in (before, answers)]
+    if both[0] is not None and both[1] is not None:
+        unseen = np.repeat([False, True], [len(each) for each in both if each is not None])
+        found["auroc_after_the_end"] = auroc(np.concatenate([both[0][:, 0], both[1][:, 0]]), unseen)
+    return {**found, "after_the_end": float(np.mean(away))}
 
 
 def _values(spec: TaskSpec, questions: Questions, answers: Answers) -> dict[str, Any]:
@@ -158,6 +174,7 @@ def _where(
 ) -> dict[str, dict[str, float]]:  # fmt: skip
     """Mean total variation by action, coordinate, plan length, whether it is in the data, and number of outcomes."""
     actions, several = questions.asked[:, 0], np.array([len(each) > 1 for each in exact])
+    comes = np.array([_comes_of(spec.rules, *pair) for pair in zip(questions.states, actions.tolist(), strict=True)])
     lengths = {state: _plan_length(spec, state) for state in set(questions.states)}
     plan = np.array([lengths[state] for state in questions.states])
 
@@ -171,9 +188,18 @@ def _where(
             for index, name in enumerate(spec.macrostate_names)
         },
         "plan length": means((str(each), plan == each) for each in sorted(set(plan.tolist()))),
+        "what comes of it": means((name, comes == name) for name in sorted(set(comes.tolist()))),
         "in its data": means((("seen", seen), ("never", ~seen))),
         "outcomes": means((("one", ~several), ("several", several))),
     }
+
+
+def _comes_of(rules: Rules, state: State, action: int) -> str:
+    """Success, failure or that the episode goes on; "chance decides" where the rules leave it open."""
+    kinds = {
+        "success" if o.success else "failure" if o.terminated else "it goes on" for o in rules.outcomes(state, action)
+    }
+    return kinds.pop() if len(kinds) == 1 else "chance decides"
 
 
 def _plan_length(spec: TaskSpec, state: State) -> int:
