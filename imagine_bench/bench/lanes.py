@@ -28,7 +28,8 @@ def lanes_pay(run: Run, episodes: int) -> bool:
     from the one that is shown: in tests, those of every learner do that does not remember its episode.
     """
     markov = run.entry.learns and not isinstance(run.agent, EpisodeRememberer)
-    simulated = run.protocol.execution == "physics" and run.protocol.shows_frames_alone and markov
+    wanted = run.protocol
+    simulated = wanted.execution == "physics" and wanted.shows_frames_alone and wanted.split is None and markov
     offered = registry.vector_id(registry.task_entry(run.task.id).env_id) in gymnasium.registry
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 
