@@ -86,8 +86,17 @@ class Observation:
     """What an agent is given before it acts."""
 
     frame: Frame  #: the camera image. Shape (64, 64, 3), uint8.
-    #: the true state, only for agents registered as privileged; None for every other
+    #: the true state, only for agents registered as privileged, as all below; None for every other
     macrostate: Macrostate | None = None
+    shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
+
+    @classmethod
+    def of(cls, frame: Frame, info: Mapping[str, Any], *, privileged: bool) -> Observation:
+        """What an agent may see: of ``info`` only if it is privileged."""
+        if not privileged:
+            return cls(frame=frame)
+        macrostate = np.asarray(info["macrostate"])
+        return cls(frame=frame, macrostate=macrostate, shown=np.asarray(info.get("shown", macrostate)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +189,8 @@ class PerformanceTargets:
     """What ``make speed`` holds a task in contact physics to."""
 
     objects: tuple[str, ...]  #: bodies of the loose objects; coordinate i of a macrostate is object i's
-    as_ruled: float  #: least share of random macro-actions that end exactly as the rules say
+    as_ruled: float  #: least share of random macro-actions that end exactly as the rules say, at clean
+    as_ruled_varied: float = 0.995  #: the same at every other appearance
     other_objects_mm: float  #: an object that an action leaves where it stands moves by less
     #: the object acted on ends nearer to where a perfect execution leaves it, 99 times of 100; None asks for nothing
     error_mm: float | None = None
@@ -253,8 +263,9 @@ class AgentContext:
     #: single settings that replace the set's, by dotted name
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
-    #: the rules' optimal action, only for agents registered as privileged; None for every other
-    optimal_action: Callable[[State], int] | None = None
+    #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
+    #: for agents registered as privileged, None for every other
+    optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,6 +32,7 @@ from imagine_bench.errors import (
 )
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.world_models import WorldModel
 
 _ARROWS = TaskEntry(
     spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_limited_env",
@@ -558,5 +559,16 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
-    """A new regressor by its registered name."""
-    return load(regressor_entry(name).make)(context)
+    """A new regressor by its registered name. Raises as :func:`make_agent`."""
+    entry, own = regressor_entry(name), entrant(name).agent in REGRESSORS
+    with _guests_faults(f"Regressor {name} ({entry.make})", own=own):
+        regressor: Regressor = load(entry.make)(context)
+    return regressor
+
+
+def make_world_model(name: str, *given: Any) -> WorldModel:
+    """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
+    entry = world_model_entry(name)
+    with _guests_faults(f"World model {name} ({entry.make})", own=name in WORLD_MODELS):
+        model: WorldModel = load(entry.make)(*given)
+    return model

@@ -20,11 +20,6 @@ Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
 
 
-def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
-    """What an agent may see of a step: the macrostate only if it is registered as privileged."""
-    return Observation(frame=frame, macrostate=np.asarray(info["macrostate"]) if privileged else None)
-
-
 def play(
     env: Env,
     agent: Agent,
@@ -42,14 +37,14 @@ def play(
     frame, info = env.reset(seed=seed)
     _require_sound(env, frame, 0.0)
     begin_episode(agent)
-    before, over = observation(frame, info, privileged=privileged), False
+    before, over = Observation.of(frame, info, privileged=privileged), False
     while not over:
         if before_acting is not None:
             before_acting(before, info)
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
         _require_sound(env, frame, reward)
-        after = observation(frame, info, privileged=privileged)
+        after = Observation.of(frame, info, privileged=privileged)
         transition = Transition(
             observation=before, action=action, reward=float(reward), next_observation=after,
             terminated=bool(terminated), truncated=bool(truncated),

@@ -10,11 +10,10 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import observation
 from imagine_bench.bench.run_state import Run
 from imagine_bench.capabilities import EpisodeRememberer
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import Agent
+from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.store.counters import Played
 
 LEAST_EPISODES = 50
@@ -60,7 +59,7 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
     free, following, actions = list(everyone), 0, dict[int, int]()
 
     def act(lane: int, frame: Any, info: dict[str, Any]) -> None:
-        actions[lane] = int(agent.act(observation(frame, info, privileged=privileged), explore=False))
+        actions[lane] = int(agent.act(Observation.of(frame, info, privileged=privileged), explore=False))
         lanes.send([actions[lane]], [lane])
 
     while following < len(seeds):

@@ -57,8 +57,8 @@ def as_seen(transition: Transition) -> Transition:
     """A demonstrated transition as a learner may see it: without macrostates."""
     return dataclasses.replace(
         transition,
-        observation=dataclasses.replace(transition.observation, macrostate=None),
-        next_observation=dataclasses.replace(transition.next_observation, macrostate=None),
+        observation=Observation(frame=transition.observation.frame),
+        next_observation=Observation(frame=transition.next_observation.frame),
     )
 
 

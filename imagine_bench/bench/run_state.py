@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import gymnasium
 
 from imagine_bench import registry
 from imagine_bench.bench.evaluation import Env
-from imagine_bench.bench.queries import Teacher, require_able
+from imagine_bench.bench.queries import Teacher, demonstrator, require_able
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
@@ -116,6 +117,11 @@ class Run:
             "seed": self.spec.seed,
             "settings": {} if settings is None else dataclasses.asdict(settings),
         }
+
+    @cached_property
+    def demonstrator(self) -> Agent:
+        """See :func:`.queries.demonstrator`; it holds nothing from one episode to the next."""
+        return demonstrator(self.spec)
 
     @property
     def budgets_left(self) -> tuple[int, ...]:

@@ -92,6 +92,13 @@ def certificate(spec: TaskSpec) -> Certificate:
     )
 
 
+def optimum(spec: TaskSpec) -> float:
+    """The largest success probability with memory; where there are too many beliefs, a bound on it."""
+    tables = tabulate(spec.rules)
+    seen_optimum = float(horizon_optimum(tables, spec.horizon).success[tables.starts].mean())
+    return seen_optimum if spec.sight is None else _with_memory(spec, tables, seen_optimum)[0]
+
+
 def certificate_rows(found: Certificate) -> dict[str, str]:
     """A certificate in words, by heading."""
     plans = ", ".join(f"{length} ({count} starts)" for length, count in found.plan_lengths if length > 0)

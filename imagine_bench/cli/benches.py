@@ -45,7 +45,7 @@ class Bench:
     execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
-    """How much light, colors and poses vary: clean, mild, strong, or photo (a finite pool)."""
+    """How much frames vary: clean, mild, strong, photo (a finite pool), or factors such as light=0.5,camera=0.2."""
     test_appearance: Annotated[str | None, shown("STR", "(default: the training's)")] = None
     """The appearance in tests."""
     physics: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()

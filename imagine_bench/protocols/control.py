@@ -6,9 +6,10 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
+from imagine_bench.appearance import appearance_name
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
+from imagine_bench.interfaces import DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
@@ -38,7 +39,7 @@ class Protocol(ProtocolData):
     budgets: tuple[int, ...] = (100, 250, 500)
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
-    appearance: str = "clean"  #: One of :data:`imagine_bench.interfaces.APPEARANCES`
+    appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
     #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
@@ -74,8 +75,9 @@ class Protocol(ProtocolData):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        for appearance in (self.appearance, self.test_appearance or self.appearance):
-            require_known("appearance", appearance, APPEARANCES)
+        for name in ("appearance", "test_appearance"):
+            if (looks := getattr(self, name)) is not None:
+                object.__setattr__(self, name, appearance_name(looks))
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)

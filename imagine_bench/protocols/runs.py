@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from imagine_bench import registry
+from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
@@ -48,7 +49,7 @@ class RunSpec(Generic[P_co]):
             hyperparameters=protocol.hyperparameters,
             overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,
-            optimal_action=task.rules.optimal_action if entry.privileged else None,
+            optimal_policy=optimal_policy_of(task) if entry.privileged else None,
         )
 
 

@@ -112,7 +112,7 @@ class _EpisodeRecorder:
         done, step, heading = False, 0, f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
-            observation = Observation(frame=frame, macrostate=macrostate if self._privileged else None)
+            observation = Observation.of(frame, info, privileged=self._privileged)
             action = int(self._agent.act(observation, explore=False))
             self._describe(heading, macrostate, f"Next: {self._spec.action_names[action]}.")
             self._log_values(observation, action)

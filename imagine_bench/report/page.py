@@ -119,7 +119,7 @@ def summary_table(result: BenchResult) -> str:
         f"{protocol.evaluation_episodes} test episodes"
         f"{f'; trained first on dataset {protocol.dataset}' if protocol.dataset else ''}"
     )
-    return "\n".join([title, "", *aligned(rows), "", *text.answers(data)])
+    return "\n".join([title, "", *aligned(rows), "", *text.paired_answers(data), "", *text.answers(data)])
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:
