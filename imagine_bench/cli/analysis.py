@@ -80,7 +80,7 @@ class Judge:
     samples: int = 8
     """Futures imagined of each question."""
     appearance: str = APPEARANCES[0]
-    """How much light, colors and poses vary."""
+    """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: str = "random"
     """Who collects the data: random, uniform, oracle or mixed."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
