@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name
+from imagine_bench.certificates.splits import StartingFrom, split_of
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
+from imagine_bench.interfaces import DEVICES, EXECUTIONS, PhysicsSettings, Rules, TaskSpec, appearance_of_tests
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
@@ -71,6 +72,8 @@ class Protocol(ProtocolData):
     #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
     #: (name, value) pairs.
     physics: tuple[tuple[str, Any], ...] = field(default=(), metadata=LATER)
+    #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
+    split: str | None = field(default=None, metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,6 +127,15 @@ class Protocol(ProtocolData):
     def world(self) -> dict[str, Any]:
         """What the environments of this protocol are made with, but for their appearance."""
         return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {})}
+
+    def spec(self, *, testing: bool) -> TaskSpec:
+        """The task with the starts that training or tests have. Raises InvalidValueError: another split than here."""
+        spec = task(self.task)
+        if self.split is None:
+            return spec
+        found = split_of(spec.rules, self.split)
+        rules = StartingFrom(spec.rules, found.test if testing else found.train)
+        return dataclasses.replace(spec, rules=cast("Rules", rules))
 
     @property
     def looks(self) -> str:
@@ -189,6 +201,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     values["after"] = tuple(map(canonical, values.get("after", ())))
+    if values.get("split") is not None:
+        values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         agent_entry(agent)
