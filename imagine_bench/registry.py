@@ -143,6 +143,11 @@ AGENTS: dict[str, AgentEntry] = {
         )
         for twin in ("", "_macrostate")
     },
+    "dreamer_v3": AgentEntry(
+        make="imagine_bench.agents.library.dreamer:make", needs_encoder=False, title="DreamerV3 (pixels)",
+        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
+        description="sheeprl's DreamerV3: a recurrent world model of pixels, and a policy trained in its imagination.",
+    ),
     "sb3_ppo_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
         title="SB3 PPO (latents)",

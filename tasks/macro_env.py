@@ -83,7 +83,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         spec: The task.
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
-        appearance: A name in :data:`.scenes.appearance.LEVELS`.
+        appearance: A name, or factors, as :func:`imagine_bench.appearance.appearance_name` takes them.
         render_mode: None, ``"rgb_array"``, which :meth:`render` returns, or ``"human"``: a window that shows each
             motion as long as it took.
         width: Pixels of :meth:`render`.
@@ -96,7 +96,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     Raises:
         UnknownNameError: An unknown execution, appearance, render mode, camera, physics setting or observation.
-        InvalidValueError: An image size, a physics setting or a rate out of range.
+        InvalidValueError: An image size, a factor, a physics setting or a rate out of range.
 
     Version History: v0, the first.
     """
@@ -115,7 +115,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         make_world: Callable[[Appearance], World],
         *,
         execution: str = "physics",
-        appearance: str = "clean",
+        appearance: str | Mapping[str, float] = "clean",
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
@@ -134,9 +134,10 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._lag, self._shown_lag = self._lags = [Lag(spec.sight.lag if spec.sight else 0) for _ in range(2)]
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
-        self._make_world, self.world = make_world, make_world(appearance_level(appearance))
+        level = appearance_level(appearance)
+        self._make_world, self.world = make_world, make_world(level)
         self.world.set_physics(settings)
-        self._kind = (spec.id, self._execution, appearance, settings)
+        self._kind = (spec.id, self._execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
         self._agent_camera = agent_camera(self.world.model)

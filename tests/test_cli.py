@@ -50,7 +50,10 @@ def bench_words(out: Path, *more: str) -> list[str]:
             "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
         ),
         (["--agents", "dqnn"], "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
-        (["--appearance", "strng"], "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo."),
+        (
+            ["--appearance", "strng"],
+            "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, ",
+        ),
         (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
         (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
         (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),

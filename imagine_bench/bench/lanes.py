@@ -28,7 +28,7 @@ def lanes_pay(run: Run, episodes: int) -> bool:
     observation that it is shown: in tests, those of every learner do that does not remember its episode.
     """
     markov = run.entry.learns and not isinstance(run.agent, EpisodeRememberer)
-    simulated = run.protocol.execution == "physics" and markov
+    simulated = run.protocol.execution == "physics" and run.protocol.split is None and markov
     offered = registry.vector_id(registry.task_entry(run.task.id).env_id) in gymnasium.registry
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -78,7 +79,7 @@ class Judge:
     samples: int = 8
     """Futures imagined of each question."""
     appearance: str = APPEARANCES[0]
-    """How much light, colors and poses vary."""
+    """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: str = "random"
     """Who collects the data: random, uniform, oracle or mixed."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
@@ -117,11 +118,12 @@ class Verify:
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.audit.verify import verify  # noqa: PLC0415 - as above
+        from imagine_bench.audit.verify import price, verify  # noqa: PLC0415 - as above
         from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
 
-        verdicts = verify(chosen(self.folder, self.out, self.task))
-        print(*verdicts, sep="\n")
+        folder, begun_s = chosen(self.folder, self.out, self.task), time.process_time()
+        verdicts = verify(folder)
+        print(*verdicts, price(folder, verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)
 

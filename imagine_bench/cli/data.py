@@ -36,7 +36,7 @@ class Dataset:
     execution: str = EXECUTIONS[0]
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: str = APPEARANCES[0]
-    """How much light, colors and poses vary: clean, mild, strong, or photo."""
+    """How much frames vary: clean, mild, strong, photo, or factors such as light=0.5,camera=0.2."""
     motion_hz: float = 0.0
     """Samples a second of the arm's motion and commands, kept in a file apart; 0 keeps none."""
     encoder: Annotated[str | None, shown("NAME|FILE", "(default: the run's, if bundled)")] = None

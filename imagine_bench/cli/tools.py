@@ -45,7 +45,7 @@ class Encoder:
     task: str
     """Task whose frames it learns."""
     appearance: str = APPEARANCES[0]
-    """Appearance level of the frames."""
+    """Appearance of the frames: a level, or factors such as light=0.5,camera=0.2."""
     recipe: str = "default"
     """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole image), or codes,
     for agents that read factors and their values."""
@@ -86,7 +86,7 @@ class Film:
     task: str
     """Task to film."""
     appearance: str = APPEARANCES[0]
-    """Appearance level."""
+    """Appearance: a level, or factors."""
     seed: int = 0
     """Chooses the episode."""
     out: Path = Path("film.gif")
@@ -110,7 +110,7 @@ class Play:
     execution: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
     """physics or kinematic."""
     appearance: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
-    """Appearance level."""
+    """Appearance: a level, or factors."""
     encoder: Annotated[str | None, shown("STR", "(default: the bundled one)")] = None
     """Name or file of the encoder that the model used."""
     seed: int = 0

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
+from imagine_bench.appearance import appearance_name
 from imagine_bench.capabilities import begin_episode
 from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.data.episodes import Episodes, joined
@@ -108,7 +109,7 @@ def collect(
         names = [field.name for field in dataclasses.fields(ArmMotion)]
         apart["arm"] = {name: np.concatenate([getattr(each, name) for each in motion]) for name in names}
         apart["arm"]["samples"] = np.array([len(each.time_s) for each in motion])
-    made = {"seed": seed, "execution": execution, "appearance": appearance, "motion_hz": motion_hz}
+    made = {"seed": seed, "execution": execution, "appearance": appearance_name(appearance), "motion_hz": motion_hz}
     return played, apart, {**_card(spec, policy, played), **made, "faults": sum(part["faults"] for part in parts)}
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
+from imagine_bench.appearance import appearance_name
+from imagine_bench.certificates.splits import StartingFrom, split_of
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
+from imagine_bench.interfaces import DEVICES, EXECUTIONS, PhysicsSettings, Rules, TaskSpec, appearance_of_tests
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
@@ -38,7 +40,7 @@ class Protocol(ProtocolData):
     budgets: tuple[int, ...] = (100, 250, 500)
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
-    appearance: str = "clean"  #: One of :data:`imagine_bench.interfaces.APPEARANCES`
+    appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
     #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
@@ -70,12 +72,15 @@ class Protocol(ProtocolData):
     #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
     #: (name, value) pairs.
     physics: tuple[tuple[str, Any], ...] = field(default=(), metadata=LATER)
+    #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
+    split: str | None = field(default=None, metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        for appearance in (self.appearance, self.test_appearance or self.appearance):
-            require_known("appearance", appearance, APPEARANCES)
+        for name in ("appearance", "test_appearance"):
+            if (looks := getattr(self, name)) is not None:
+                object.__setattr__(self, name, appearance_name(looks))
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)
@@ -122,6 +127,15 @@ class Protocol(ProtocolData):
     def world(self) -> dict[str, Any]:
         """What the environments of this protocol are made with, but for their appearance."""
         return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {})}
+
+    def spec(self, *, testing: bool) -> TaskSpec:
+        """The task with the starts that training or tests have. Raises InvalidValueError: another split than here."""
+        spec = task(self.task)
+        if self.split is None:
+            return spec
+        found = split_of(spec.rules, self.split)
+        rules = StartingFrom(spec.rules, found.test if testing else found.train)
+        return dataclasses.replace(spec, rules=cast("Rules", rules))
 
     @property
     def looks(self) -> str:
@@ -187,6 +201,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     values["after"] = tuple(map(canonical, values.get("after", ())))
+    if values.get("split") is not None:
+        values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         agent_entry(agent)

@@ -59,6 +59,7 @@ class Progress:
 
     agent: str  #: Registered agent
     seed: int  #: The run's seed
+    bench: str = ""  #: Hash of the run's protocol
     phase: Phase  #: What it is doing
     done: int  #: Episodes played, for training and for tests
     work: int  #: Episodes to play

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.entrants import file_name
@@ -70,6 +71,7 @@ class Judgement:
             raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
         for name in self.models:
             model_entry(name)
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
         if registry.task(self.task).sight is not None:
             raise InvalidValueError(
                 f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
