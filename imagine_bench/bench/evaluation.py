@@ -20,6 +20,18 @@ Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
 
 
+class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """An observation of one part, as a dict of that part."""
+
+    def __init__(self, env: Env, name: str) -> None:
+        super().__init__(env)
+        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """See above."""
+        return {self._name: observation}
+
+
 def play(
     env: Env,
     agent: Agent,

@@ -13,12 +13,12 @@ from typing import Any
 import gymnasium
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Env, StartsFrom
+from imagine_bench.bench.evaluation import ByName, Env, StartsFrom
 from imagine_bench.bench.queries import Teacher, demonstrator, require_able
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Agent
+from imagine_bench.interfaces import OBSERVATIONS, Agent
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.store import encoders, run_folder
@@ -40,6 +40,8 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options:
         **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
+    if protocol.observation in OBSERVATIONS[1:]:
+        env = ByName(env, protocol.observation)
     if protocol.split is None or task != protocol.task:
         return env
     return StartsFrom(env, protocol.spec(testing=testing).rules.start_states)

@@ -53,6 +53,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     Raises:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
         UnknownNameError: No such encoder.
+        InvalidValueError: An agent that sees other observations than frames.
     """
     path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
     config = read_sealed(path, what)
@@ -62,6 +63,11 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     require_control(task, str(folder))
     with reading(path, what):
         protocol = Protocol.from_dict(config["protocol"])
+    if not protocol.shows_frames_alone:
+        raise InvalidValueError(
+            f"{folder} is of an agent that sees {protocol.observation} at {protocol.observation_size} pixels, and it "
+            "would be asked with 64 x 64 frames alone; give the run of one that sees these."
+        )
     spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:
