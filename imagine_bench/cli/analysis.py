@@ -12,8 +12,7 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, shown
-from imagine_bench.entrants import parse_settings
+from imagine_bench.cli.options import ANY, NEWEST, listed, shown
 from imagine_bench.errors import RunFailedError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 
@@ -66,7 +65,7 @@ class Judge:
     task: str = "arrow_puzzle"
     """Task whose world is imagined."""
     models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite but slow ones)")] = None
-    """World models; 'imagine-bench list' names them."""
+    """World models, as 'imagine-bench list' names them, or folders of finished runs, whose agents are judged."""
     sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
         100,
         300,
@@ -141,23 +140,6 @@ class _OfBench:
     """The encoder the runs saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Generalise(_OfBench):
-    """Ask the models of a bench, finished or not, for every transition: also those that no training can contain."""
-
-    set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
-    """Settings that replace those the agents ran with, as name=value, such as imagination.temperature=0."""
-
-    def __call__(self) -> None:
-        """Ask and report."""
-        from imagine_bench.report.generalisation import generalisation_report  # noqa: PLC0415 - as above
-
-        overrides = parse_settings(added_up("set", self.set))
-        print(
-            generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder, overrides=overrides)
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
