@@ -239,6 +239,11 @@ class TaskSpec:
     #: what ``make speed`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
     sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
+    executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first
+
+    def execution(self, asked: str | None) -> str:
+        """How macro-actions are to happen: as asked for, or the usual way. UnknownNameError: not in this world."""
+        return self.executions[0] if asked is None else require_known(f"execution of {self.id}", asked, self.executions)
 
     @property
     def n_actions(self) -> int:
