@@ -130,7 +130,7 @@ class NosyAgent(TableAgent):
 
     def __init__(self, context: AgentContext) -> None:
         super().__init__(context)
-        self.seen.append(context.optimal_action)
+        self.seen.append(context.optimal_policy)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         self.seen.append(observation.macrostate)
