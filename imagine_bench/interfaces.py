@@ -183,7 +183,7 @@ class RuleFacts:
     """What the rules alone say about a task, computed by enumeration."""
 
     chance_level: float  #: success probability of a uniformly random agent within the horizon
-    optimum: float  #: success probability of an optimal agent within the horizon
+    optimum: float  #: largest success probability of any policy within the horizon
     optimal_return: float  #: mean undiscounted return of an optimal agent over the start states
     mean_plan_length: float  #: mean number of actions of an optimal agent over the start states
 
@@ -239,6 +239,11 @@ class TaskSpec:
     #: what ``make speed`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
     sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
+    executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first
+
+    def execution(self, asked: str | None) -> str:
+        """How macro-actions are to happen: as asked for, or the usual way. UnknownNameError: not in this world."""
+        return self.executions[0] if asked is None else require_known(f"execution of {self.id}", asked, self.executions)
 
     @property
     def n_actions(self) -> int:

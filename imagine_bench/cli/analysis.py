@@ -14,7 +14,7 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.cli.options import ANY, NEWEST, listed, shown
 from imagine_bench.errors import RunFailedError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.interfaces import APPEARANCES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Plan:
     """Plans."""
     recorded: int = 5
     """Plans that are recorded too; 0 for none."""
-    execution: str = EXECUTIONS[0]
+    execution: Annotated[str | None, shown("STR", "(default: the task's)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     max_epistemic: Annotated[float | None, shown("FLOAT", "(default: the agent's own filter)")] = None
     """A plan with an imagined step of more epistemic uncertainty is refused."""

@@ -130,7 +130,7 @@ class Protocol(ProtocolData):
         changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
         object.__setattr__(self, "physics", changed)
         if changed and self.execution == "kinematic":
-            raise InvalidValueError("Physics settings change nothing in kinematic execution; give --execution physics.")
+            raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
 
     def _require_observation(self) -> None:
         """One way to write each choice; errors for an unknown part, one that is given twice, or a size out of range."""
@@ -237,6 +237,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
+    values["execution"] = spec.execution(values.get("execution"))
     values["after"] = tuple(map(canonical, values.get("after", ())))
     if values.get("split") is not None:
         values["split"] = split_of(spec.rules, values["split"]).identity
