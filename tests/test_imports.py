@@ -54,6 +54,7 @@ ARROWS: dict[str, set[str]] = {
         "judge",
         "recording",
         "studies",
+        "suite",
         "report",
         "testing",
         "tools",
