@@ -138,25 +138,6 @@ class Imaginer(Protocol):
 
 
 @runtime_checkable
-class MapPredictor(Protocol):
-    """An agent whose model names what it holds likeliest, apart from what it samples when it imagines."""
-
-    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """Macrostates (N, M), as a probe reads them, likeliest after one of the actions (N,) from each real frame.
-
-        ``rng`` draws dropout masks; nothing changes in the agent.
-        """
-
-
-@runtime_checkable
-class ReplayReader(Protocol):
-    """An agent that can say which transitions it learns from."""
-
-    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Macrostates (N, M), as a probe reads them, and actions (N,) of the real transitions that it remembers."""
-
-
-@runtime_checkable
 class FrameReader(Protocol):
     """An agent that can say what it takes a frame for."""
 

@@ -138,14 +138,6 @@ class ImaginingAgent(DQN):
         """Imagine many futures of the same beginnings; see :class:`imagine_bench.capabilities.FutureSampler`."""
         return sample_futures(self.imagination, self.perception.encoder, frames, actions, follow, samples, depth, rng)
 
-    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """The likeliest results of actions; see :class:`imagine_bench.capabilities.MapPredictor`."""
-        z = torch.stack([self.perception.posterior(frame)[0] for frame in frames])  # [N, Z]
-        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
-        weights, action = self.imagination.draw_weights(generator), torch.as_tensor(actions, device=z.device)
-        likeliest = self.imagination.likeliest(z, action, weights, generator)
-        return self.perception.encoder.read_macrostate(likeliest)
-
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
         """As many samples as :data:`_BRANCHES`; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
         z, shape = self.perception.encoder.encode(frames)[0], (len(frames), self.n_actions, _BRANCHES)
@@ -159,11 +151,6 @@ class ImaginingAgent(DQN):
             p_continues=(p_terminated <= TERMINAL).double().cpu().numpy().reshape(shape) / _BRANCHES,
             reward=reward.double().cpu().numpy().reshape(shape).mean(axis=2),
         )
-
-    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What the real memory holds; see :class:`imagine_bench.capabilities.ReplayReader`."""
-        rows = self.real.arrays()
-        return self.perception.encoder.read_macrostate(torch.as_tensor(rows["mu"])), rows["action"].astype(np.int64)
 
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator

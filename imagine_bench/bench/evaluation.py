@@ -12,12 +12,24 @@ import numpy as np
 
 from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Agent, Observation, Transition
+from imagine_bench.interfaces import Agent, Observation, State, Transition
 from imagine_bench.seeding import Purpose, episode_seed
 from imagine_bench.store.counters import Counters, EvaluationCounts, Played
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
+
+
+class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """An observation of one part, as a dict of that part."""
+
+    def __init__(self, env: Env, name: str) -> None:
+        super().__init__(env)
+        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """See above."""
+        return {self._name: observation}
 
 
 def play(
@@ -113,6 +125,21 @@ class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._counters.try_out(self._at, int(action))
         self._at = np.asarray(after[4]["macrostate"]).tolist()
         return after
+
+
+class StartsFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Starts every episode in one of some macrostates, equally likely, that its seed decides."""
+
+    def __init__(self, env: Env, starts: Sequence[State]) -> None:
+        super().__init__(env)
+        self._starts = tuple(starts)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+        """Start an episode, where ``options`` say so if they do."""
+        if options is None:
+            rng = np.random.default_rng(seed)
+            options = {"macrostate": self._starts[int(rng.integers(len(self._starts)))]}
+        return self.env.reset(seed=seed, options=options)
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -24,11 +24,12 @@ _LANES_PER_CORE = 4
 def lanes_pay(run: Run, episodes: int) -> bool:
     """Whether the episodes of a test are played in lanes.
 
-    They are where simulating takes the time, the run has several cores, and an agent's actions follow from the one
-    observation that it is shown: in tests, those of every learner do that does not remember its episode.
+    They are where simulating takes the time, the run has several cores, frames are all that is seen, and actions follow
+    from the one that is shown: in tests, those of every learner do that does not remember its episode.
     """
     markov = run.entry.learns and not isinstance(run.agent, EpisodeRememberer)
-    simulated = run.protocol.execution == "physics" and markov
+    wanted = run.protocol
+    simulated = wanted.execution == "physics" and wanted.shows_frames_alone and wanted.split is None and markov
     offered = registry.vector_id(registry.task_entry(run.task.id).env_id) in gymnasium.registry
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 

@@ -95,7 +95,8 @@ def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
     budget = data.decisive_budget
     sentences = [_unfinished(data)] if data.result.missing else []
-    sentences += [absent] if (absent := missing(data.result.protocol)) else []
+    absent = missing(data.result.protocol, certified=data.result.certificate is not None)
+    sentences += [absent] if absent else []
     if BASE_AGENT in data.scores:
         where = ", where the learners differ most," if data.spread(budget) > 0 and len(data.budgets) > 1 else ""
         sentences.append(

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Frame, Rules, State, TaskSpec
-from imagine_bench.judge.models.asking import FRAMES, Answers, ask, one_step, ranked, rollouts
+from imagine_bench.judge.models.asking import FRAMES, Answers, after_the_end, ask, one_step, ranked, rollouts
 from imagine_bench.judge.models.ends import Copy, Exact, Gallery
+from imagine_bench.judge.models.scores import after_the_end as scores_after_the_end
 from imagine_bench.judge.models.scores import by_depth, filter_scores, one_step_scores, ranking_scores
 from imagine_bench.judge.models.truth import Questions
 from imagine_bench.world_models import Imagined, WorldModel
@@ -120,6 +121,26 @@ def test_copy_loses_what_always_doing_the_same_loses() -> None:
     assert found["value_loss"] == pytest.approx(np.mean(losses))
     assert found["worst_value_loss"] == pytest.approx(max(losses))
     assert found["value_loss_by_start"] == pytest.approx(losses)
+
+
+def test_after_the_end_is_what_no_training_contains() -> None:
+    world = asked("arrow_puzzle")
+    questions = after_the_end(world.spec, world.gallery)
+    assert questions is not None and len(questions.states) == 200
+    rules = world.spec.rules
+    assert all(rules.is_terminal(state) for state in questions.states)
+    assert not set(questions.states) & set(world.one_step.states)
+    for state, steps in zip(questions.states, questions.truth, strict=True):
+        ((after, _),) = steps[0]
+        assert sum(a != b for a, b in zip(state, after, strict=True)) == 1, "a macro-action still turns a cube"
+    exact, still = Exact(world.spec, world.gallery), Copy()
+    found = [
+        scores_after_the_end(questions, world.answers(model, questions), world.answers(model, world.one_step))
+        for model in (exact, still)
+    ]
+    assert [each["after_the_end"] for each in found] == [0.0, 1.0]
+    assert found[0]["auroc_after_the_end"] == 0.5 and math.isnan(found[1]["auroc_after_the_end"])
+    assert math.isnan(scores_after_the_end(None, None, world.answers(still, world.one_step))["after_the_end"])
 
 
 class Mistaken(Exact):
