@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
+from imagine_bench.report import plots
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -136,6 +138,19 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
+def why() -> None:
+    """Failures by cause, as the report draws them."""
+    kept = RESULTS / "arrow_puzzle-mild-why"
+    tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
+    found: plots.Failures = {}
+    for run in json.loads((kept / "why.json").read_text())["runs"]:
+        for budget, counts in run["failures"].items():
+            before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
+            found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
+    figure = plots.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
+    figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
+
+
 DIALS = ({}, {"slip": 0.5}, {"fickle": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
 FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
 TURNS = {"start": None, "left turned": 0, "middle turned": 2, "right turned": 4}
@@ -174,7 +189,7 @@ def dials() -> None:
     figure.savefig(HERE / "dials.png", dpi=110)
 
 
-PICTURES = {each.__name__: each for each in (learning_curves, thesis_settings, mild, margins, dials)}
+PICTURES = {each.__name__: each for each in (learning_curves, thesis_settings, mild, margins, why, dials)}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:
