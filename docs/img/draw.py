@@ -2,12 +2,14 @@
 
 import csv
 import json
+from collections import Counter
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
 from imagine_bench import reference, statistics
+from imagine_bench.report import plots
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -132,8 +134,22 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
+def why() -> None:
+    """Failures by cause, as the report draws them."""
+    kept = RESULTS / "arrow_puzzle-mild-why"
+    tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
+    found: plots.Failures = {}
+    for run in json.loads((kept / "why.json").read_text())["runs"]:
+        for budget, counts in run["failures"].items():
+            before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
+            found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
+    figure = plots.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
+    figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
+
+
 if __name__ == "__main__":
     learning_curves()
     thesis_settings()
     mild()
     margins()
+    why()
