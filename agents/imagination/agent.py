@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.capabilities import ExpectedOutcomes, Follow, ImaginedRollout, SampledFutures, planned_actions
-from imagine_bench.interfaces import AgentContext, AgentState, Frame
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
-from ..dqn import DQN, Controller, epsilon
+from ..dqn import DQN, epsilon
 from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..networks.precision import settle
@@ -39,6 +39,7 @@ class ImaginingAgent(DQN):
     """
 
     settings: Settings
+    imagination_kind = Imagination
 
     def __init__(
         self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
@@ -46,10 +47,12 @@ class ImaginingAgent(DQN):
     ) -> None:  # fmt: skip
         super().__init__(perception, n_actions, settings, seeds, device)
         size, node = perception.latent_size, seeds.child("imagination")
-        self.imagination = Imagination(size, n_actions, settings, filtered=filtered, seeds=node, device=device)
+        self.imagination = self.imagination_kind(
+            size, n_actions, settings, filtered=filtered, seeds=node, device=device
+        )
 
-    def learn_more(self, z: Tensor, episode: int) -> None:
-        """N_E model updates; from ``start_episode`` on, imagine from ``z`` (Z,) and make N_I updates on that.
+    def learn_more(self, observation: Observation, episode: int) -> None:
+        """N_E model updates; from ``start_episode`` on, imagine from what was observed and make N_I updates on that.
 
         After the last episode that imagines, these updates are made on real transitions.
         """
@@ -58,23 +61,27 @@ class ImaginingAgent(DQN):
         if settings.end_episode is not None and episode >= settings.end_episode:
             self.learn_values(self.real, settings.updates_per_step)
         elif episode >= settings.start_episode:
-            self._imagine(z)
+            self._imagine(self.perceive(observation))
             self.learn_values(self.imagination.memory, settings.updates_per_step)
         self.meters.count("time/imagination_s")
 
     def learn_model(self) -> None:
         """N_E updates of the world model on real transitions."""
         model, draws = self.imagination.model, self.imagination.generators
-        settings, size = model.settings, model.settings.batch_size
         with self.meters.cpu_time("time/model_s"):
-            rows = settings.updates_per_step * size  # for all updates at once, which is quicker
-            sampled = self.real.sample(rows, draws["replay"], spread=settings.spread, balance=settings.balance)
-            for batch in sampled.split(size):
+            for batch in self.draw_model_batches(draws["replay"]):
                 losses = model.update(batch, draws["dropout"])
                 for name, value in asdict(losses).items():
                     self.meters.add(f"loss/{name}", value)
                 self.updates += 1
         self.meters.count("time/model_s")
+
+    def draw_model_batches(self, generator: torch.Generator) -> Iterable[Batch]:
+        """Real transitions for the N_E updates of the world model, drawn at once, which is quicker."""
+        settings = self.settings.model
+        rows = settings.updates_per_step * settings.batch_size
+        sampled = self.real.sample(rows, generator, spread=settings.spread, balance=settings.balance)
+        return sampled.split(settings.batch_size)
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
@@ -114,8 +121,7 @@ class ImaginingAgent(DQN):
         Reward, termination, controller, memories and the schedule of exploration begin anew.
         """
         self.imagination.reset_for_new_task()
-        size, settings = self.perception.latent_size, self.settings.controller
-        self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
+        self.controller = self.new_controller(self._replay)  # a generator that snapshots hold
         self.real.clear()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
         self.steps = self.updates = 0
