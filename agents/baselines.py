@@ -53,16 +53,25 @@ class RandomAgent(_FixedPolicy):
 
 
 class OracleAgent(_FixedPolicy):
-    """An optimal action of the rules in the true macrostate."""
+    """An optimal action of the rules, given what every frame of the episode has shown of the macrostate.
 
-    def __init__(self, optimal_action: Callable[[tuple[int, ...]], int]) -> None:
-        self._optimal_action = optimal_action
+    It reads frames without error and remembers them, but what they hide or show late it does not know.
+    """
+
+    def __init__(self, optimal_policy: Callable[[tuple[int, ...], int], int]) -> None:
+        self._optimal_policy, self._step = optimal_policy, 0
+
+    def begin_episode(self) -> None:
+        """Forget the episode so far."""
+        self._step = 0
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The optimal action; InvalidValueError if the observation does not show the macrostate."""
-        if observation.macrostate is None:
+        shown = observation.macrostate if observation.shown is None else observation.shown
+        if shown is None:
             raise InvalidValueError("The oracle was shown no macrostate; give it privileged observations.")
-        return self._optimal_action(tuple(int(value) for value in observation.macrostate))
+        self._step += 1
+        return self._optimal_policy(tuple(int(value) for value in shown), self._step - 1)
 
 
 def make_random(context: AgentContext) -> RandomAgent:
@@ -72,6 +81,6 @@ def make_random(context: AgentContext) -> RandomAgent:
 
 def make_oracle(context: AgentContext) -> OracleAgent:
     """The ``oracle`` agent; InvalidValueError if the context has no rules to ask."""
-    if context.optimal_action is None:
-        raise InvalidValueError("The oracle needs the rules' optimal action in its context.")
-    return OracleAgent(context.optimal_action)
+    if context.optimal_policy is None:
+        raise InvalidValueError("The oracle needs the rules' optimal policy in its context.")
+    return OracleAgent(context.optimal_policy())

@@ -138,11 +138,11 @@ class DQN:
         return encoder.read_macrostate(encoder.encode(frames)[0])
 
     def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
-        return controller.values(self.perceive(observation).unsqueeze(0))[0].cpu().numpy()
+        return controller.values(self.perceive(observation.frame).unsqueeze(0))[0].cpu().numpy()
 
-    def perceive(self, observation: Observation) -> Tensor:
-        """What the controller reads of an observation: here the mean latents of its frame. Shape (Z,)."""
-        return self.perception.posterior(observation.frame)[0]
+    def perceive(self, frame: Frame) -> Tensor:
+        """The state that the controller reads: here the mean latents of the frame. Shape (Z,)."""
+        return self.perception.posterior(frame)[0]
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act epsilon-greedily on the mean latents; greedily, and changing nothing, without ``explore``."""
@@ -152,20 +152,21 @@ class DQN:
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Store the transition, and learn from replayed ones N_R times; DivergedError if a loss is not finite."""
-        self.store(transition)
+        state = self.store(transition)
         self.learn_values(self.real, self.settings.controller.updates_per_step)
-        self.learn_more(transition.observation, episode)
+        self.learn_more(state, episode)
         self.meters.count("time/controller_s")
         self.steps += 1
 
-    def store(self, transition: Transition) -> None:
-        """Add a real transition to the memory."""
+    def store(self, transition: Transition) -> Tensor:
+        """Add a real transition to the memory; the state that it began in. Shape (Z,)."""
         now = self.perception.posterior(transition.observation.frame)
         then = self.perception.posterior(transition.next_observation.frame)
         self.real.add(now, transition.action, transition.reward, then, transition.terminated)
+        return now[0]
 
-    def learn_more(self, observation: Observation, episode: int) -> None:
-        """What a subclass does after the updates on real transitions, with the observation that it acted on."""
+    def learn_more(self, z: Tensor, episode: int) -> None:
+        """What a subclass does after the updates on real transitions, with the state (Z,) it acted in."""
 
     def learn_values(self, memory: Transitions, updates: int) -> None:
         """Update the controller on batches of a memory, if that holds anything yet."""

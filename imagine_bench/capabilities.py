@@ -39,6 +39,23 @@ class ImaginedRollout:
 
 
 @runtime_checkable
+class EpisodeRememberer(Protocol):
+    """An agent that remembers what it saw earlier in an episode: :meth:`Agent.act` takes its observation in."""
+
+    def begin_episode(self) -> None:
+        """Forget the episode so far: the next observation is another's first. No part of :meth:`Agent.state`.
+
+        Called before every episode of training and of tests, and before an agent is asked about a frame on its own.
+        """
+
+
+def begin_episode(agent: object) -> None:
+    """Tell an agent, if it remembers, that its next observation is the first of an episode."""
+    if isinstance(agent, EpisodeRememberer):
+        agent.begin_episode()
+
+
+@runtime_checkable
 class ValueReader(Protocol):
     """An agent that has action values."""
 
@@ -118,25 +135,6 @@ class Imaginer(Protocol):
         Given ``actions``, (D,) with D <= depth, are never stopped early; None lets the greedy controller choose and
         stops where the model says the episode has ended.
         """
-
-
-@runtime_checkable
-class MapPredictor(Protocol):
-    """An agent whose model names what it holds likeliest, apart from what it samples when it imagines."""
-
-    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """Macrostates (N, M), as a probe reads them, likeliest after one of the actions (N,) from each real frame.
-
-        ``rng`` draws dropout masks; nothing changes in the agent.
-        """
-
-
-@runtime_checkable
-class ReplayReader(Protocol):
-    """An agent that can say which transitions it learns from."""
-
-    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Macrostates (N, M), as a probe reads them, and actions (N,) of the real transitions that it remembers."""
 
 
 @runtime_checkable

@@ -46,6 +46,8 @@ class AgentEntry:
     #: group)``.
     settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
     privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
+    #: Parts of :data:`.interfaces.OBSERVATIONS` that it can take, images of any size; by default 64 x 64 frames alone
+    observes: tuple[str, ...] = ()
     #: Whether it is a :class:`.capabilities.ExternalTrainer`, whose run cannot pause.
     external_training_loop: bool = False
     title: str = ""  #: For headings, legends and tables; by default the registered name in plain words

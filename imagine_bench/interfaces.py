@@ -29,6 +29,12 @@ HELD_OUT: Mapping[str, str] = {"photo": "photo_held_out"}
 EXECUTIONS = ("physics", "kinematic")
 SENSES = ("true", "nominal")
 DEVICES = ("cpu", "cuda")
+OBSERVATIONS = ("frame", "human", "state", "proprio")
+"""Parts of what an environment of ours can show of one moment."""
+PROPRIO_SIZE = 16
+"""Joints, fingers, and the tool's position and quaternion."""
+FRAME_PX, OBSERVATION_SIZES_PX = 64, (32, 256)
+"""Edge of a frame; smallest and largest edge of an image that is observed instead."""
 
 
 PHYSICS_RANGES: Mapping[str, tuple[float, float]] = {
@@ -85,9 +91,23 @@ class PhysicsSettings:
 class Observation:
     """What an agent is given before it acts."""
 
-    frame: Frame  #: the camera image. Shape (64, 64, 3), uint8.
-    #: the true state, only for agents registered as privileged; None for every other
+    #: the camera image, uint8. Shape (64, 64, 3), or as the protocol says (size, size, 3), or (0, 0, 3) for none
+    frame: Frame
+    #: the true state, only for agents registered as privileged, as the next; None for every other
     macrostate: Macrostate | None = None
+    shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
+    #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
+    more: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, seen: Any, info: Mapping[str, Any], *, privileged: bool) -> Observation:
+        """What an agent may see of a frame, or of parts by name; of ``info`` only if it is privileged."""
+        more = {name: part for name, part in seen.items() if name != "frame"} if isinstance(seen, Mapping) else {}
+        frame = seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)) if isinstance(seen, Mapping) else seen
+        if not privileged:
+            return cls(frame=frame, more=more)
+        macrostate = np.asarray(info["macrostate"])
+        return cls(frame=frame, macrostate=macrostate, shown=np.asarray(info.get("shown", macrostate)), more=more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +200,8 @@ class PerformanceTargets:
     """What ``make speed`` holds a task in contact physics to."""
 
     objects: tuple[str, ...]  #: bodies of the loose objects; coordinate i of a macrostate is object i's
-    as_ruled: float  #: least share of random macro-actions that end exactly as the rules say
+    as_ruled: float  #: least share of random macro-actions that end exactly as the rules say, at clean
+    as_ruled_varied: float = 0.995  #: the same at every other appearance
     other_objects_mm: float  #: an object that an action leaves where it stands moves by less
     #: the object acted on ends nearer to where a perfect execution leaves it, 99 times of 100; None asks for nothing
     error_mm: float | None = None
@@ -218,6 +239,11 @@ class TaskSpec:
     #: what ``make speed`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
     sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
+    executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first
+
+    def execution(self, asked: str | None) -> str:
+        """How macro-actions are to happen: as asked for, or the usual way. UnknownNameError: not in this world."""
+        return self.executions[0] if asked is None else require_known(f"execution of {self.id}", asked, self.executions)
 
     @property
     def n_actions(self) -> int:
@@ -253,8 +279,11 @@ class AgentContext:
     #: single settings that replace the set's, by dotted name
     overrides: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
-    #: the rules' optimal action, only for agents registered as privileged; None for every other
-    optimal_action: Callable[[State], int] | None = None
+    #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
+    #: for agents registered as privileged, None for every other
+    optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
+    #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`
+    observation: Mapping[str, tuple[int, ...]] = field(default_factory=lambda: {"frame": (FRAME_PX, FRAME_PX, 3)})
 
 
 @dataclass(frozen=True, kw_only=True)

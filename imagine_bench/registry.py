@@ -30,8 +30,9 @@ from imagine_bench.errors import (
     plain,
     require_known,
 )
-from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentContext, TaskSpec
 from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.world_models import WorldModel
 
 _ARROWS = TaskEntry(
     spec="imagine_bench.tasks.arrows.spec:spec_of", env="imagine_bench.tasks.arrows.spec:make_limited_env",
@@ -64,11 +65,12 @@ _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
 AGENTS: dict[str, AgentEntry] = {
     "random": AgentEntry(
-        make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False,
+        make="imagine_bench.agents.baselines:make_random", learns=False, needs_encoder=False, observes=OBSERVATIONS,
         description="Picks every macro-action by chance: the floor.",
     ),
     "oracle": AgentEntry(
         make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True,
+        observes=OBSERVATIONS,
         description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
     ),
     "dqn": AgentEntry(
@@ -104,12 +106,12 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
-        external_training_loop=True, title="SB3 DQN (pixels)",
+        external_training_loop=True, title="SB3 DQN (pixels)", observes=OBSERVATIONS,
         description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
     ),
     "sb3_qrdqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_qrdqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
-        external_training_loop=True, title="SB3 QR-DQN (pixels)",
+        external_training_loop=True, title="SB3 QR-DQN (pixels)", observes=OBSERVATIONS,
         description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
     ),
     "sb3_dqn_latents": AgentEntry(
@@ -154,6 +156,11 @@ AGENTS: dict[str, AgentEntry] = {
         )
         for twin in ("", "_macrostate")
     },
+    "dreamer_v3": AgentEntry(
+        make="imagine_bench.agents.library.dreamer:make", needs_encoder=False, title="DreamerV3 (pixels)",
+        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
+        description="sheeprl's DreamerV3: a recurrent world model of pixels, and a policy trained in its imagination.",
+    ),
     "sb3_ppo_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
         title="SB3 PPO (latents)",
@@ -565,5 +572,16 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
-    """A new regressor by its registered name."""
-    return load(regressor_entry(name).make)(context)
+    """A new regressor by its registered name. Raises as :func:`make_agent`."""
+    entry, own = regressor_entry(name), entrant(name).agent in REGRESSORS
+    with _guests_faults(f"Regressor {name} ({entry.make})", own=own):
+        regressor: Regressor = load(entry.make)(context)
+    return regressor
+
+
+def make_world_model(name: str, *given: Any) -> WorldModel:
+    """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
+    entry = world_model_entry(name)
+    with _guests_faults(f"World model {name} ({entry.make})", own=name in WORLD_MODELS):
+        model: WorldModel = load(entry.make)(*given)
+    return model

@@ -33,6 +33,8 @@ class Imagined:
     epistemic: NDArray[Any] | None = None  #: How much it does not know for want of data, in any unit. Shape (N, D).
     aleatoric: NDArray[Any] | None = None  #: How much is noise. Shape (N, D).
     modal: NDArray[Any] | None = None  #: How far several possible outcomes are apart. Shape (N, D).
+    #: Whether a filter of its own would let it learn from, or act on, what it imagines there. Shape (N, D), bool.
+    accepted: NDArray[Any] | None = None
 
 
 class WorldModel(Protocol):
@@ -78,6 +80,8 @@ def _require_numbers(offered: dict[str, Any], said: str) -> None:
     for each, array in offered.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise InvalidValueError(f"{said} gave {each} of {type(array).__name__}; give an array of numbers.")
+        if each == "accepted" and array.dtype.kind != "b":
+            raise InvalidValueError(f"{said} gave {each} of {array.dtype}; give an array of bool.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise InvalidValueError(f"{said} gave {each} with NaN or infinity; give finite numbers.")
 
@@ -93,7 +97,7 @@ def _require_shapes(offered: dict[str, NDArray[Any]], said: str, asked: tuple[in
             wanted = f"({rows}, {futures}, {depth}, H, W) or ({rows}, {futures}, {depth}, H, W, 3)"
             right = right and 0 not in given
         else:
-            shape = (rows, depth) if each in UNCERTAINTIES else (rows, futures, depth)
+            shape = (rows, depth) if each in (*UNCERTAINTIES, "accepted") else (rows, futures, depth)
             right, wanted = array.shape == shape, str(shape)
         if not right:
             raise InvalidValueError(f"{said} gave {each} of shape {array.shape}; give {wanted}.")

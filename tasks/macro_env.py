@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import DivergedError, InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
 from imagine_bench.rules import states_of
 
@@ -23,7 +23,7 @@ from .dials.lag import Lag
 from .motion.executor import MacroResult, finish
 from .motion.executor import Motion as Acting
 from .observations import Observer
-from .rendering import Renderer, View
+from .rendering import Renderer, View, image_size
 from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, shapes_of
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
@@ -32,7 +32,6 @@ from .window import HAS_PYGAME, Window
 from .world import World, WorldState
 
 FRAME_PX = 64
-MAX_IMAGE_PX = 4096
 MAX_MOTION_HZ = 1000
 _WINDOW_HZ = 25.0  # images a second of a window
 _ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
@@ -57,7 +56,8 @@ class EnvState:
     latest: MacroResult | None = field(repr=False)
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
     steps: int = 0
-    under_way: tuple[Any, ...] = field(default=(), repr=False)  #: observations that lag keeps back
+    #: what lag keeps back: observations, and what they show
+    under_way: tuple[tuple[Any, ...], ...] = field(default=((), ()), repr=False)
 
 
 class MacroEnv(gymnasium.Env[Any, np.int64]):
@@ -74,15 +74,16 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     Episode End: terminated where the rules say so; truncation is the registered time limit.
 
-    Info: ``macrostate`` (int64, (M,)), ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty
-    where there is none), ``sim_time_s`` and ``ik_error_m`` of the latest macro-action, ``action_mask`` (int8, (A,)).
-    All are there at every reset and step, as numpy scalars or arrays but the reason.
+    Info: ``macrostate`` and what the observation shows of it, ``shown``, late, or -1 where hidden (int64, (M,)),
+    ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty where there is none), ``sim_time_s``
+    and ``ik_error_m`` of the latest macro-action, ``action_mask`` (int8, (A,)). All are there at every reset and step,
+    as numpy scalars or arrays but the reason.
 
     Args:
         spec: The task.
         make_world: Its world, at an appearance level.
         execution: ``"physics"`` moves the arm in contact physics, ``"kinematic"`` sets the outcome.
-        appearance: A name in :data:`.scenes.appearance.LEVELS`.
+        appearance: A name, or factors, as :func:`imagine_bench.appearance.appearance_name` takes them.
         render_mode: None, ``"rgb_array"``, which :meth:`render` returns, or ``"human"``: a window that shows each
             motion as long as it took.
         width: Pixels of :meth:`render`.
@@ -95,7 +96,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     Raises:
         UnknownNameError: An unknown execution, appearance, render mode, camera, physics setting or observation.
-        InvalidValueError: An image size, a physics setting or a rate out of range.
+        InvalidValueError: An image size, a factor, a physics setting or a rate out of range.
 
     Version History: v0, the first.
     """
@@ -114,7 +115,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         make_world: Callable[[Appearance], World],
         *,
         execution: str = "physics",
-        appearance: str = "clean",
+        appearance: str | Mapping[str, float] = "clean",
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
@@ -129,23 +130,26 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._execution = require_known("execution", execution, EXECUTIONS)
         self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
         self._starts, self.horizon = spec.rules.start_states, spec.horizon
-        self._sight, self._lag, self._steps = spec.sight, Lag(spec.sight.lag if spec.sight else 0), 0
+        self._sight, self._steps = spec.sight, 0
+        self._lag, self._shown_lag = self._lags = [Lag(spec.sight.lag if spec.sight else 0) for _ in range(2)]
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
-        self._make_world, self.world = make_world, make_world(appearance_level(appearance))
+        level = appearance_level(appearance)
+        self._make_world, self.world = make_world, make_world(level)
         self.world.set_physics(settings)
-        self._kind = (spec.id, self._execution, appearance, settings)
+        self._kind = (spec.id, self._execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
         self._agent_camera = agent_camera(self.world.model)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self._observing_camera)
         self.observation_space = self._observer.space
-        self._render_camera = Renderer(self.world.model, human_camera_view(camera, *_image_size(width, height)))
+        self._render_camera = Renderer(self.world.model, human_camera_view(camera, *image_size(width, height)))
         self._human_camera: Renderer | None = None
         self._window = Window(spec.title) if self.render_mode == "human" else None
         self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
-        self._begun, self._macrostate, self._people = False, self._starts[0], self._mocap()
+        self._begun, self._people = False, self._mocap()
         self._latest: MacroResult | None = None
+        self._macrostate = self._shown = self._starts[0]
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -168,13 +172,12 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun, self._latest, self._steps, self._lag.kept = True, None, 0, ()
+        self._begun, self._latest, self._steps, self._lag.kept, self._shown_lag.kept = True, None, 0, (), ()
         self.world.place(start, self.np_random)
         self._vary()
         reading = self.world.read()
-        self._macrostate = reading.macrostate
-        legal = self._rules.is_legal(reading.macrostate)
-        return self._info(success=False, legal=legal, fault=reading.problem)
+        self._reach(reading.macrostate)
+        return self._info(success=False, legal=self._rules.is_legal(reading.macrostate), fault=reading.problem)
 
     def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
@@ -210,13 +213,13 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             self.world.set_outcome(chosen, intended.macrostate)
         self._vary(move_objects=self._execution == "kinematic")
         reading = self.world.read()
-        self._macrostate, self._begun = reading.macrostate, True
+        self._reach(reading.macrostate)
+        self._begun = True
         fault = fault or reading.problem
         if reading.macrostate != intended.macrostate:
             outcome = self._rules.judge(start, chosen, reading.macrostate)
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
-        legal = outcome.success or not outcome.terminated
-        info = self._info(success=outcome.success, legal=legal, fault=fault)
+        info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
         return float(outcome.reward), outcome.terminated, info
 
     @property
@@ -267,7 +270,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         return EnvState(
             kind=self._kind, world=self.world.get_state(), generator=copy.deepcopy(self.np_random.bit_generator.state),
             macrostate=self._macrostate, begun=self._begun, latest=self._latest, people=self._people,
-            steps=self._steps, under_way=self._lag.kept,
+            steps=self._steps, under_way=tuple(lag.kept for lag in self._lags),
         )  # fmt: skip
 
     def set_state(self, state: EnvState) -> None:
@@ -285,7 +288,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._macrostate, self._begun, self._latest, self._people = (
             state.macrostate, state.begun, state.latest, state.people,
         )  # fmt: skip
-        self._steps, self._lag.kept = state.steps, state.under_way
+        self._steps, (self._lag.kept, self._shown_lag.kept) = state.steps, state.under_way
 
     # --- SceneReader ---------------------------------------------------------------------------------------------
 
@@ -346,7 +349,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
         """An image of the whole scene with the arm. Shape (height, width, 3)."""
-        view = human_camera_view(HUMAN_CAMERA, *_image_size(width, height))
+        view = human_camera_view(HUMAN_CAMERA, *image_size(width, height))
         if self._human_camera is None or self._human_camera.view != view:
             if self._human_camera is not None:
                 self._human_camera.close()
@@ -419,6 +422,11 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             self.world.hide_gesture(hides(self._sight, self.world.read().macrostate, self._steps, self.np_random))
         self.world.vary(self.np_random, move_objects=move_objects)
 
+    def _reach(self, macrostate: tuple[int, ...]) -> None:
+        """Be in a macrostate, once a moment, of which the frame that is due may show less, or another."""
+        self._macrostate = macrostate
+        self._shown = self._shown_lag.deliver(self.world.shown(macrostate))
+
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""
         return self.world.data.mocap_pos.copy(), self.world.data.mocap_quat.copy()
@@ -429,8 +437,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
                 f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
             )
         for key in options:
-            if key != "macrostate":
-                raise UnknownNameError("reset option", key, ("macrostate",))
+            require_known("reset option", key, ("macrostate",))
         if "macrostate" not in options:
             return self._starts[int(self.np_random.integers(len(self._starts)))]
         given = options["macrostate"]
@@ -477,6 +484,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
+            "shown": np.array(self._shown, dtype=np.int64),
             "is_success": np.bool_(success),
             "success": np.bool_(success),
             "legal": np.bool_(legal),
@@ -486,13 +494,6 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             "ik_error_m": np.float64(0.0 if latest is None else latest.ik_error_m),
             "action_mask": self.action_masks().view(np.int8),
         }
-
-
-def _image_size(width: int, height: int) -> tuple[int, int]:
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
-            raise InvalidValueError(f"Image {name} {brief(value)} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
-    return int(width), int(height)
 
 
 def agent_camera(model: mujoco.MjModel) -> Renderer:

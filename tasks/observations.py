@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
 
 from .rendering import Renderer
 from .scene_reader import arm_columns, tcp_in_world
@@ -22,9 +22,6 @@ from .world import World
 
 _Camera = Callable[[str, int], Renderer]
 _Moment = tuple["Observer", tuple[int, ...]]
-PARTS = ("frame", "human", "state", "proprio")
-SIZES_PX = (32, 256)
-"""Smallest and largest edge of an observed image."""
 _LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
 """Of ``proprio``: joints (rad), fingers (m), and the tool's position (m) and quaternion. The arm reaches 1.3 m."""
 
@@ -38,7 +35,7 @@ class Observer:
     (w, x, y, z).
 
     Args:
-        choice: Names in :data:`PARTS`.
+        choice: Names in :data:`.interfaces.OBSERVATIONS`.
         size: Edge of images in pixels.
         world: What is observed.
         values: Names of the values of each coordinate of a macrostate.
@@ -51,10 +48,12 @@ class Observer:
 
     def __init__(self, choice: str, size: int, world: World, values: Sequence[Sequence[str]], camera: _Camera) -> None:
         names = choice.split(",") if isinstance(choice, str) else [choice]
-        self._names = tuple(require_known("observation", name, PARTS) for name in names)
+        self._names = tuple(require_known("observation", name, OBSERVATIONS) for name in names)
         if len(set(names)) < len(names):
-            raise InvalidValueError(f"Observation {choice!r} names a part twice; give each of {', '.join(PARTS)} once.")
-        low, high = SIZES_PX
+            raise InvalidValueError(
+                f"Observation {choice!r} names a part twice; give each of {', '.join(OBSERVATIONS)} once."
+            )
+        low, high = OBSERVATION_SIZES_PX
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
         self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)

@@ -27,8 +27,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import SetupError, require_known
+from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known
 
+MAX_IMAGE_PX = 4096
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
 _EXTRA_GEOMS = 32
@@ -52,6 +53,14 @@ class View:
     samples: int = 0  # multisampling; 0 draws hard edges
     slices: int = 12  # corners of a drawn cylinder
     sky: bool = False  # whether to draw the skybox
+
+
+def image_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of an image in pixels as numbers. Raises InvalidValueError: one out of range."""
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
+            raise InvalidValueError(f"Image {name} {brief(value)} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
+    return int(width), int(height)
 
 
 def _new_gl_context(width: int, height: int) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
+from .dials.distractors import Distraction
 from .dials.gesture import HIDDEN
 from .motion import orientation
 from .motion.executor import MacroResult, Motion, at_rest, finish
@@ -59,11 +60,13 @@ class World(abc.ABC):
         level: How much the appearance varies.
         objects: Bodies of the loose objects, and their names in sentences; ``<body>_joint`` is a free joint.
         materials: Those whose colors vary.
+        distractors: How many the model has.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, level: Appearance, *, objects: Mapping[str, str], materials: tuple[str, ...]
-    ) -> None:
+        self, model: mujoco.MjModel, level: Appearance, *, objects: Mapping[str, str], materials: tuple[str, ...],
+        distractors: int = 0,
+    ) -> None:  # fmt: skip
         self.model, self.data = model, mujoco.MjData(model)
         self.sensing = Sensing()
         self._bodies = [model.body(body).id for body in objects]
@@ -71,6 +74,7 @@ class World(abc.ABC):
         self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         self._photographer = None if level.pool is None else Photographer(level)
+        self._distraction = Distraction(model, distractors) if distractors else None
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._people = [model.material(name).id for name in ("skin", "cloth")]
@@ -121,6 +125,8 @@ class World(abc.ABC):
         for index, offset in enumerate(rng.uniform(-1.0, 1.0, (len(objects), 3)).tolist()):
             self._put(index, objects[index], offset)
         self._gesture(gesture)
+        if self._distraction is not None:
+            self._distraction.place(self.data, rng)
         self.update()
 
     def hide_gesture(self, hidden: bool) -> None:
@@ -132,21 +138,23 @@ class World(abc.ABC):
         return (*macrostate[:-1], HIDDEN) if self.model.mat_rgba[self._people[0], 3] == 0.0 else macrostate
 
     def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
-        """Draw this frame's light, colors, camera and hands as the appearance says.
+        """Draw this frame's light, colors, camera and hands as the appearance says, then its distractors.
 
         Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
         where physics left it lies there.
         """
         if self._photographer is not None:
             self._patch(self._photographer, rng, move_objects=move_objects)
+        elif self._varies:
+            self._appearance.vary(rng)
+            *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
+            if self._hands_vary():
+                offset_m = [self._level.hand_offset_m * each for each in wobble]
+                self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
+        elif self._distraction is None:
             return
-        if not self._varies:
-            return
-        self._appearance.vary(rng)
-        *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
-        if self._hands_vary():
-            offset_m = [self._level.hand_offset_m * each for each in wobble]
-            self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
+        if self._distraction is not None:
+            self._distraction.vary(self.data, rng)
         self.update()
 
     def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
@@ -160,7 +168,6 @@ class World(abc.ABC):
             *offset, yaw = shot.hand.offset
             offset_m = [self._level.hand_offset_m * each for each in offset]
             self._gesture(gesture, offset_m, self._level.hand_yaw_rad * yaw)
-        self.update()
 
     def develop(self, frame: Frame) -> Frame:
         """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""

@@ -50,7 +50,10 @@ def bench_words(out: Path, *more: str) -> list[str]:
             "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
         ),
         (["--agents", "dqnn"], "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
-        (["--appearance", "strng"], "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo."),
+        (
+            ["--appearance", "strng"],
+            "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, ",
+        ),
         (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
         (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
         (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
@@ -102,7 +105,7 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         (["study", "--task", "toy"], "No task 'toy'."),
         *(
             ([command, "a", "--task", "arrow_puzzle"], "Both a and --task arrow_puzzle were given; leave one of them")
-            for command in ("report", "plan", "generalise", "policy", "view")
+            for command in ("report", "plan", "policy", "view")
         ),
         (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
         (["report", "--task", "robot_ik", "--out", str(tmp_path)], "There is no such bench below"),

@@ -172,7 +172,7 @@ assert main(["view"]) == 2
 
 
 def test_every_module_of_an_extra_is_brought_by_it() -> None:
-    brought = {"PIL": "pillow", "rerun": "rerun-sdk", "pygame": "pygame-ce"}
+    brought = {"PIL": "pillow", "rerun": "rerun-sdk", "pygame": "pygame-ce", "hydra": "hydra-core"}
     for module, extra in EXTRAS.items():
         named = [Requirement(text).name for text in _PROJECT["project"]["optional-dependencies"][extra]]
         assert brought.get(module, module.replace("_", "-")) in named

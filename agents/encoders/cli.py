@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from imagine_bench.errors import require_known
-from imagine_bench.interfaces import APPEARANCES, TaskSpec, appearance_of_tests, bundled_name
+from imagine_bench.appearance import appearance_name
+from imagine_bench.interfaces import TaskSpec, appearance_of_tests, bundled_name
 from imagine_bench.seeding import SeedTree
 
 from .encoder import Encoder, EncoderCard, bundled_encoder, refuse_existing
@@ -38,7 +38,8 @@ def retrain(
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     recipe = recipe if steps is None else replace(recipe, steps=steps)
-    name = bundled_name(spec.encoder, require_known("appearance", appearance, APPEARANCES), recipe.kind)
+    appearance = appearance_name(appearance)
+    name = bundled_name(spec.encoder, appearance, recipe.kind)
     path = out / f"{name}.safetensors"
     refuse_existing(path)
     unfinished = path.with_name(f".{name}.unfinished.pt")

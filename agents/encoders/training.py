@@ -19,8 +19,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.errors import DivergedError, require_known
-from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, appearance_of_tests
+from imagine_bench.appearance import appearance_name
+from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
@@ -167,7 +168,7 @@ def train_encoder(
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     if recipe.kind == "codes":
         recipe = replace(recipe, frames=recipe.frames * max(image_shape(spec.preprocessing)[0], 3) // 3)
-    require_known("appearance", appearance, APPEARANCES)
+    appearance = appearance_name(appearance)
     progress = progress or (lambda stage, done: None)
     prepare_torch("cpu")
     seeds = SeedTree(seed)

@@ -175,12 +175,6 @@ class FactoredAgent:
             macrostates=read.reshape(*found.p_continues.shape, -1), p_continues=found.p_continues, reward=found.reward
         )
 
-    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What it did, labels of an oracle not counted; see :class:`imagine_bench.capabilities.ReplayReader`."""
-        rows = [row for row in self.replay.rows() if row.has_dynamics]
-        macrostates = self.perception.macrostates([row.code for row in rows])
-        return macrostates, np.array([row.action for row in rows], dtype=np.int64)
-
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         began = self.tasks[-1] if self.tasks else 0

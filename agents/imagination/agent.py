@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.capabilities import ExpectedOutcomes, Follow, ImaginedRollout, SampledFutures, planned_actions
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
+from imagine_bench.interfaces import AgentContext, AgentState, Frame
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -51,8 +51,8 @@ class ImaginingAgent(DQN):
             size, n_actions, settings, filtered=filtered, seeds=node, device=device
         )
 
-    def learn_more(self, observation: Observation, episode: int) -> None:
-        """N_E model updates; from ``start_episode`` on, imagine from what was observed and make N_I updates on that.
+    def learn_more(self, z: Tensor, episode: int) -> None:
+        """N_E model updates; from ``start_episode`` on, imagine from ``z`` (Z,) and make N_I updates on that.
 
         After the last episode that imagines, these updates are made on real transitions.
         """
@@ -61,7 +61,7 @@ class ImaginingAgent(DQN):
         if settings.end_episode is not None and episode >= settings.end_episode:
             self.learn_values(self.real, settings.updates_per_step)
         elif episode >= settings.start_episode:
-            self._imagine(self.perceive(observation))
+            self._imagine(z)
             self.learn_values(self.imagination.memory, settings.updates_per_step)
         self.meters.count("time/imagination_s")
 
@@ -134,7 +134,7 @@ class ImaginingAgent(DQN):
         InvalidValueError if there is no depth to imagine, or actions are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
-        start = self.perception.posterior(frame)[0].unsqueeze(0)  # [1, Z]
+        start = self.perceive(frame).unsqueeze(0)  # [1, Z]
         return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
     def sample_futures(
@@ -143,14 +143,6 @@ class ImaginingAgent(DQN):
     ) -> SampledFutures:  # fmt: skip
         """Imagine many futures of the same beginnings; see :class:`imagine_bench.capabilities.FutureSampler`."""
         return sample_futures(self.imagination, self.perception.encoder, frames, actions, follow, samples, depth, rng)
-
-    def predict_map(self, frames: Frame, actions: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """The likeliest results of actions; see :class:`imagine_bench.capabilities.MapPredictor`."""
-        z = torch.stack([self.perception.posterior(frame)[0] for frame in frames])  # [N, Z]
-        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
-        weights, action = self.imagination.draw_weights(generator), torch.as_tensor(actions, device=z.device)
-        likeliest = self.imagination.likeliest(z, action, weights, generator)
-        return self.perception.encoder.read_macrostate(likeliest)
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
         """As many samples as :data:`_BRANCHES`; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
@@ -165,11 +157,6 @@ class ImaginingAgent(DQN):
             p_continues=(p_terminated <= TERMINAL).double().cpu().numpy().reshape(shape) / _BRANCHES,
             reward=reward.double().cpu().numpy().reshape(shape).mean(axis=2),
         )
-
-    def replayed(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """What the real memory holds; see :class:`imagine_bench.capabilities.ReplayReader`."""
-        rows = self.real.arrays()
-        return self.perception.encoder.read_macrostate(torch.as_tensor(rows["mu"])), rows["action"].astype(np.int64)
 
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator

@@ -64,12 +64,6 @@ def mean(mixture: Mixture) -> Tensor:
     return (mixture.log_weights.exp().unsqueeze(-1) * mixture.means).sum(dim=-2)
 
 
-def likeliest(mixture: Mixture) -> Tensor:
-    """Mean of the component with the largest coefficient. Shape (..., Z)."""
-    chosen = mixture.log_weights.argmax(dim=-1)[..., None, None]  # [..., 1, 1]
-    return mixture.means.take_along_dim(chosen, dim=-2).squeeze(-2)
-
-
 def sample(mixture: Mixture, temperature: float, generator: torch.Generator) -> Tensor:
     """Sample a component of each of N mixtures by its coefficient, then a value of it. Shape (N, Z).
 

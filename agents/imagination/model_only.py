@@ -11,8 +11,9 @@ from __future__ import annotations
 from functools import partial
 
 import torch
+from torch import Tensor
 
-from imagine_bench.interfaces import AgentState, Observation, Transition
+from imagine_bench.interfaces import AgentState, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -131,7 +132,7 @@ class ModelOnlyAgent(ImaginingAgent):
             self._episode = episode
         super().observe(transition, episode=episode)
 
-    def learn_more(self, observation: Observation, episode: int) -> None:
+    def learn_more(self, z: Tensor, episode: int) -> None:
         """N_E model updates; what is imagined is left to :meth:`train_in_model`."""
         self.learn_model()
         self.meters.count("time/model_only_s")

@@ -128,11 +128,6 @@ class Imagination:
         del z, action
         return predicted
 
-    def likeliest(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Tensor:
-        """The mean of the likeliest component of what :meth:`step` samples from. Shape (N, Z)."""
-        samples = self.model.predict(z, action, weights.dynamics)
-        return mdn.likeliest(self._predicted(samples, z, action, weights, generator))
-
     def ignorance(self, z: Tensor, action: Tensor) -> Tensor:
         """Epistemic variance of where actions (N,) lead from z (N, Z), reduced as the filter does, at most 1: (N,).
 

@@ -1,6 +1,6 @@
 """Agents of Stable-Baselines3 (Raffin et al. 2021) through Gymnasium, trained by the library's own loop.
 
-They see the environment's frames, or an encoder's latents of them, and nothing else.
+They see the environment's frames, or what else the protocol shows, or an encoder's latents of frames.
 """
 
 from __future__ import annotations
@@ -60,8 +60,10 @@ class LibraryAgent:
         steps = max(episodes * self._steps_an_episode(horizon), explores)  # on_episode ends training before
         if explores:
             keywords["exploration_fraction"] = explores / steps  # exploration depends on the step alone
-        policy = "CnnPolicy" if self._encoder is None else "MlpPolicy"
-        self._model = self._algorithm(policy, self._experience(env), seed=self._seed, device=self._device, **keywords)
+        world = self._experience(env)
+        named = isinstance(world.observation_space, gymnasium.spaces.Dict)
+        policy = "MultiInputPolicy" if named else "CnnPolicy" if self._encoder is None else "MlpPolicy"
+        self._model = self._algorithm(policy, world, seed=self._seed, device=self._device, **keywords)
         learn(self._model, steps, on_episode)
 
     def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
@@ -77,7 +79,9 @@ class LibraryAgent:
         if self._model is None:
             raise ArtefactError("This agent has no policy before its training loop has run; train it first.")
         frame = observation.frame
-        seen = frame if self._encoder is None else self._encoder.latents(frame)
+        seen: Any = frame if self._encoder is None else self._encoder.latents(frame)
+        if observation.more:
+            seen = {**observation.more, **({"frame": frame} if frame.size else {})}
         return int(self._model.predict(seen, deterministic=not explore)[0])
 
     def observe(self, transition: Transition, *, episode: int) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.interfaces import Frame, Observation
+from imagine_bench.interfaces import Frame
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import Perception
@@ -47,7 +47,7 @@ class StateEncoder(Encoder):
 
 
 class Remembering(Perception):
-    """States of single frames, and of observations with all that the episode showed before."""
+    """States of single frames, and of the last of an episode so far."""
 
     encoder: StateEncoder
 
@@ -62,11 +62,13 @@ class Remembering(Perception):
         return states[0][0], states[1][0]
 
     @torch.no_grad()
-    def recall(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """The mean state of an observation (Z + H,), and what was remembered before its frame (H,)."""
-        frames, recurrence = [*(frame for frame, _ in observation.past), observation.frame], self._recurrence()
+    def recall(self, frames: Sequence[Frame], actions: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """The mean state after the frames of an episode so far (Z + H,), and what was remembered before the last (H,).
+
+        ``actions`` are the macro-actions between them.
+        """
         z = torch.stack([self.plain.posterior(frame)[0] for frame in frames]).unsqueeze(0)  # [1, T, Z]
-        previous = torch.tensor([[START, *(action for _, action in observation.past)]], device=z.device)
+        recurrence, previous = self._recurrence(), torch.tensor([[START, *actions]], device=z.device)
         blank = recurrence.blank(1)
         memory = recurrence(z, previous, blank)[0]  # [T, H]
         return torch.cat([z[0, -1], memory[-1]]), memory[-2] if len(memory) > 1 else blank[0]

@@ -81,7 +81,7 @@ class SequenceMemory(RealMemory):
     def draw(
         self, count: int, length: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0
     ) -> Sequences:
-        """Sequences of ``length`` transitions that begin with drawn ones; see :meth:`RealMemory.sample`."""
+        """Sequences of at most ``length`` transitions that begin with drawn ones; see :meth:`RealMemory.sample`."""
         drawn = self._draw(count, generator, self._weights(balance) if balance else None)
         columns, step = self._columns, drawn["step"]
         oldest = self.added - len(self)
@@ -95,6 +95,9 @@ class SequenceMemory(RealMemory):
 
         early, _ = rows(first, int(burned.max()))
         late, there = rows(number, length)
+        valid = there & (columns["step"][late] - torch.arange(length, device=step.device) == step.unsqueeze(1))
+        longest = int(valid.sum(dim=1).max())
+        late, valid = late[:, :longest], valid[:, :longest]
         mu = torch.cat([columns["mu"][early], drawn["mu"].unsqueeze(1), columns["next_mu"][late]], dim=1)
         sigma = torch.cat([columns["sigma"][early], drawn["sigma"].unsqueeze(1), columns["next_sigma"][late]], dim=1)
         noise = torch.empty(mu.shape, device=generator.device).normal_(generator=generator)
@@ -109,7 +112,7 @@ class SequenceMemory(RealMemory):
             action=columns["action"][late],
             reward=columns["reward"][late],
             terminated=columns["terminated"][late],
-            valid=there & (columns["step"][late] - torch.arange(length, device=step.device) == step.unsqueeze(1)),
+            valid=valid,
         )
 
     @torch.no_grad()

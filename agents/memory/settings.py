@@ -43,18 +43,26 @@ _FAST: Mapping[str, Override] = {
     "recurrence.burn_in": Override(10, "most episodes are that short, so that nothing stored is out of date"),
     "recurrence.sequence": Override(10, "as long as most episodes are"),
 }
+_SLOW_TARGET = Override(0.05, "without a target network the values of states that are still being learned swing")
+_FAST_DQN = {**_FAST, "controller.target_rate": _SLOW_TARGET}
+_FAST_IMAGINATION = {
+    **_FAST_DQN,
+    "model.batch_size": Override(32, "CPU time; each row is a sequence of several transitions"),
+}
 _UNUSED = frozenset({"memory.priority", "memory.priority_correction"})
 _S = TypeVar("_S", RecurrentDQNSettings, RecurrentSettings)
 
 
-def _with_memory(kind: type[_S], base: Hyperparameters[DQNSettings] | Hyperparameters[Settings]) -> Hyperparameters[_S]:
+def _with_memory(
+    kind: type[_S], base: Hyperparameters[DQNSettings] | Hyperparameters[Settings], fast: Mapping[str, Override]
+) -> Hyperparameters[_S]:
     """Those of an agent without memory, and how it remembers; sequences are not prioritised."""
     groups = {}
     for name, group in base.groups.items():
-        sets = {each: {**changes, **({} if each == "published" else _FAST)} for each, changes in group.sets.items()}
+        sets = {each: {**changes, **({} if each == "published" else fast)} for each, changes in group.sets.items()}
         groups[name] = ConfigGroup(replaced(kind(), flatten(group.published)), sets, unused=_UNUSED)
     return Hyperparameters(groups)
 
 
-DRQN = _with_memory(RecurrentDQNSettings, DQN)
-IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION)
+DRQN = _with_memory(RecurrentDQNSettings, DQN, _FAST_DQN)
+IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)

@@ -27,6 +27,7 @@ from ..imagination.uncertainty import decompose
 from ..replay import RealMemory
 
 UPDATES = 1_500
+_MOST = 0.5  # share of its futures that the filter keeps of a step that counts as kept
 _MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25, "imagination.weight_samples": 20}
 _GAUSSIAN = {**_MC_DROPOUT, "model.components": 1}
 
@@ -37,7 +38,7 @@ class LatentModel:
     def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
         self.encoder, self.settings, device = encoder, settings, encoder.device
         size, seeds = encoder.latent_size, context.seeds
-        self.imagination = Imagination(size, context.n_actions, settings, filtered=False, seeds=seeds, device=device)
+        self.imagination = Imagination(size, context.n_actions, settings, filtered=True, seeds=seeds, device=device)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Encode every frame once and make :data:`UPDATES` updates."""
@@ -62,7 +63,10 @@ class LatentModel:
         generator, rows = self._generator(rng), len(frames)
         z = self.encoder.encode(frames[:, -1])[0].repeat_interleave(samples, dim=0)  # [N S, Z]
         weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))
-        steps: dict[str, list[Any]] = {name: [] for name in ("pictures", "rewards", "p_ended", *UNCERTAINTIES)}
+        kept = torch.ones(len(z), dtype=torch.bool)
+        steps: dict[str, list[Any]] = {
+            name: [] for name in ("pictures", "rewards", "p_ended", "accepted", *UNCERTAINTIES)
+        }
         for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
             step = self.imagination.step(z, action.repeat_interleave(samples), weights, generator)
             z, spread = step.next_z, decompose(step.samples)
@@ -70,6 +74,8 @@ class LatentModel:
             steps["rewards"].append((alive * step.reward).numpy())
             alive = alive * (1.0 - step.p_terminated)
             steps["p_ended"].append((1.0 - alive).numpy())
+            kept = kept & self.imagination.keeps(step)  # what follows a discarded step is discarded
+            steps["accepted"].append(kept.view(rows, samples).float().mean(dim=1).numpy() >= _MOST)
             for name in UNCERTAINTIES:
                 reduced = self.imagination.filter.score(getattr(spread, name))
                 steps[name].append(reduced.view(rows, samples).mean(dim=1).numpy())

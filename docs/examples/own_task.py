@@ -86,10 +86,11 @@ SPEC = TaskSpec(
     horizon=HORIZON, action_names=("step left", "step right"), macrostate_names=("cell",),
     macrostate_values=(tuple(map(str, range(CELLS))),), preprocessing="small_rgb", encoder="corridor", rules=Rules(),
     facts=functools.partial(facts, Rules(), HORIZON), render_macrostates=render_macrostates,
+    executions=("kinematic",),
 )  # fmt: skip
 TASKS["corridor"] = TaskEntry(spec="own_task:SPEC", env_id=SPEC.env_id, env="own_task:Corridor", horizon=HORIZON)
 register_env(TASKS["corridor"])
-BENCH = "bench --task corridor --preset smoke --execution kinematic --agents random oracle dqn"
+BENCH = "bench --task corridor --preset smoke --agents random oracle dqn"
 
 if __name__ == "__main__":  # dqn's encoder is trained on first use, in a minute
     sys.exit(main([*BENCH.split(), *sys.argv[1:]]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
 
@@ -78,6 +79,14 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
     if not any(each.complaint for each in found) and (folder / "report").is_dir():
         found.append(Verdict(what="report", complaint=_report_complaint(folder)))
     return found
+
+
+def price(folder: Path, found: Sequence[Verdict], cpu_s: float) -> str:
+    """What keeping test episodes costs in bytes, and playing them again in CPU seconds, in a sentence."""
+    size = sum(path.stat().st_size for path in folder.glob("*/*/episodes.npz"))
+    episodes = sum(each.episodes for each in found)
+    more = f", {size / episodes:.1f} bytes each" if episodes else ""
+    return f"{episodes:,} test episodes in {size / 1024:,.1f} KiB{more}; checked in {cpu_s:,.1f} CPU s."
 
 
 class Replays:

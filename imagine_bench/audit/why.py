@@ -14,12 +14,13 @@ import numpy as np
 from imagine_bench.bench.evaluation import Env
 from imagine_bench.bench.run_state import make_env
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Agent
-from imagine_bench.judge.causes import Attribution, Course, misread
+from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.judge.causes import Attribution, Course, frames_to_ask_with, misread
 from imagine_bench.report.analysis import Analysis, Measured, analyse, chosen, markdown
 from imagine_bench.report.page import write_report
 from imagine_bench.report.sections.causes import HEAD, causes_table, failures
-from imagine_bench.seeding import episode_seed, evaluation_split
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import KeptEpisodes
@@ -50,8 +51,18 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
     heading = "why agents failed"
     rows_file = "causes.csv"
 
+    def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
+        super().__init__(spec, appearance=appearance, purpose=purpose)
+        if spec.sight is not None:
+            raise InvalidValueError(
+                f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
+                "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
+            )
+        self._appearance, self._purpose = appearance, purpose
+        self._states = np.array(states_of(spec.rules), dtype=np.int64)
+
     def measure(self, trained: Trained) -> tuple[Tested, ...]:
-        """Play its failed test episodes again and find their causes.
+        """Play its failed test episodes again and find their causes; its eyes are those of the end of training.
 
         Raises:
             ArtefactError: An unfinished run, or one that keeps no test episodes.
@@ -64,14 +75,16 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
             raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
         run = run_folder.load_run(trained.folder)
         with closing(make_env(protocol, protocol.task, testing=True)) as env:
-            courses = _Courses(env, trained.agent, trained.spec.seed)
+            courses, agent = _Courses(env, trained.agent, trained.spec.seed), trained.agent
+            frames = frames_to_ask_with(agent, self.spec, appearance=self._appearance, purpose=self._purpose)
+            readable = ~misread(agent, frames, self._states)
             for row in run.checkpoints:
                 if row.kept is None or run.tried is None:
                     raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
                 if row.beliefs is None:
                     raise InvalidValueError(f"{self.spec.id} has too many macrostates to ask an agent about each.")
                 tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
-                attribution = Attribution(self.spec, row.beliefs, tried)
+                attribution = Attribution(self.spec, row.beliefs, tried, readable)
                 failed = np.flatnonzero(~row.kept.success).tolist()
                 causes = {test: attribution.cause(courses.of(row.kept, test)) for test in failed}
                 found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Collection, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.bench.launchers.jobs import Failure, Job, Launcher
-from imagine_bench.bench.progress import ProgressBars
+from imagine_bench.bench.progress import ProgressBars, RunKey
 from imagine_bench.errors import RunFailedError, SetupError, require_modules
 from imagine_bench.machine import describe_environment, gl_renderer
 from imagine_bench.protocols.data import ProtocolData
@@ -48,48 +48,80 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         SetupError: The folder cannot be written, there is no GL, or an extra of this package is not installed.
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
+    folder = bench_folder(root, wanted)
+    failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
+    if failures:
+        _raise(failures, missing)
+    if not missing:
+        print(f"All runs lie in {folder} already; nothing was run.")
+        _warn(BenchStore(folder, wanted).changed(describe_environment()), folder)
+    return load_bench(folder)
+
+
+def carry_out(
+    planned: Sequence[tuple[ProtocolData, Encoders]], *, root: Path, launcher: Launcher
+) -> tuple[list[Failure], int]:
+    """Run what is missing of several protocols as one piece of work, shown as one.
+
+    Returns:
+        The runs that failed, and how many were missing before. Raises as :func:`bench`, but for runs that fail.
+    """
     require_modules("matplotlib", "PIL", "rerun")  # torch only where an agent is made of it
-    store = BenchStore(bench_folder(root, wanted), wanted)
-    store.open()
-    with store.lock():
-        sweep(store.folder)
-        missing = len(store.missing())
-        if missing:
+    with ExitStack() as held:
+        work, missing = list[_Bench](), 0
+        for wanted, paths in planned:
+            store = BenchStore(bench_folder(root, wanted), wanted)
+            store.open()
+            held.enter_context(store.lock())
+            sweep(store.folder)
+            if store.missing():
+                missing += len(store.missing())
+                work.append((store, paths))
+        for store, _ in work:
             if task_type(store.protocol.task).draws:
                 gl_renderer()  # fails here, in one sentence, rather than in every run
             _warn(store.begin_session(describe_environment()), store.folder)
-            failures = _in_stages(store, paths, launcher)
-            store.save_time()
-            if failures:
-                _raise(failures, missing)
-        else:
-            print(f"All runs lie in {store.folder} already; nothing was run.")
-            _warn(store.changed(describe_environment()), store.folder)
-    return load_bench(store.folder)
+            if registry.has_task(store.protocol.task):
+                store.keep_certificate()
+        return _in_stages(work, launcher), missing
 
 
-def _in_stages(store: BenchStore, paths: Encoders, launcher: Launcher) -> list[Failure]:
-    """Take all runs as far as the protocol's next stage, again and again; one that failed goes no further."""
+_Bench = tuple[BenchStore, Encoders]
+
+
+def _in_stages(work: Sequence[_Bench], launcher: Launcher) -> list[Failure]:
+    """Take all runs as far as their protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
-    order = store.protocol.agents  # those listed last cost most and come first of each seed, so no worker idles
-    specs = [_job(store, paths, *pair, None).spec for pair in store.missing()]
-    with ProgressBars(specs, _done_before(store)) as show:
-        for until in store.protocol.stages:
-            failed = {(failure.job.spec.agent, failure.job.spec.seed) for failure in failures}
-            pairs = [pair for pair in store.missing(until) if pair not in failed]
-            pairs.sort(key=lambda pair: (pair[1], -order.index(pair[0])))
-            jobs = [_job(store, paths, *pair, until) for pair in pairs]
+    specs = [_job(store, paths, *pair, None).spec for store, paths in work for pair in store.missing()]
+    with ProgressBars(specs, dict(pair for store, _ in work for pair in _done_before(store).items())) as show:
+        for index in range(max((len(store.protocol.stages) for store, _ in work), default=0)):
+            jobs: list[Job] = []
+            for store, paths in work:
+                jobs += _next_jobs(store, paths, index, {failure.job.folder for failure in failures})
             if jobs:
-                failures += launcher.launch(jobs, _saving_time(store, show))
+                failures += launcher.launch(jobs, _saving_time([store for store, _ in work], show))
+    for store, _ in work:
+        store.save_time()
     return failures
 
 
-def _done_before(store: BenchStore) -> dict[tuple[str, int], int]:
+def _next_jobs(store: BenchStore, paths: Encoders, index: int, failed: Collection[Path]) -> list[Job]:
+    order = store.protocol.agents  # those listed last cost most and come first of each seed, so no worker idles
+    if index >= len(store.protocol.stages):
+        return []
+    until = store.protocol.stages[index]
+    pairs = sorted(store.missing(until), key=lambda pair: (pair[1], -order.index(pair[0])))
+    jobs = [_job(store, paths, *pair, until) for pair in pairs]
+    return [job for job in jobs if job.folder not in failed]
+
+
+def _done_before(store: BenchStore) -> dict[RunKey, int]:
     """How much of each unfinished run lies before its last test; only runs that act are tested on the way."""
     if not registry.has_task(store.protocol.task):
         return {}
     reached = {pair: run_folder.reached(store.run_folder(*pair)) for pair in store.missing()}
-    return {pair: store.protocol.work(pair[0], until) for pair, until in reached.items() if until}
+    known = {pair: until for pair, until in reached.items() if until}
+    return {(store.protocol.hash, *pair): store.protocol.work(pair[0], until) for pair, until in known.items()}
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
@@ -103,7 +135,7 @@ def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int |
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 
 
-def _saving_time(store: BenchStore, show: OnProgress) -> OnProgress:
+def _saving_time(stores: Sequence[BenchStore], show: OnProgress) -> OnProgress:
     saved_s = time.monotonic()
 
     def observe(progress: Progress) -> None:
@@ -112,7 +144,8 @@ def _saving_time(store: BenchStore, show: OnProgress) -> OnProgress:
             show(progress)
         if time.monotonic() - saved_s > _SAVE_EVERY_S:
             with suppress(SetupError):  # a count of seconds stops no run; what they cannot write they say themselves
-                store.save_time()
+                for store in stores:
+                    store.save_time()
             saved_s = time.monotonic()
 
     return observe

@@ -15,7 +15,7 @@ from imagine_bench.bench.queries import require_able
 from imagine_bench.bench.run_state import make_env
 from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.entrants import entrant
-from imagine_bench.errors import InvalidValueError, UnknownNameError, plain
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress, RunSpec
@@ -70,7 +70,11 @@ def _require_sound(wanted: Protocol) -> None:
         )
         seen = [("render_macrostates", frame[0])]
         with closing(make_env(wanted, wanted.task)) as env:
-            seen.append(("its environment", env.reset(seed=0)[0]))
+            first = env.reset(seed=0)[0]
+        if wanted.shows_frames_alone:
+            seen.append(("its environment", first))
+        elif set(first) != set(wanted.observation.split(",")):
+            raise InvalidValueError(f"its environment shows {brief(first)}, not {wanted.observation}")
         for what, each in seen:
             if (each.shape, each.dtype) != ((64, 64, 3), np.uint8):
                 raise InvalidValueError(f"{what} gives frames of {each.dtype} and shape {each.shape}")
@@ -133,7 +137,9 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
 
 def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
     """Do a run, looked at by every registered observer; see :func:`.runner.run`."""
-    return runner.run(spec, folder, on_progress, [registry.load(name)() for name in registry.OBSERVERS])
+    *askers, recorder = registry.OBSERVERS
+    names = [*askers, recorder] if spec.protocol.shows_frames_alone else [recorder]  # the others ask with frames
+    return runner.run(spec, folder, on_progress, [registry.load(name)() for name in names])
 
 
 CONTROL = TaskType(

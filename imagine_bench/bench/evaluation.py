@@ -10,8 +10,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Agent, Observation, Transition
+from imagine_bench.interfaces import Agent, Observation, State, Transition
 from imagine_bench.seeding import Purpose, episode_seed
 from imagine_bench.store.counters import Counters, EvaluationCounts, Played
 
@@ -19,9 +20,16 @@ Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
 
 
-def observation(frame: Any, info: Info, *, privileged: bool) -> Observation:
-    """What an agent may see of a step: the macrostate only if it is registered as privileged."""
-    return Observation(frame=frame, macrostate=np.asarray(info["macrostate"]) if privileged else None)
+class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """An observation of one part, as a dict of that part."""
+
+    def __init__(self, env: Env, name: str) -> None:
+        super().__init__(env)
+        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """See above."""
+        return {self._name: observation}
 
 
 def play(
@@ -40,14 +48,15 @@ def play(
     """
     frame, info = env.reset(seed=seed)
     _require_sound(env, frame, 0.0)
-    before, over = observation(frame, info, privileged=privileged), False
+    begin_episode(agent)
+    before, over = Observation.of(frame, info, privileged=privileged), False
     while not over:
         if before_acting is not None:
             before_acting(before, info)
         action = agent.act(before, explore=explore)
         frame, reward, terminated, truncated, info = env.step(action)
         _require_sound(env, frame, reward)
-        after = observation(frame, info, privileged=privileged)
+        after = Observation.of(frame, info, privileged=privileged)
         transition = Transition(
             observation=before, action=action, reward=float(reward), next_observation=after,
             terminated=bool(terminated), truncated=bool(truncated),
@@ -116,6 +125,21 @@ class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._counters.try_out(self._at, int(action))
         self._at = np.asarray(after[4]["macrostate"]).tolist()
         return after
+
+
+class StartsFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Starts every episode in one of some macrostates, equally likely, that its seed decides."""
+
+    def __init__(self, env: Env, starts: Sequence[State]) -> None:
+        super().__init__(env)
+        self._starts = tuple(starts)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+        """Start an episode, where ``options`` say so if they do."""
+        if options is None:
+            rng = np.random.default_rng(seed)
+            options = {"macrostate": self._starts[int(rng.integers(len(self._starts)))]}
+        return self.env.reset(seed=seed, options=options)
 
 
 class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):

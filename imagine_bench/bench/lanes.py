@@ -10,10 +10,10 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import observation
 from imagine_bench.bench.run_state import Run
+from imagine_bench.capabilities import EpisodeRememberer
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import Agent
+from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.store.counters import Played
 
 LEAST_EPISODES = 50
@@ -24,10 +24,12 @@ _LANES_PER_CORE = 4
 def lanes_pay(run: Run, episodes: int) -> bool:
     """Whether the episodes of a test are played in lanes.
 
-    They are where simulating takes the time, the run has several cores, and an agent's actions follow from what it is
-    shown alone: in tests, those of every learner do.
+    They are where simulating takes the time, the run has several cores, frames are all that is seen, and actions follow
+    from the one that is shown: in tests, those of every learner do that does not remember its episode.
     """
-    simulated = run.protocol.execution == "physics" and run.entry.learns
+    markov = run.entry.learns and not isinstance(run.agent, EpisodeRememberer)
+    wanted = run.protocol
+    simulated = wanted.execution == "physics" and wanted.shows_frames_alone and wanted.split is None and markov
     offered = registry.vector_id(registry.task_entry(run.task.id).env_id) in gymnasium.registry
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 
@@ -58,7 +60,7 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
     free, following, actions = list(everyone), 0, dict[int, int]()
 
     def act(lane: int, frame: Any, info: dict[str, Any]) -> None:
-        actions[lane] = int(agent.act(observation(frame, info, privileged=privileged), explore=False))
+        actions[lane] = int(agent.act(Observation.of(frame, info, privileged=privileged), explore=False))
         lanes.send([actions[lane]], [lane])
 
     while following < len(seeds):

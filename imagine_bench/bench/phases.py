@@ -8,7 +8,7 @@ from contextlib import closing
 
 from imagine_bench.bench.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
 from imagine_bench.bench.lanes import episodes_in_lanes, lanes_pay
-from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen, demonstrator
+from imagine_bench.bench.queries import LabelOracle, QueryBudget, Teacher, as_seen
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
 from imagine_bench.data.episodes import Episodes
@@ -74,7 +74,7 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
 
     episode = play(
         Watched(run.env, counters),
-        demonstrator(run.spec) if demonstrated else run.agent,
+        run.demonstrator if demonstrated else run.agent,
         seed=seed,
         explore=True,
         privileged=demonstrated or run.entry.privileged,

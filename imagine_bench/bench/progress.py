@@ -14,6 +14,8 @@ from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import Progress, RunSpec
 
 Item = TypeVar("Item")
+RunKey = tuple[str, str, int]
+"""Hash of its protocol, agent and seed of a run."""
 
 _LINE_EVERY_S = 15.0
 """Between two lines where nobody watches a terminal."""
@@ -23,20 +25,18 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
     """Shows :class:`~imagine_bench.protocols.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
 
     ``specs`` are the runs to come, to their ends even where they pause on the way; ``done`` is how much of each run
-    earlier sessions did, by agent and seed, as far as is known before it goes on.
+    earlier sessions did, by bench, agent and seed, as far as is known before it goes on.
     """
 
-    def __init__(
-        self, specs: Sequence[RunSpec[ProtocolData]], done: Mapping[tuple[str, int], int] | None = None
-    ) -> None:
-        self._works = {(spec.agent, spec.seed): spec.work for spec in specs}
-        self._finished = set[tuple[str, int]]()
+    def __init__(self, specs: Sequence[RunSpec[ProtocolData]], done: Mapping[RunKey, int] | None = None) -> None:
+        self._works = {(spec.protocol.hash, spec.agent, spec.seed): spec.work for spec in specs}
+        self._finished = set[RunKey]()
         self._done = dict(done or {})
         self._before = dict(self._done)
-        self._seen = set[tuple[str, int]]()
+        self._seen = set[RunKey]()
         self._began_s = self._shown_s = time.monotonic()
         self._total: tqdm | None = None
-        self._lines: list[tuple[tuple[str, int] | None, tqdm]] = []
+        self._lines: list[tuple[RunKey | None, tqdm]] = []
         if sys.stderr.isatty():
             form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
             self._total = tqdm(total=sum(self._works.values()), desc=self._description(), bar_format=form, leave=False)
@@ -49,7 +49,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
-        run, pauses = (progress.agent, progress.seed), progress.phase == "done"
+        run, pauses = (progress.bench, progress.agent, progress.seed), progress.phase == "done"
         if progress.phase == "failed":
             self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
             return
@@ -66,7 +66,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
             self._shown_s = time.monotonic()
             print(f"{self._description()},{self._times()}; {_sentence(progress, work)}", file=sys.stderr, flush=True)
 
-    def _drop(self, run: tuple[str, int], sentence: str) -> None:
+    def _drop(self, run: RunKey, sentence: str) -> None:
         """Say that a run failed; what it lacks will not be done."""
         self._works[run] = self._done.get(run, 0)
         if self._total is not None:
@@ -84,7 +84,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
         return f" {tqdm.format_interval(gone_s)} gone{left}"
 
-    def _show_on_bars(self, total: tqdm, run: tuple[str, int], text: str) -> None:
+    def _show_on_bars(self, total: tqdm, run: RunKey, text: str) -> None:
         total.n = sum(self._done.values())
         total.set_description_str(self._description(), refresh=False)
         total.set_postfix_str(self._times(), refresh=True)
@@ -93,7 +93,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         line.set_description_str(text)
         self._lines[row] = (run if text else None, line)
 
-    def _row(self, run: tuple[str, int]) -> int:
+    def _row(self, run: RunKey) -> int:
         """The run's line, else one that a finished run has left, else a new one below."""
         owners = [owner for owner, _ in self._lines]
         for wanted in (run, None):

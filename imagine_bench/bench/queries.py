@@ -55,11 +55,11 @@ def demonstrator(spec: RunSpec[Protocol]) -> Agent:
 
 def as_seen(transition: Transition) -> Transition:
     """A demonstrated transition as a learner may see it: without macrostates."""
-    return dataclasses.replace(
-        transition,
-        observation=dataclasses.replace(transition.observation, macrostate=None),
-        next_observation=dataclasses.replace(transition.next_observation, macrostate=None),
+    before, after = (
+        dataclasses.replace(seen, macrostate=None, shown=None)
+        for seen in (transition.observation, transition.next_observation)
     )
+    return dataclasses.replace(transition, observation=before, next_observation=after)
 
 
 class LabelOracle:

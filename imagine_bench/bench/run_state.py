@@ -6,18 +6,19 @@ import dataclasses
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Env
-from imagine_bench.bench.queries import Teacher, require_able
+from imagine_bench.bench.evaluation import ByName, Env, StartsFrom
+from imagine_bench.bench.queries import Teacher, demonstrator, require_able
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Agent
+from imagine_bench.interfaces import OBSERVATIONS, Agent
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.store import encoders, run_folder
@@ -32,20 +33,25 @@ _REPORT_EVERY_S = 0.25
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
     """The environment of a task as a protocol has it, for training or for tests; ``options`` are more of its own."""
-    return gymnasium.make(
+    env = gymnasium.make(
         registry.task_entry(task).env_id,
         **protocol.world,
         appearance=protocol.appearance_in_tests if testing else protocol.appearance,
         **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
+    if protocol.observation in OBSERVATIONS[1:]:
+        env = ByName(env, protocol.observation)
+    if protocol.split is None or task != protocol.task:
+        return env
+    return StartsFrom(env, protocol.spec(testing=testing).rules.start_states)
 
 
 @contextmanager
 def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]]:
-    """The environments of training and of tests; one and the same unless tests have looks of their own."""
+    """The environments of training and of tests; one and the same unless tests have looks or starts of their own."""
     with closing(make_env(protocol, protocol.task, **options)) as env:
-        if protocol.appearance_in_tests == protocol.appearance:
+        if protocol.appearance_in_tests == protocol.appearance and protocol.split is None:
             yield env, env
             return
         with closing(make_env(protocol, protocol.task, testing=True, **options)) as test_env:
@@ -117,6 +123,11 @@ class Run:
             "settings": {} if settings is None else dataclasses.asdict(settings),
         }
 
+    @cached_property
+    def demonstrator(self) -> Agent:
+        """See :func:`.queries.demonstrator`; it holds nothing from one episode to the next."""
+        return demonstrator(self.spec)
+
     @property
     def budgets_left(self) -> tuple[int, ...]:
         """Budgets to come before the run pauses or ends."""
@@ -159,6 +170,7 @@ class Run:
             success = sum(recent) / len(recent) if recent else None
         spec, done, episode = self.spec, played + (test.episodes if test else 0), counters.episode
         where = Progress(
-            agent=spec.agent, seed=spec.seed, phase=phase, done=done, work=spec.work, episode=episode, success=success
-        )
+            agent=spec.agent, seed=spec.seed, bench=self.protocol.hash, phase=phase, done=done, work=spec.work,
+            episode=episode, success=success,
+        )  # fmt: skip
         self._on_progress(where)

@@ -10,13 +10,15 @@ solved as any other.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.interfaces import Outcome, Rules, Sight, State
+from imagine_bench.interfaces import Outcome, Rules, Sight, State, TaskSpec
 from imagine_bench.rules import horizon_optimum, tabulate
 
 Window = tuple[State, ...]
@@ -128,20 +130,26 @@ def _normal(group: dict[Window, float]) -> tuple[tuple[Window, float], ...]:
 
 
 class OptimalPolicy:
-    """What the best agent does that has memory and the rules, but sees only what frames show; it holds one episode."""
+    """What the best agent does that has memory and the rules, but sees only what frames show; it holds one episode.
+
+    With more than :data:`MOST` beliefs none is solved for: it does what is best in the most probable macrostates if all
+    will be seen from then on (Littman, Cassandra and Kaelbling 1995, QMDP).
+    """
 
     def __init__(self, rules: Rules, sight: Sight | None, horizon: int) -> None:
         self._rules, self._horizon = rules, horizon
         self._tables = tabulate(rules)
         self._best = horizon_optimum(self._tables, horizon).actions
         self._beliefs: BeliefRules | None = None
+        self._rows: dict[State, int] = {}
         if sight is not None:
             self._sight, self._play = sight, [state for state in self._tables.index if not rules.is_terminal(state)]
             self._beliefs = BeliefRules(rules, sight, self._play, horizon)
-            self._belief_tables = tabulate(cast(Rules, self._beliefs), depth=horizon)
-            self._belief_best = horizon_optimum(self._belief_tables, horizon).actions
-        self._belief: Belief | None = None
-        self._action = 0
+            with suppress(TooManyBeliefsError):
+                known = tabulate(cast(Rules, self._beliefs), depth=horizon)
+                self._rows, self._belief_best = known.index, horizon_optimum(known, horizon).actions
+        self._episode: list[tuple[Belief, int]] = []
+        """By step: what was known, and the action that was asked for then."""
 
     def __call__(self, seen: State, step: int) -> int:
         """The action after ``step`` macro-actions of an episode, each of which was asked for here, from step 0 on."""
@@ -149,24 +157,30 @@ class OptimalPolicy:
         if self._beliefs is None:
             row = self._tables.index.get(seen)
             return self._rules.optimal_action(seen) if row is None else int(self._best[left - 1, row])
+        del self._episode[step:]
         if step == 0:
-            self._belief = self._beliefs.starts.get(seen, (0.0, None))[1]
-        elif self._belief is not None:
-            self._belief = self._beliefs.follow(self._belief, self._action, seen)
-        if self._belief is None:  # what the rules call impossible: anything that would look so
-            self._belief = self._anything_like(seen, step)
-        row = self._belief_tables.index.get(self._belief)
-        self._action = self._vote(left) if row is None else int(self._belief_best[left - 1, row])
-        return self._action
+            belief = self._beliefs.starts.get(seen, (0.0, None))[1]
+        else:
+            belief = self._beliefs.follow(*self._episode[step - 1], seen) if step == len(self._episode) else None
+        if belief is None:  # what the rules call impossible: anything that would look so
+            belief = self._anything_like(seen, step)
+        row = self._rows.get(belief)
+        action = self._vote(belief, left) if row is None else int(self._belief_best[left - 1, row])
+        self._episode.append((belief, action))
+        return action
 
     def _anything_like(self, seen: State, step: int) -> Belief:
         """Every macrostate whose frame may show this, each equally likely, as if it had stood there for long."""
         like = [s for s in self._play if any(what == seen for _, what in self._sight.seen(s, step))] or self._play
         return step, tuple(((state,) * max(self._sight.lag, 1), 1.0 / len(like)) for state in like)
 
-    def _vote(self, left: int) -> int:
-        """The action that is best in the most probable macrostates if all will be seen (Littman et al. 1995, QMDP)."""
+    def _vote(self, belief: Belief, left: int) -> int:
         votes = np.zeros(self._rules.n_actions)
-        for window, weight in (self._belief or _ENDED)[1]:
+        for window, weight in belief[1]:
             votes[self._best[left - 1, self._tables.index[window[-1]]]] += weight
         return int(votes.argmax())
+
+
+def optimal_policy_of(spec: TaskSpec) -> Callable[[], OptimalPolicy]:
+    """Makes a task's optimal policy when it is called: to enumerate beliefs takes a moment."""
+    return partial(OptimalPolicy, spec.rules, spec.sight, spec.horizon)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -90,6 +91,20 @@ def certificate(spec: TaskSpec) -> Certificate:
         facts=graph.facts,
         floor=_floor(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
     )
+
+
+def from_json(values: Mapping[str, Any]) -> Certificate:
+    """Undo ``dataclasses.asdict`` and JSON. Raises TypeError or KeyError: fields are missing or unknown."""
+    lists = {name: tuple(map(tuple, values[name])) for name in ("plan_lengths", "dynamics", "outcomes")}
+    floor = values["floor"] and InformationFloor(**values["floor"])
+    return Certificate(**{**values, **lists, "floor": floor})
+
+
+def optimum(spec: TaskSpec) -> float:
+    """The largest success probability with memory; where there are too many beliefs, a bound on it."""
+    tables = tabulate(spec.rules)
+    seen_optimum = float(horizon_optimum(tables, spec.horizon).success[tables.starts].mean())
+    return seen_optimum if spec.sight is None else _with_memory(spec, tables, seen_optimum)[0]
 
 
 def certificate_rows(found: Certificate) -> dict[str, str]:

@@ -1,15 +1,16 @@
-"""Starts for training and others for tests that differ in structure: data with a hash, not wired into protocols yet."""
+"""Starts for training and others for tests that differ in structure: data with a hash, named by a line of text."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import Rules, State
 from imagine_bench.rules import shortest_plans, tabulate
 
@@ -35,6 +36,46 @@ class Split:
     def hash(self) -> str:
         """12 hex digits of the content, whatever its name."""
         return hashlib.sha256(json.dumps([sorted(self.train), sorted(self.test)]).encode()).hexdigest()[:12]
+
+    @property
+    def identity(self) -> str:
+        """What stands for it in a protocol: its name and its hash."""
+        return f"{self.name}@{self.hash}"
+
+
+class StartingFrom:
+    """Rules as they are, with some of their starts."""
+
+    def __init__(self, rules: Rules, starts: tuple[State, ...]) -> None:
+        self._rules, self.start_states = rules, starts
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._rules, name)
+
+
+def split_of(rules: Rules, text: str) -> Split:
+    """The split that a text names, such as ``plan_length=2``, ``values=3:0:1`` or ``pairs=0:3:4``.
+
+    The numbers are the arguments of :func:`by_plan_length`, of :func:`by_values`, one value behind the other, and of
+    :func:`by_pairs`, whose generator has seed 0. With ``@`` and a hash behind, it must be that very split.
+
+    Raises:
+        InvalidValueError: It names none, or another than its hash says.
+    """
+    name, _, wanted = text.partition("@")
+    kind, _, rest = name.partition("=")
+    try:
+        numbers = [int(each) for each in rest.split(":")]
+        found = _KINDS[kind](rules, *numbers)
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise InvalidValueError(
+            f"{brief(text)} names no split of {len(rules.start_states)} starts; give plan_length=LONGEST, "
+            "values=COORDINATE:VALUE:... or pairs=COORDINATE:COORDINATE:COUNT, such as plan_length=2."
+        ) from error
+    found = replace(found, name=f"{kind}={':'.join(map(str, numbers))}")
+    if wanted and wanted != found.hash:
+        raise InvalidValueError(f"Split {found.name} is {found.hash} here, not {wanted}; the world's starts changed.")
+    return found
 
 
 def by_plan_length(rules: Rules, longest: int) -> Split:
@@ -79,3 +120,10 @@ def _split(name: str, starts: Collection[State], is_test: Callable[[State], bool
         train=tuple(state for state in starts if not is_test(state)),
         test=tuple(state for state in starts if is_test(state)),
     )
+
+
+_KINDS: dict[str, Callable[..., Split]] = {
+    "plan_length": by_plan_length,
+    "values": lambda rules, coordinate, *values: by_values(rules, coordinate, values),
+    "pairs": lambda rules, first, second, count: by_pairs(rules, first, second, count, np.random.default_rng(0)),
+}

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from imagine_bench import __version__
-from imagine_bench.cli.analysis import Generalise, Judge, Plan, Policy, Verify, Why
+from imagine_bench.cli.analysis import Judge, Plan, Policy, Verify, Why
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
@@ -29,7 +29,6 @@ Command = (
     Bench
     | Report
     | Plan
-    | Generalise
     | Policy
     | Judge
     | Verify

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +12,9 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, shown
-from imagine_bench.entrants import parse_settings
+from imagine_bench.cli.options import ANY, NEWEST, listed, shown
 from imagine_bench.errors import RunFailedError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.interfaces import APPEARANCES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Plan:
     """Plans."""
     recorded: int = 5
     """Plans that are recorded too; 0 for none."""
-    execution: str = EXECUTIONS[0]
+    execution: Annotated[str | None, shown("STR", "(default: the task's)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     max_epistemic: Annotated[float | None, shown("FLOAT", "(default: the agent's own filter)")] = None
     """A plan with an imagined step of more epistemic uncertainty is refused."""
@@ -65,7 +65,7 @@ class Judge:
     task: str = "arrow_puzzle"
     """Task whose world is imagined."""
     models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite but slow ones)")] = None
-    """World models; 'imagine-bench list' names them."""
+    """World models, as 'imagine-bench list' names them, or folders of finished runs, whose agents are judged."""
     sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
         100,
         300,
@@ -79,7 +79,7 @@ class Judge:
     samples: int = 8
     """Futures imagined of each question."""
     appearance: str = APPEARANCES[0]
-    """How much light, colors and poses vary."""
+    """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: str = "random"
     """Who collects the data: random, uniform, oracle or mixed."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
@@ -118,11 +118,12 @@ class Verify:
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.audit.verify import verify  # noqa: PLC0415 - as above
+        from imagine_bench.audit.verify import price, verify  # noqa: PLC0415 - as above
         from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
 
-        verdicts = verify(chosen(self.folder, self.out, self.task))
-        print(*verdicts, sep="\n")
+        folder, begun_s = chosen(self.folder, self.out, self.task), time.process_time()
+        verdicts = verify(folder)
+        print(*verdicts, price(folder, verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)
 
@@ -139,23 +140,6 @@ class _OfBench:
     """The encoder the runs saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Generalise(_OfBench):
-    """Ask the models of a bench, finished or not, for every transition: also those that no training can contain."""
-
-    set: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
-    """Settings that replace those the agents ran with, as name=value, such as imagination.temperature=0."""
-
-    def __call__(self) -> None:
-        """Ask and report."""
-        from imagine_bench.report.generalisation import generalisation_report  # noqa: PLC0415 - as above
-
-        overrides = parse_settings(added_up("set", self.set))
-        print(
-            generalisation_report(self.folder, root=self.out, task=self.task, encoder=self.encoder, overrides=overrides)
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,11 +45,15 @@ class Bench:
     execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
-    """How much light, colors and poses vary: clean, mild, strong, or photo (a finite pool)."""
+    """How much frames vary: clean, mild, strong, photo (a finite pool), or factors such as light=0.5,camera=0.2."""
     test_appearance: Annotated[str | None, shown("STR", "(default: the training's)")] = None
     """The appearance in tests."""
     physics: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: none)")] = ()
     """What decides whether a grasp holds, as name=value, such as pad_friction=0.5."""
+    observation: Annotated[str | None, shown("STR", "(default: frame)")] = None
+    """What agents see: frame, human, state (privileged) or proprio, several separated by commas."""
+    observation_size: Annotated[int | None, shown("INT", "(default: 64)")] = None
+    """Edge of images that agents see, 32 to 256 pixels."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR")] = ()
     """Of regression tasks: datasets, or numbers of samples, to learn from."""
     networks: Annotated[int | None, shown("INT")] = None
@@ -64,6 +68,8 @@ class Bench:
     """First training episodes that the oracle plays and learners watch; budgets count them."""
     dataset: Annotated[Path | None, shown("PATH", "(default: none)")] = None
     """Folder of a dataset whose episodes come first in training; budgets count them, and are them alone by default."""
+    split: Annotated[str | None, shown("STR", "(default: none)")] = None
+    """Tests start where training never does, such as plan_length=2: after at most 2 macro-actions training can end."""
     queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
     """Most oracle queries of a learner in a training episode."""
     feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
@@ -88,6 +94,7 @@ class Bench:
         names = (
             *_LISTS, "evaluation_episodes", "execution", "appearance", "test_appearance", "networks", "encoder",
             "after_episodes", "demonstrations", "queries", "dataset", "feedback", "feedback_error",
+            "observation", "observation_size", "split",
         )  # fmt: skip
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         options["variants"] = added_up("variants", self.variants) or None
@@ -143,6 +150,10 @@ class Study:
     """Which study; 'imagine-bench list' names them."""
     file: Annotated[Path | None, shown("FILE", "(default: none)")] = None
     """A study of your own, as .toml or .json."""
+    observation: Annotated[str | None, shown("STR", "(default: frame)")] = None
+    """What agents see: frame, human, state (privileged) or proprio, several separated by commas."""
+    observation_size: Annotated[int | None, shown("INT", "(default: 64)")] = None
+    """Edge of images that agents see, 32 to 256 pixels."""
     variants: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: all)")] = ()
     """Only these variants and what they are compared with."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None

@@ -12,7 +12,7 @@ from imagine_bench import registry
 from imagine_bench.cli.options import shown
 from imagine_bench.entrants import file_name
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.files import require_writable
 
 
@@ -33,10 +33,10 @@ class Dataset:
     """Folder of the dataset; never overwritten."""
     seed: int = 0
     """Seed of starts and of chance."""
-    execution: str = EXECUTIONS[0]
+    execution: Annotated[str | None, shown("STR", "(default: the task's)")] = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: str = APPEARANCES[0]
-    """How much light, colors and poses vary: clean, mild, strong, or photo."""
+    """How much frames vary: clean, mild, strong, photo, or factors such as light=0.5,camera=0.2."""
     motion_hz: float = 0.0
     """Samples a second of the arm's motion and commands, kept in a file apart; 0 keeps none."""
     encoder: Annotated[str | None, shown("NAME|FILE", "(default: the run's, if bundled)")] = None
@@ -68,7 +68,7 @@ class Dataset:
         require_new(folder)
         require_writable(folder.parent)
         episodes, files, card = collect(
-            spec, policy, episodes=self.episodes, seed=self.seed, execution=self.execution, appearance=self.appearance,
-            motion_hz=self.motion_hz,
+            spec, policy, episodes=self.episodes, seed=self.seed, execution=spec.execution(self.execution),
+            appearance=self.appearance, motion_hz=self.motion_hz,
         )  # fmt: skip
         print(f"{folder}\n{describe(write_dataset(folder, episodes, files, card, self.format))}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from imagine_bench.bench.run_state import Run
+from contextlib import closing
+
+from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.bench.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.capabilities import FutureSampler, Imaginer
 from imagine_bench.interfaces import Frame
@@ -72,9 +74,9 @@ class BeliefsObserver(RunObserver):
         self._frames: Frame | None = None
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """``beliefs`` of an agent that learns, in a task of not too many macrostates."""
+        """``beliefs`` of an agent that learns, in a task of not too many macrostates, each of which frames show."""
         task, entry = run.task, run.entry
-        if not entry.learns or len(states_of(task.rules)) > MOST_STATES:
+        if not entry.learns or task.sight is not None or len(states_of(task.rules)) > MOST_STATES:
             return {}
         if self._frames is None:  # the same at every budget
             appearance, purpose = run.protocol.appearance_in_tests, evaluation_split(run.spec.seed)
@@ -112,14 +114,15 @@ class RecordingObserver(RunObserver):
         from imagine_bench.recording import record_run  # noqa: PLC0415 - loading Rerun costs a second
 
         run.tell("recording", at_once=True)
-        record_run(
-            protocol.task,
-            run.agent,
-            name=run.spec.agent,
-            seed=run.spec.seed,
-            world=protocol.world,
-            appearance=protocol.appearance_in_tests,
-            episodes=protocol.recorded_episodes,
-            path=run_folder.recording_path(run.folder),
-        )
+        with closing(make_env(protocol, protocol.task, testing=True)) as env:
+            record_run(
+                protocol.task,
+                run.agent,
+                name=run.spec.agent,
+                seed=run.spec.seed,
+                env=env,
+                appearance=protocol.appearance_in_tests,
+                episodes=protocol.recorded_episodes,
+                path=run_folder.recording_path(run.folder),
+            )
         return {}

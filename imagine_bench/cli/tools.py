@@ -10,8 +10,7 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, only, shown
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.cli.options import ANY, NEWEST, listed, only, require_values, shown
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
@@ -46,7 +45,7 @@ class Encoder:
     task: str
     """Task whose frames it learns."""
     appearance: str = APPEARANCES[0]
-    """Appearance level of the frames."""
+    """Appearance of the frames: a level, or factors such as light=0.5,camera=0.2."""
     recipe: str = "default"
     """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole image), or codes,
     for agents that read factors and their values."""
@@ -87,7 +86,7 @@ class Film:
     task: str
     """Task to film."""
     appearance: str = APPEARANCES[0]
-    """Appearance level."""
+    """Appearance: a level, or factors."""
     seed: int = 0
     """Chooses the episode."""
     out: Path = Path("film.gif")
@@ -111,7 +110,7 @@ class Play:
     execution: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
     """physics or kinematic."""
     appearance: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
-    """Appearance level."""
+    """Appearance: a level, or factors."""
     encoder: Annotated[str | None, shown("STR", "(default: the bundled one)")] = None
     """Name or file of the encoder that the model used."""
     seed: int = 0
@@ -131,6 +130,10 @@ class Speed:
 
     turns: int = 2_000
     """Macro-actions of the fidelity measurement."""
+    worlds: Annotated[tuple[str, ...] | None, listed("STR", "(default: none)")] = None
+    """Worlds, such as arrows:cubes=5, whose fidelity is measured and nothing else."""
+    appearances: Annotated[tuple[str, ...], listed("STR")] = APPEARANCES[:1]
+    """Appearance levels at which it is."""
     out: Path = Path("runs/speed.json")
     """Where the figures are kept, with the machine's description."""
 
@@ -138,36 +141,37 @@ class Speed:
         """Measure."""
         from imagine_bench.tools.speed import speed_report  # noqa: PLC0415 - nothing else needs it
 
-        if not speed_report(self.out, self.turns):
+        require_values("worlds", self.worlds)
+        require_values("appearances", self.appearances)
+        if not speed_report(self.out, self.turns, worlds=self.worlds or (), appearances=self.appearances):
             sys.exit(1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Say whether a task or an agent, of this suite or of another package, keeps the contract."""
+    """Say whether a task, an agent or a world model, of this suite or another package, keeps the contract."""
 
     task: Annotated[str | None, shown("STR", "(default: none)")] = None
-    """Task to check; with --agent, the one that it is checked in."""
+    """Task to check; with --agent or --model, the one that these are checked in."""
     agent: Annotated[str | None, shown("STR", "(default: none)")] = None
     """Agent to check."""
+    model: Annotated[str | None, shown("STR", "(default: none)")] = None
+    """World model to check."""
 
     def __call__(self) -> None:
         """Check."""
-        from imagine_bench.tools.check import agent_checks, report, task_checks  # noqa: PLC0415 - nothing else needs it
+        from imagine_bench.testing.contract import checks, report  # noqa: PLC0415 - nothing else needs it
 
-        if self.agent is None and self.task is None:
-            raise InvalidValueError("There is nothing to check; give --task or --agent.")
-        task = self.task or "arrow_puzzle"
-        if report(task_checks(task) if self.agent is None else agent_checks(self.agent, task)):
+        if report(checks(self.task, self.agent, self.model)):
             sys.exit(1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a package of your own with a task or an agent in it, ready to be changed."""
+    """Write a package of your own with a task, an agent or a world model in it, ready to be changed."""
 
     kind: Annotated[str, tyro.conf.Positional]
-    """task or agent."""
+    """task, agent or model."""
     name: Annotated[str, tyro.conf.Positional]
     """Name of the package and of what it offers."""
     out: Path = Path()

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
+from imagine_bench.appearance import appearance_name
+from imagine_bench.capabilities import begin_episode
+from imagine_bench.certificates.beliefs import optimal_policy_of
 from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -64,7 +67,7 @@ def policy_of(name: str, spec: TaskSpec, seed: int, encoder: str | None = None) 
     names = {"oracle": (registry.DEMONSTRATOR,), "mixed": ("random", registry.DEMONSTRATOR)}.get(name, ("random",))
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=None,
-        seeds=SeedTree(seed).child("dataset", "agent"), optimal_action=spec.rules.optimal_action,
+        seeds=SeedTree(seed).child("dataset", "agent"), optimal_policy=optimal_policy_of(spec),
     )  # fmt: skip
     players = [(registry.make_agent(each, context), registry.agent_entry(each).privileged) for each in names]
     return Policy(name=name, players=players, facts={"played": POLICIES[name]})
@@ -106,7 +109,7 @@ def collect(
         names = [field.name for field in dataclasses.fields(ArmMotion)]
         apart["arm"] = {name: np.concatenate([getattr(each, name) for each in motion]) for name in names}
         apart["arm"]["samples"] = np.array([len(each.time_s) for each in motion])
-    made = {"seed": seed, "execution": execution, "appearance": appearance, "motion_hz": motion_hz}
+    made = {"seed": seed, "execution": execution, "appearance": appearance_name(appearance), "motion_hz": motion_hz}
     return played, apart, {**_card(spec, policy, played), **made, "faults": sum(part["faults"] for part in parts)}
 
 
@@ -130,6 +133,7 @@ def _episode(
 ) -> dict[str, Any]:
     """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""
     frame, info = env.reset(seed=seed, options=options)
+    begin_episode(player[0])
     mask, faults, ended = np.ones(int(env.action_space.n), dtype=np.int8), 0, False  # type: ignore[attr-defined]
     kept: dict[str, list[Any]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
     seen: dict[str, list[Any]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
@@ -138,8 +142,7 @@ def _episode(
             each.append(np.asarray(value))
         if ended:
             return {**seen, **kept, "success": bool(info["is_success"]), "faults": faults}
-        shown = kept["macrostates"][-1] if player[1] else None
-        action = player[0].act(Observation(frame=frame, macrostate=shown), explore=False)
+        action = player[0].act(Observation.of(frame, info, privileged=player[1]), explore=False)
         frame, reward, terminated, truncated, info = env.step(action)
         watch()
         truncated = truncated or (options is not None and not terminated)

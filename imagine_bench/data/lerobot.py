@@ -152,11 +152,15 @@ def _info(episodes: Episodes) -> dict[str, Any]:
 def read(path: Path) -> Episodes:
     """Read such a dataset from its ``info.json``. Raises ArtefactError: damaged, not whole, or not of our columns."""
     info, folder = read_json(path, "the metadata of a LeRobot dataset"), path.parents[1]
-    with reading(folder / _FINAL, "the last frames of episodes"):
-        ends = pq.read_table(folder / _FINAL)
     with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
         if info["codebase_version"] != _VERSION:
             raise InvalidValueError(f"it is of version {info['codebase_version']}")
+        lacks = [name for name in (*_TYPES, _MASK, _IMAGE) if name not in info["features"]]
+        if lacks:
+            raise InvalidValueError(f"it has no {lacks[0]}, which 'imagine-bench dataset' writes")
+    with reading(folder / _FINAL, "the last frames of episodes"):
+        ends = pq.read_table(folder / _FINAL)
+    with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
         table = pa.concat_tables(map(pq.read_table, sorted(folder.glob("data/*/*.parquet"))))
         column = {name: table[name].to_numpy() for name in _TYPES}
         lengths = np.bincount(column[_EPISODE], minlength=len(ends))

@@ -1,15 +1,18 @@
 """Why an agent failed a test episode: truth is swapped in, one stage at a time, until the episode is solved.
 
-What the agent saw is made right first, then its plan, then what its model says of transitions that it never
-experienced, then all of its model, then physics. Each stage keeps the truth of those before it. The first stage that
-solves the episode names its cause; where none does, an optimal policy would have failed too. So every failure has
-exactly one cause. A policy cannot be learned anew in a model that was made right; so the plan comes before the model:
-where perfect planning in the agent's own model solves the episode, that model was right enough.
+What no optimal policy would have solved with the same draws of chance was bad luck. Of all else, what the agent saw is
+made right first, then its plan, then what its model says of transitions that it never experienced, then all of its
+model, then physics. Each stage keeps the truth of those before it, and the first that solves the episode names its
+cause; the last is the optimal policy, which does. So every failure has exactly one cause. A policy cannot be learned
+anew in a model that was made right; so the plan comes before the model: where perfect planning in the agent's own model
+solves the episode, that model was right enough. Nor can an agent that reads no frame of a macrostate right be asked
+about it: what is best there stands for what it would do, and the truth for what its model says.
 
 An agent without a model has, in its place, what it experienced: true where it was, and nothing elsewhere.
 
 An episode is lived again by the rules. Where a stage does in a step what the agent did there, the same happens, faults
-of physics included; where it does something else, chance decides with the same uniform number.
+of physics included. Else a uniform number decides among the outcomes, as in an environment: in every step the one that
+decided then, as far as what happened tells where it lay. So whoever slips in a step slips there whatever they do.
 
 Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizon.
 """
@@ -23,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor
+from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, SeedTree
@@ -96,6 +99,7 @@ def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator,
     for row, state in enumerate(states):
         if not rules.is_terminal(state):
             seen = Observation(frame=frames[row], macrostate=np.array(state) if privileged else None)
+            begin_episode(agent)
             action[row] = agent.act(seen, explore=False)
     model = agent.predict_outcomes(frames, rng) if isinstance(agent, OutcomePredictor) else None
     if model is not None:
@@ -111,30 +115,49 @@ class Attribution:
         spec: The task.
         held: What the agent does and expects.
         tried: Macrostate and macro-action of everything that it had experienced. Shape (pairs, M + 1).
+        readable: Macrostates of which it reads some frame right; those that end episodes do not matter. Shape (S,).
     """
 
-    def __init__(self, spec: TaskSpec, held: Beliefs, tried: NDArray[np.int64]) -> None:
+    def __init__(self, spec: TaskSpec, held: Beliefs, tried: NDArray[np.int64], readable: NDArray[np.bool_]) -> None:
         self._rules, self._horizon, self._held = spec.rules, spec.horizon, held
         self._rows = {state: row for row, state in enumerate(states_of(spec.rules))}
         truth = true_model(spec.rules)
         known = np.zeros(truth.reward.shape, dtype=np.bool_)
         for *state, action in tried.tolist():
-            known[self._rows[tuple(state)], action] = True
-        nothing = Model(truth.following, np.zeros_like(truth.p_continues), np.full_like(truth.reward, _NOWHERE))
-        own = _mixed(known, truth, nothing) if held.model is None else self._own(held.model)
+            if (row := self._rows.get(tuple(state))) is not None:  # physics can leave a scene that is no macrostate
+                known[row, action] = True
+        if held.model is None:
+            nothing = Model(truth.following, np.zeros_like(truth.p_continues), np.full_like(truth.reward, _NOWHERE))
+            own = _mixed(known, truth, nothing)
+        else:
+            own = _mixed(np.broadcast_to(readable[:, None], known.shape), self._own(held.model), truth)
+        self._best = self._plan(truth)
         self._stages = (
-            ("planning" if held.model else "values", self._plan(own), True),
-            ("unexperienced", self._plan(_mixed(known, own, truth)), True),
-            ("model", self._plan(truth), True),
-            ("fault", self._plan(truth), False),
-        )
+            ("misread", self._best | readable[:, None]),
+            ("planning" if held.model else "values", self._plan(own)),
+            ("unexperienced", self._plan(_mixed(known, own, truth))),
+            ("model", self._best),
+        )  # and "fault": the best plan, without faults
 
     def cause(self, course: Course) -> str:
         """One of :data:`CAUSES`."""
-        if any(course.misread) and self._solves(course, None, faults=True):
-            return "misread"
-        found = (name for name, plan, faults in self._stages if self._solves(course, plan, faults=faults))
-        return next(found, "unlucky")
+        drawn = self._drawn(course)
+        if not self._solves(course, drawn, self._best, faults=False):
+            return "unlucky"
+        for name, plan in self._stages[0 if any(course.misread) else 1 :]:
+            if self._solves(course, drawn, plan, faults=True):
+                return name
+        return "fault"
+
+    def _drawn(self, course: Course) -> list[float]:
+        """The uniform number of each step until the horizon."""
+        rng = np.random.default_rng(course.seed)
+        drawn: list[float] = rng.random(self._horizon).tolist()
+        for step, (state, action) in enumerate(zip(course.states, course.actions, strict=False)):
+            if state in self._rows and not course.faults[step]:
+                before, probability = _place(self._rules.outcomes(state, action), course.states[step + 1])
+                drawn[step] = before + probability * drawn[step]
+        return drawn
 
     def _own(self, model: ExpectedOutcomes) -> Model:
         flat = map(tuple, model.macrostates.reshape(-1, model.macrostates.shape[-1]).tolist())
@@ -150,30 +173,25 @@ class Attribution:
             best.append(q >= (value[:-1] - _TIE * np.maximum(1.0, np.abs(value[:-1])))[:, None])
         return np.array(best)
 
-    def _solves(self, course: Course, plan: NDArray[np.bool_] | None, *, faults: bool) -> bool:
-        """Whether the episode succeeds where frames are read right and, if given, a plan is followed.
+    def _solves(self, course: Course, drawn: Sequence[float], plan: NDArray[np.bool_], *, faults: bool) -> bool:
+        """Whether the episode succeeds where frames are read right and a plan is followed.
 
         Among equals of the plan is what the agent does.
         """
-        state, rng = course.states[0], np.random.default_rng(course.seed)
-        drawn = rng.random(self._horizon).tolist()
+        state = course.states[0]
         for step in range(self._horizon):
             row, lived = self._rows.get(state, -1), step < len(course.actions) and state == course.states[step]
             if row < 0:
                 return False
             action = int(course.actions[step] if lived and not course.misread[step] else self._held.action[row])
-            if plan is not None and not plan[self._horizon - step - 1, row, action]:
+            if not plan[self._horizon - step - 1, row, action]:
                 action = int(plan[self._horizon - step - 1, row].argmax())
             if lived and action == course.actions[step] and (faults or not course.faults[step]):
                 if course.terminated and step + 1 == len(course.actions):
                     return False
                 state = course.states[step + 1]
                 continue
-            share = drawn[step]
-            if lived and not course.faults[step]:  # what happened tells where the number lay
-                before, probability = _place(self._rules.outcomes(state, course.actions[step]), course.states[step + 1])
-                share = before + probability * share
-            outcome = _at(self._rules.outcomes(state, action), share)
+            outcome = _at(self._rules.outcomes(state, action), drawn[step])
             if outcome.terminated:
                 return outcome.success
             state = outcome.macrostate

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, TaskSpec
 from imagine_bench.rules import evaluate, greedy, optimal_policy, states_of, tabulate
 from imagine_bench.seeding import Purpose, SeedTree
@@ -67,6 +68,7 @@ def action_shares(agent: Agent, states: EvalStates, n_actions: int, *, privilege
     for index, frames in enumerate(states.frames):
         for frame in frames:
             seen = Observation(frame=frame, macrostate=states.macrostates[index] if privileged else None)
+            begin_episode(agent)
             counts[agent.act(seen, explore=False), index] += 1.0
     return np.asarray(counts / counts.sum(axis=0))
 

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
+from imagine_bench.appearance import appearance_name
+from imagine_bench.certificates.splits import StartingFrom, split_of
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS, PhysicsSettings, appearance_of_tests
+from imagine_bench.interfaces import (
+    DEVICES,
+    EXECUTIONS,
+    FRAME_PX,
+    OBSERVATION_SIZES_PX,
+    OBSERVATIONS,
+    PhysicsSettings,
+    Rules,
+    TaskSpec,
+    appearance_of_tests,
+)
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
@@ -38,7 +50,7 @@ class Protocol(ProtocolData):
     budgets: tuple[int, ...] = (100, 250, 500)
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
-    appearance: str = "clean"  #: One of :data:`imagine_bench.interfaces.APPEARANCES`
+    appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
     #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
@@ -70,12 +82,18 @@ class Protocol(ProtocolData):
     #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
     #: (name, value) pairs.
     physics: tuple[tuple[str, Any], ...] = field(default=(), metadata=LATER)
+    #: What agents see: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
+    observation: str = field(default=OBSERVATIONS[0], metadata=LATER)
+    observation_size: int = field(default=FRAME_PX, metadata=LATER)  #: Edge of its images in pixels
+    #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
+    split: str | None = field(default=None, metadata=LATER)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        for appearance in (self.appearance, self.test_appearance or self.appearance):
-            require_known("appearance", appearance, APPEARANCES)
+        for name in ("appearance", "test_appearance"):
+            if (looks := getattr(self, name)) is not None:
+                object.__setattr__(self, name, appearance_name(looks))
         require_known("execution", self.execution, EXECUTIONS)
         require_known("device", self.device, DEVICES)
         require_ascending("budgets", self.budgets, at_least=1)
@@ -91,6 +109,7 @@ class Protocol(ProtocolData):
                 f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
             )
         self._require_physics()
+        self._require_observation()
         if self.dataset is not None and self.demonstrations:
             raise InvalidValueError("Both a dataset and demonstrations would come first; give one of them.")
         if not self.after and self.after_episodes != _AFTER_EPISODES:
@@ -111,7 +130,25 @@ class Protocol(ProtocolData):
         changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
         object.__setattr__(self, "physics", changed)
         if changed and self.execution == "kinematic":
-            raise InvalidValueError("Physics settings change nothing in kinematic execution; give --execution physics.")
+            raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
+
+    def _require_observation(self) -> None:
+        """One way to write each choice; errors for an unknown part, one that is given twice, or a size out of range."""
+        parts = tuple(self.observation.split(","))
+        for part in parts:
+            require_known("observation", part, OBSERVATIONS)
+        require_different("observation", parts)
+        object.__setattr__(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
+        low, high = OBSERVATION_SIZES_PX
+        if not low <= self.observation_size <= high:
+            raise InvalidValueError(f"observation_size is {brief(self.observation_size)}; give {low} to {high} pixels.")
+        if self.dataset is not None and not self.shows_frames_alone:
+            raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
+
+    @property
+    def shows_frames_alone(self) -> bool:
+        """Whether agents see 64 x 64 frames and nothing else."""
+        return (self.observation, self.observation_size) == (OBSERVATIONS[0], FRAME_PX)
 
     @property
     def appearance_in_tests(self) -> str:
@@ -121,13 +158,27 @@ class Protocol(ProtocolData):
     @property
     def world(self) -> dict[str, Any]:
         """What the environments of this protocol are made with, but for their appearance."""
-        return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {})}
+        seen = {} if self.shows_frames_alone else {"observation": self.observation, "size": self.observation_size}
+        return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {}), **seen}
+
+    def spec(self, *, testing: bool) -> TaskSpec:
+        """The task with the starts that training or tests have. Raises InvalidValueError: another split than here."""
+        spec = task(self.task)
+        if self.split is None:
+            return spec
+        found = split_of(spec.rules, self.split)
+        rules = StartingFrom(spec.rules, found.test if testing else found.train)
+        return dataclasses.replace(spec, rules=cast("Rules", rules))
 
     @property
     def looks(self) -> str:
-        """The appearance in words: ``clean``, or ``clean, tested at strong``."""
+        """The appearance in words: ``clean``, or ``clean, tested at strong``; and what agents see beside frames."""
         other = self.test_appearance not in (None, self.appearance)
-        return f"{self.appearance}, tested at {self.test_appearance}" if other else self.appearance
+        words = [self.appearance, *([f"tested at {self.test_appearance}"] if other else [])]
+        if not self.shows_frames_alone:
+            privileged = " (privileged)" if "state" in self.observation else ""
+            words.append(f"agents see {self.observation} at {self.observation_size} pixels{privileged}")
+        return ", ".join(words)
 
     @property
     def episodes_before(self) -> int:
@@ -186,12 +237,27 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
+    values["execution"] = spec.execution(values.get("execution"))
     values["after"] = tuple(map(canonical, values.get("after", ())))
+    if values.get("split") is not None:
+        values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
     for agent in wanted.agents:  # what is only read may be of a package that is not here
-        agent_entry(agent)
+        _require_takes(agent, wanted)
     require_same_world(wanted.task, wanted.after)
     return wanted
+
+
+def _require_takes(agent: str, wanted: Protocol) -> None:
+    """Raise InvalidValueError for an agent that cannot take what is observed, or UnknownNameError."""
+    takes = agent_entry(agent).observes
+    if not wanted.shows_frames_alone and not takes:
+        raise InvalidValueError(
+            f"Agent {agent!r} takes 64 x 64 frames alone; leave it out, or leave the observation as it is by default."
+        )
+    for part in wanted.observation.split(",") if takes else ():
+        if part not in takes:
+            raise InvalidValueError(f"Agent {agent!r} takes {', '.join(takes)}, but not {part}; leave one of them out.")
 
 
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:

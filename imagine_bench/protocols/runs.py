@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from imagine_bench import registry
-from imagine_bench.interfaces import AgentContext
+from imagine_bench.certificates.beliefs import optimal_policy_of
+from imagine_bench.interfaces import PROPRIO_SIZE, AgentContext, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.seeding import SeedTree
@@ -48,8 +49,14 @@ class RunSpec(Generic[P_co]):
             hyperparameters=protocol.hyperparameters,
             overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,
-            optimal_action=task.rules.optimal_action if entry.privileged else None,
+            optimal_policy=optimal_policy_of(task) if entry.privileged else None,
+            observation={part: _shape(part, task, protocol) for part in protocol.observation.split(",")},
         )
+
+
+def _shape(part: str, task: TaskSpec, protocol: Protocol) -> tuple[int, ...]:
+    vectors = {"state": sum(map(len, task.macrostate_values)), "proprio": PROPRIO_SIZE}
+    return (vectors[part],) if part in vectors else (protocol.observation_size, protocol.observation_size, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +65,7 @@ class Progress:
 
     agent: str  #: Registered agent
     seed: int  #: The run's seed
+    bench: str = ""  #: Hash of the run's protocol
     phase: Phase  #: What it is doing
     done: int  #: Episodes played, for training and for tests
     work: int  #: Episodes to play

@@ -6,7 +6,7 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, ValueReader
+from imagine_bench.capabilities import Imaginer, ValueReader, begin_episode
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
@@ -41,40 +41,36 @@ def record_run(
     *,
     name: str,
     seed: int,
-    world: Mapping[str, Any],
+    env: gymnasium.Env[Any, Any],
     appearance: str,
     episodes: int,
     path: Path,
 ) -> Path:
     """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
 
-    ``world`` is what the task's environment is made with, as :attr:`.Protocol.world`; nothing changes in the agent,
-    registered as ``name``. The episodes' seeds follow from the run's and are used for
-    nothing else. ``path``, which is returned, ends in ``.rrd``; until complete it is called ``<stem>.partial.rrd``.
+    ``env`` is the task's at ``appearance``, and stays open; nothing changes in the agent, registered as ``name``. The
+    episodes' seeds follow from the run's and are used for nothing else. ``path``, which is returned, ends in ``.rrd``;
+    until complete it is called ``<stem>.partial.rrd``.
 
     Raises:
-        UnknownNameError: Unknown task, agent, execution or appearance.
+        UnknownNameError: Unknown task or agent.
         SetupError: The folder cannot be written.
     """
     spec, entry = registry.task(task), registry.agent_entry(name)
     make_folder(path.parent)
-    env = gymnasium.make(spec.env_id, **world, appearance=appearance)
-    try:
-        scene = env.unwrapped
+    scene = env.unwrapped
+    if isinstance(scene, SceneReader):
+        scene.capture_motion_hz = MOTION_HZ
+    env.reset(seed=episode_seed("recording", seed, 1))
+    values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
+    several = imagines and is_random(spec.rules)
+    layout = blueprint(target_m=look_target_m(scene), values=values, imagines=imagines, several=several)
+    with recording_file(path, task, layout) as recording:
+        recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
         if isinstance(scene, SceneReader):
-            scene.capture_motion_hz = MOTION_HZ
-        env.reset(seed=episode_seed("recording", seed, 1))
-        values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
-        several = imagines and is_random(spec.rules)
-        layout = blueprint(target_m=look_target_m(scene), values=values, imagines=imagines, several=several)
-        with recording_file(path, task, layout) as recording:
-            recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
-            if isinstance(scene, SceneReader):
-                log_shapes(recording, scene.shapes())
-            for episode in range(1, episodes + 1):
-                recorder.record(env, episode)
-    finally:
-        env.close()
+            log_shapes(recording, scene.shapes())
+        for episode in range(1, episodes + 1):
+            recorder.record(env, episode)
     return path
 
 
@@ -102,24 +98,24 @@ class _EpisodeRecorder:
         self._privileged, self._seed = privileged, seed
         self._clock_s, self._env_step = 0.0, -1
 
-    def record(self, env: gymnasium.Env[Frame, np.int64], episode: int) -> None:
+    def record(self, env: gymnasium.Env[Any, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
-        frame, info = env.reset(seed=episode_seed("recording", self._seed, episode))
+        seen, info = env.reset(seed=episode_seed("recording", self._seed, episode))
+        begin_episode(self._agent)
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
             self._recording.stream.set_time("imagined_depth", sequence=0)
-        self._log_frame(env.unwrapped, episode, frame)
+        observation = self._log_frame(env.unwrapped, episode, seen, info)
         done, step, heading = False, 0, f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
-            observation = Observation(frame=frame, macrostate=macrostate if self._privileged else None)
             action = int(self._agent.act(observation, explore=False))
             self._describe(heading, macrostate, f"Next: {self._spec.action_names[action]}.")
             self._log_values(observation, action)
             self._recording.stream.disable_timeline("imagined_depth")
-            self._log_imagination(frame, macrostate, episode, step)
-            frame, reward, terminated, truncated, info = env.step(np.int64(action))
+            self._log_imagination(observation.frame, macrostate, episode, step)
+            seen, reward, terminated, truncated, info = env.step(np.int64(action))
             self._clock_s += macro_duration_s(env.unwrapped)
-            self._log_frame(env.unwrapped, episode, frame)
+            observation = self._log_frame(env.unwrapped, episode, seen, info)
             self._recording.scalar("/real/reward", float(reward))
             done, step = terminated or truncated, step + 1
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
@@ -129,8 +125,10 @@ class _EpisodeRecorder:
         self._clear_predictions()
         self._clock_s += _STILL_S
 
-    def _log_frame(self, scene: Any, episode: int, frame: Frame) -> None:
-        """A new real frame: set the clocks, show it and how the scene stands."""
+    def _log_frame(self, scene: Any, episode: int, seen: Any, info: dict[str, Any]) -> Observation:
+        """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
+        observation = Observation.of(seen, info, privileged=self._privileged)
+        frame = observation.frame if observation.frame.size else scene.agent_view()
         self._env_step += 1
         sequences = {"env_step": self._env_step, "episode": episode}
         self._recording.set_clocks(self._clock_s, **sequences)
@@ -139,6 +137,7 @@ class _EpisodeRecorder:
             if self._env_step == 0:
                 sequences["imagined_depth"] = 0
             log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
+        return observation
 
     def _describe(self, heading: str, macrostate: NDArray[np.int64], last: str) -> None:
         """What has happened, what the frame shows, what comes next."""

@@ -15,6 +15,7 @@ import rerun.blueprint as rrb
 from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.judge.models.study import Judgement, shown
+from imagine_bench.judge.models.trained import model_entry
 from imagine_bench.recording.stream import recording_file
 
 
@@ -29,7 +30,7 @@ def record_judgement(folder: Path, judgement: Judgement) -> Path | None:
     one = next(iter(found.values()))
     strips = {"real": ("the truth", one["futures_before"], one["futures_real"][0], one["futures"]["real"])}
     for model, each in found.items():
-        title = registry.world_model_entry(model).title
+        title = model_entry(model).title
         strips[file_name(model)] = (
             title,
             each["futures_before"],

@@ -160,5 +160,8 @@ class _Run:
 
     def _report(self, phase: Phase, detail: str, done: int) -> None:
         done = min((_SLICES + _MEASURING) * len(self.evaluations) + done, self.spec.work)
-        agent, seed, work = self.spec.agent, self.spec.seed, self.spec.work
-        self.on_progress(Progress(agent=agent, seed=seed, phase=phase, done=done, work=work, detail=detail))
+        spec, bench = self.spec, self.protocol.hash
+        where = Progress(
+            agent=spec.agent, seed=spec.seed, bench=bench, phase=phase, done=done, work=spec.work, detail=detail
+        )
+        self.on_progress(where)

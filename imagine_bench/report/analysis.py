@@ -8,14 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from imagine_bench import registry
 from imagine_bench.bench.progress import counted
-from imagine_bench.errors import ArtefactError, require_known
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.filmstrips import png
 from imagine_bench.machine import describe_environment
 from imagine_bench.protocols.task_types import task_type
 from imagine_bench.report.text import agent_words, origin
@@ -67,8 +62,8 @@ class Analysis(ABC, Generic[Value]):
         self.spec = spec
 
     @abstractmethod
-    def measure(self, trained: Trained) -> Value | None:
-        """Measure one agent, which is not changed; None where it has nothing to measure."""
+    def measure(self, trained: Trained) -> Value:
+        """Measure one agent, which is not changed."""
 
     @abstractmethod
     def table(self, runs: Sequence[Measured[Value]]) -> str:
@@ -82,12 +77,8 @@ class Analysis(ABC, Generic[Value]):
     def summary(self, value: Value) -> dict[str, Any]:
         """One run in a few numbers."""
 
-    def figure(self, runs: Sequence[Measured[Value]]) -> tuple[NDArray[np.uint8], str] | None:
-        """An image (height, width, 3) and what it shows; None where there is nothing to see."""
-        return None
-
     def write(self, folder: Path, runs: Sequence[Measured[Value]], provenance: dict[str, Any]) -> None:
-        """Write all rows, ``summary.json``, ``<name>.md`` and ``<name>.png`` if there is a figure.
+        """Write all rows, ``summary.json`` and ``<name>.md``.
 
         Raises:
             SetupError: The folder cannot be written.
@@ -96,11 +87,7 @@ class Analysis(ABC, Generic[Value]):
         write_bytes(folder / self.rows_file, csv_text(self.rows(runs)).encode())
         summaries = [{**run.head, **self.summary(run.value)} for run in runs]
         write_json(folder / "summary.json", {**provenance, "runs": with_null(summaries)})
-        shown, figure = "", self.figure(runs)
-        if figure is not None:
-            write_bytes(folder / f"{self.name}.png", png(figure[0]))
-            shown = f"![{figure[1]}]({self.name}.png)\n\n"
-        page = f"# {self.spec.title}: {self.heading}\n\n{self.table(runs)}\n\n{shown}{origin(provenance)}\n"
+        page = f"# {self.spec.title}: {self.heading}\n\n{self.table(runs)}\n\n{origin(provenance)}\n"
         write_bytes(folder / f"{self.name}.md", page.encode())
 
 
@@ -112,38 +99,29 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]
 
 def analyse(
     analysis: type[Analysis[Value]], folder: Path | None, *, root: Path, task: str | None, encoder: str | None,
-    overrides: Sequence[tuple[str, Any]] = (),
 ) -> str:  # fmt: skip
     """Measure every learner of a bench, and leave the analysis in its folder.
 
     An unfinished bench will do: every run is measured as its last checkpoint left it. The bench is as in
-    :func:`chosen`, ``encoder`` and ``overrides`` are as in :func:`imagine_bench.store.trained.load_trained`; what was
-    measured with overrides has a folder of its own. Returns what to print.
+    :func:`chosen`, ``encoder`` is as in :func:`imagine_bench.store.trained.load_trained`. Returns what to print.
 
     Raises:
-        ImagineBenchError: No bench, or none with an agent that can be taken up again and has something to measure.
+        ImagineBenchError: No bench, or none with an agent that can be taken up again.
         BusyError: Another process is at the same analysis.
         SetupError: The bench's folder cannot be written.
     """
     bench = chosen(folder, root, task)
     protocol = protocol_of_agents(bench)
-    for name, _ in overrides:
-        require_known("setting", name, {name for agent in protocol.agents for name in registry.setting_names(agent)})
-    where = bench / "-".join([analysis.name, *(f"{name}={value}" for name, value in overrides)]).replace("/", "_")
+    where = bench / analysis.name
     with lock(bench / f".{where.name}.lock", f"The folder {where}"):
         spec, appearance, folders = registry.task(protocol.task), protocol.appearance_in_tests, learners(bench)
         found = analysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         runs = []
         for run in counted(folders, "runs", total=len(folders)):
-            trained = load_trained(run, encoder=encoder, overrides=overrides)
-            value = found.measure(trained)
-            if value is not None:
-                name, seed = trained.spec.agent, trained.spec.seed
-                runs.append(Measured(agent=name, seed=seed, episodes=trained.episodes, value=value))
-        if not runs:
-            raise ArtefactError(f"No agent of {bench} imagines; give a bench with one that does.")
-        settings = {"settings": dict(overrides)} if overrides else {}
-        facts = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic", **settings}
+            trained = load_trained(run, encoder=encoder)
+            name, seed, value = trained.spec.agent, trained.spec.seed, found.measure(trained)
+            runs.append(Measured(agent=name, seed=seed, episodes=trained.episodes, value=value))
+        facts = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic"}
         found.write(where, runs, facts)
     return f"{spec.title}, {appearance}\n\n{found.table(runs)}\n\nAll rows:   {where / found.rows_file}"
 

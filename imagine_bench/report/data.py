@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator
@@ -162,6 +163,9 @@ def collect(result: BenchResult) -> ReportData:
     """Compute a report's numbers."""
     spec = known_task(result.protocol.task)
     facts, agents, is_here = spec.facts(), result.protocol.agents, bool(spec.action_names)
+    if (known := result.certificate) is not None:  # what is hidden or late counts there, and the tests' own starts
+        exact = {name: getattr(known, name) for name in ("chance_level", "optimum", "optimal_return")}
+        facts = dataclasses.replace(facts, **exact)
     learners = [agent for agent in agents if known_agent(agent).learns and is_here]
     thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in agents}
     thesis_gains = {agent: reference.gain(spec.reference, agent) if spec.reference else {} for agent in agents}

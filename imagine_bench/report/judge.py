@@ -6,36 +6,95 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
+from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, shown
+from imagine_bench.judge.models.trained import is_run, model_entry
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
 from imagine_bench.report.sections import Cell as TableCell
+from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, interval, iqm
 from imagine_bench.store.files import csv_text, read_json
 
-COLUMNS = {
-    "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps", "missed": "missed outcomes",
-    "invented": "invented", "nothing": "no picture", "outcome_ece": "calibration error", "outcome_brier": "Brier",
-    "reward_error": "reward error", "end_error": "end error", "value_loss": "value loss", "regret": "regret of 1 of 5",
-    "auroc_epistemic": "AUROC, wrong", "auroc_never": "AUROC, never seen", "worth_of_refusing": "worth of refusing",
-    "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
-    "encoder_frames": "frames beforehand",
+QUESTIONS = {
+    "Which outcomes, how likely?": {
+        "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps",
+        "after_the_end": "after the end", "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
+        "outcome_ece": "calibration error", "outcome_brier": "Brier", "reward_error": "reward error",
+        "reward_ece": "its calibration", "reward_brier": "its Brier", "end_error": "end error",
+        "end_ece": "its calibration", "end_brier": "its Brier",
+    },
+    "What do mistakes cost?": {
+        "value_loss": "value loss", "worst_value_loss": "from the worst start", "regret": "regret of 1 of 5",
+    },
+    "Does it know?": {
+        "auroc_wrong": "AUROC, wrong", "auroc_never": "never seen", "auroc_either": "either",
+        "auroc_after_the_end": "after the end", "auroc_noisy": "aleatoric, noisy", "auroc_several": "modal, several",
+        "filter_keeps": "its filter keeps",
+        "filter_error": "error of that", "filter_skill": "skill of its threshold", "best_skill": "of the best one",
+        "worth_of_refusing": "worth of refusing", "worth_of_filter": "worth of its filter",
+    },
+    "Does it notice?": {
+        "notice_slip": "transitions until a slip", "notice_coupling": "until a coupling",
+        "counterfactual": "counterfactuals wrong",
+    },
+    "What does it cost?": {
+        "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
+        "encoder_frames": "frames beforehand",
+    },
 }  # fmt: skip
-SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "regret", "auroc_epistemic", "fit_s")
+"""Scores by question: what a column of theirs is called."""
+COLUMNS = {name: words for columns in QUESTIONS.values() for name, words in columns.items()}
+_WORDS = {
+    "Which outcomes, how likely?": "Total variation to the exact distribution, 0 for equal ones and 1 for those that "
+    "share nothing, also of transitions after the end of an episode, which no data contains; missed and invented "
+    "outcomes a transition; the share of pictures that show nothing of this world. A reward counts as the nearest that "
+    "the rules give.",
+    "What do mistakes cost?": "V* - V of the policy that is optimal in the model, mean over starts, and the exact "
+    "return that the sequence ranked first of five leaves to the best. In units of reward.",
+    "Does it know?": "AUROC of the epistemic uncertainty for transitions imagined wrongly, never seen in the data, or "
+    "either, and for those after the end; of the aleatoric for random ones; of the modal for several outcomes. Skill: "
+    "the share of wrong ones that a filter discards, less that of right ones. Worth: reward a start that planning "
+    "gains without the macro-actions it knows least of (the best share, chosen with the truth), and without those that "
+    "its own filter discards.",
+    "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
+    f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
+    f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: what it imagines of two macro-actions with the "
+    "same draws that cannot both be.",
+    "What does it cost?": "On one core. What was spent on an encoder beforehand is in frames.",
+}
+SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
-_SHARES = {"total_variation", "tv_5", "tv_10", "nothing", "outcome_ece", "end_error", "auroc_epistemic", "auroc_never"}
+_SHARES = {
+    *(
+        "total_variation",
+        "tv_5",
+        "tv_10",
+        "after_the_end",
+        "nothing",
+        "outcome_ece",
+        "reward_ece",
+        "end_error",
+        "end_ece",
+    ),
+    *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
+    *(name for name in COLUMNS if name.startswith("auroc")),
+}
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
 _WHOLE = 1_000  # from here on no decimals are shown
 _TELLING = 0.1  # total variation
@@ -50,7 +109,7 @@ def judgement_report(folder: Path, judgement: Judgement) -> str:
     cells = by_model(kept(folder, judgement))
     page = write_page(folder / "report", _page(folder, judgement, cells))
     head = ["world model", "transitions", *(COLUMNS[name] for name in SHORT)]
-    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT)]
+    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT, judgement.sizes)]
     return "\n".join([*aligned([head, *rows]), "", f"Report: {page}"])
 
 
@@ -79,18 +138,23 @@ def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
     return TableCell(text=f"{value:,.0f}" if value >= _WHOLE else number(value), interval=shown)
 
 
+def _size(model: str, size: int) -> str:
+    """The transitions that it learned from here; a trained agent's own are its bench's to say."""
+    return DASH if is_run(model) else f"{size:,}"
+
+
 def _title(model: str) -> str:
-    return registry.world_model_entry(model).title
+    return model_entry(model).title
 
 
-def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list[Any]]:
+def _rows(judgement: Judgement, cells: Cells, names: Sequence[str], sizes: Sequence[int]) -> list[list[Any]]:
     return [
         [
             _title(model),
-            f"{size:,}",
+            _size(model, size),
             *(mean_cell(scores(cells[model, size], name), share=name in _SHARES) for name in names),
         ]
-        for model, size in itertools.product(judgement.models, judgement.sizes)
+        for model, size in itertools.product(judgement.models, sizes)
         if (model, size) in cells
     ]
 
@@ -98,27 +162,25 @@ def _rows(judgement: Judgement, cells: Cells, names: Sequence[str]) -> list[list
 def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     spec = registry.task(judgement.task)
     made = read_json(folder / "judgement.json", "a judgement")
-    errors = read_json(folder / "reader.json", "a reader's errors")
-    pictures = shown(folder, judgement)
-    largest = [model for model in judgement.models if (model, judgement.sizes[-1]) in cells]
-    table = Table(
-        name="judgement", header=["world model", "transitions", *COLUMNS.values()], why_dash=_WHY_DASH,
-        rows=_rows(judgement, cells, tuple(COLUMNS)),
+    pictures, last = shown(folder, judgement), judgement.sizes[-1:]
+    largest = [model for model in judgement.models if (model, *last) in cells]
+    short = Table(
+        name="short", header=["world model", "transitions", *(COLUMNS[name] for name in SHORT)], why_dash=_WHY_DASH,
+        rows=_rows(judgement, cells, SHORT, last),
         caption=f"Interquartile means over {len(judgement.seeds)} seeds of data and model, with 95 % intervals. 0 is "
-        "best in every error; value loss, regret and worth are in units of reward.",
+        "best in every error; value loss is in units of reward.",
     )  # fmt: skip
-    words = [
-        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
-        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
-        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
-        "fog as something."
-    ]
+    images = [*_futures(judgement, pictures), *_risk_images(judgement, cells, largest)]
+    by_question = {title: _question_section(title, judgement, cells) for title in QUESTIONS}
+    outcomes, costs, *others = by_question.values()
     sections = [
-        Section(title="Every score", words=words, tables=[table], images=_futures(judgement, pictures)),
-        Section(title="Does it know?", images=[_risk_image(judgement, cells, largest)]),
-        Section(title="By depth", images=[_depth_image(judgement, cells, largest)]),
-        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
+        Section(title="In short", words=[_reader_words(folder)], tables=[short], images=images),
+        Section(title="How much data does it need?", images=[_curve_image(judgement, cells)]),
+        replace(outcomes, images=[_depth_image(judgement, cells, largest)]),
+        replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
         _where_section(spec, judgement, cells, largest, pictures),
+        *others,
+        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
     ]
     return Page(
         title=f"{spec.title}: world models against the exact truth",
@@ -131,10 +193,47 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     )  # fmt: skip
 
 
+def _reader_words(folder: Path) -> str:
+    errors = read_json(folder / "reader.json", "a reader's errors")
+    return (
+        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
+        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
+        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
+        "fog as something."
+    )
+
+
+def _question_section(title: str, judgement: Judgement, cells: Cells) -> Section:
+    """The scores that answer one question, after every number of transitions."""
+    names = tuple(QUESTIONS[title])
+    table = Table(
+        name=title.lower().strip("?").replace(" ", "_").replace(",", ""), why_dash=_WHY_DASH,
+        header=["world model", "transitions", *QUESTIONS[title].values()],
+        rows=_rows(judgement, cells, names, judgement.sizes), folded="After every number of transitions",
+    )  # fmt: skip
+    return Section(title=title, words=[_WORDS[title]], tables=[table])
+
+
+def _by_start(spec: TaskSpec, judgement: Judgement, cells: Cells) -> Table:
+    """Value loss by the fewest macro-actions that a start needs, after every number of transitions."""
+    needs = [fewest_actions(spec.rules, state) for state in spec.rules.start_states]
+    rows: list[list[str | TableCell]] = []
+    for (model, size), each in cells.items():
+        losses = np.array([cell["value_loss_by_start"] for cell in each])  # [seeds, starts]
+        if losses.size:
+            groups = [losses[:, [need == n for need in needs]].mean(axis=1).tolist() for n in sorted(set(needs))]
+            rows.append([_title(model), _size(model, size), *map(mean_cell, groups)])
+    return Table(
+        name="value_loss_by_start", folded="By start", rows=rows,
+        header=["world model", "transitions", *(f"{n} ({needs.count(n)} starts)" for n in sorted(set(needs)))],
+        caption="Mean value loss from starts by the fewest macro-actions to a success.",
+    )  # fmt: skip
+
+
 def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[str]:
     """The best model that is given no rules, at the largest size."""
     last = judgement.sizes[-1]
-    learned = [model for model in models if not registry.world_model_entry(model).privileged]
+    learned = [model for model in models if not model_entry(model).privileged]
     if not learned:
         return []
     found = []
@@ -183,29 +282,64 @@ def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Tabl
 def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> Figure:
     figure = Figure(figsize=(9.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for (model, values), color in zip(series.items(), itertools.cycle(_COLORS)):
-        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
-    axes.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.03, 1.05))
+    _draw(axes, series, x, ylim=(-0.03, 1.05), xlabel=xlabel, ylabel=ylabel)
     axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
-def _risk_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
+def _draw(axes: Axes, series: Mapping[str, Sequence[float]], x: Sequence[float], **settings: Any) -> None:
+    """A line a model, each in the color that it has in every figure."""
+    places = {name: place for place, name in enumerate(registry.world_models())}
+    for model, values in series.items():
+        color = _COLORS[places.get(model, crc32(model.encode())) % len(_COLORS)]
+        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
+    axes.set(**settings)
+
+
+def _curve_image(judgement: Judgement, cells: Cells) -> Image:
+    """Two scores by the transitions that models learned from."""
+    shown_, sizes = {"total_variation": "total variation, 1 step", "value_loss": "value loss"}, list(judgement.sizes)
+
+    def draw() -> Figure:
+        figure = Figure(figsize=(9.2, 4.0), layout="constrained")
+        for axes, (name, label) in zip(figure.subplots(1, 2), shown_.items(), strict=True):
+            series = {
+                model: [float(np.mean(scores(cells[model, size], name))) if (model, size) in cells else math.nan
+                        for size in sizes]
+                for model in judgement.models
+            }  # fmt: skip
+            _draw(axes, series, sizes, xscale="log", xlabel="transitions of the same data", ylabel=label)
+            axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+            axes.minorticks_off()
+        figure.legend(*axes.get_legend_handles_labels(), fontsize=9, ncols=4, loc="outside lower center")
+        return figure
+
+    return image(
+        "curve", draw, svg=True, alt="Total variation and value loss by the number of transitions learned from",
+        caption="Mean over seeds. Every model learns from the same transitions.",
+    )  # fmt: skip
+
+
+def _risk_images(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[Image]:
+    """One figure, or none where no model is uncertain of anything."""
     size = _telling_size(judgement, cells, models)
     series = _risks(cells, models, size)
     shares = [100.0 * share for share in COVERAGES]
-    return image(
+    if not series:
+        return []
+    one = image(
         "risk_coverage",
         lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
         alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
         caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
         f"uncertainty are not here. After {size:,} transitions, where most of them still err, mean over seeds.",
     )  # fmt: skip
+    return [one]
 
 
 def _risks(cells: Cells, models: Sequence[str], size: int) -> dict[str, list[float]]:
     """Mean risk by coverage of each model that learned and says how sure it is."""
-    own = {model: cells.get((model, size), ()) for model in models if not registry.world_model_entry(model).privileged}
+    own = {model: cells.get((model, size), ()) for model in models if not model_entry(model).privileged}
     curves = {model: [cell["risk"] for cell in each if cell["risk"]] for model, each in own.items()}
     return {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
 
@@ -215,7 +349,7 @@ def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> 
     for size in judgement.sizes[::-1]:
         if sum(curve[-1] > _TELLING for curve in _risks(cells, models, size).values()) > 1:
             return size
-    return judgement.sizes[0]
+    return next((size for size in judgement.sizes if _risks(cells, models, size)), judgement.sizes[0])
 
 
 def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
@@ -241,14 +375,30 @@ def _futures(judgement: Judgement, found: Pictures) -> list[Image]:
     for model, arrays in found.items():
         rows.append((_title(model), [start, *map(_rgb, arrays["futures_imagined"][0])],
                      [True, *arrays["futures_right"][0].tolist()]))  # fmt: skip
-    return [
-        Image.of(
-            png(transition_sheet(titles, rows)),
-            name="futures",
-            alt="One future, real and imagined by every model",
-            caption="One real start and the same macro-actions, real and as each model imagines them.",
+    caption = "One real start and the same macro-actions, real and as each model imagines them."
+    return [_sheet("futures", titles, rows, "One future, real and imagined by every model", caption)]
+
+
+def _after_the_end(spec: TaskSpec, found: Pictures) -> list[Image]:
+    """A few transitions that no training contains, real and as each model imagines them (thesis' figure 5.9)."""
+    there = {model: arrays for model, arrays in found.items() if "after_before" in arrays}
+    if not there:
+        return []
+    one = next(iter(there.values()))
+    rows: list[tuple[str, Any, Any]] = [
+        ("before", list(one["after_before"]), None), ("real", list(one["after_real"][:, 0]), None)
+    ]  # fmt: skip
+    for model, arrays in there.items():
+        rows.append(
+            (_title(model), list(map(_rgb, arrays["after_imagined"][:, 0])), arrays["after_right"][:, 0].tolist())
         )
-    ]
+    titles = [spec.action_names[action] for action in one["after_actions"][:, 0]]
+    caption = "Macro-actions after the end of an episode, which no data contains."
+    return [_sheet("after_the_end", titles, rows, "Transitions after the end, real and imagined", caption)]
+
+
+def _sheet(name: str, titles: Sequence[str], rows: list[tuple[str, Any, Any]], alt: str, caption: str) -> Image:
+    return Image.of(png(transition_sheet(titles, rows)), name=name, alt=alt, caption=caption)
 
 
 def _where_section(
@@ -277,10 +427,9 @@ def _where_section(
                 ("before", list(arrays["worst_before"]), None), ("real", list(arrays["worst_real"][:, 0]), None),
                 ("imagined", list(map(_rgb, arrays["worst_imagined"][:, 0])), arrays["worst_right"][:, 0].tolist()),
             ]  # fmt: skip
-            name = f"worst_{file_name(model)}"
-            images.append(Image.of(png(transition_sheet(titles, strips)), name=name, alt=f"Worst of {_title(model)}",
-                                   caption=f"The ten worst transitions of {_title(model)}."))  # fmt: skip
-    return Section(title="Where it fails", tables=[table], images=images)
+            caption = f"The ten worst transitions of {_title(model)}."
+            images.append(_sheet(f"worst_{file_name(model)}", titles, strips, f"Worst of {_title(model)}", caption))
+    return Section(title="Where it fails", tables=[table], images=[*images, *_after_the_end(spec, pictures)])
 
 
 def _rgb(picture: Any) -> Any:

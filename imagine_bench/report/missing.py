@@ -33,14 +33,22 @@ def known_task(name: str) -> TaskSpec:
         )  # fmt: skip
 
 
-def missing(protocol: ProtocolData) -> str:
-    """One sentence on what is not installed here and therefore not shown; empty where everything is."""
+def missing(protocol: ProtocolData, *, certified: bool) -> str:
+    """One sentence on what is not installed here and therefore not shown; empty where everything is.
+
+    Where the bench keeps the certificate of its world (``certified``), chance level and optimum are shown.
+    """
     agents = [agent for agent in protocol.agents if not known_agent(agent).make]
     unshown = ["what they are"] if agents else []
     names = [f"agent {name}" for name in agents]
     if not known_task(protocol.task).action_names:
         names = [f"task {protocol.task}", *names]
-        unshown = ["chance level", "optimum", "areas", "imagined futures and rollouts", *unshown]
+        unshown = [
+            *([] if certified else ["chance level", "optimum"]),
+            "areas",
+            "imagined futures and rollouts",
+            *unshown,
+        ]
     return f"Not installed here: {', '.join(names)}. Not shown therefore: {', '.join(unshown)}." if names else ""
 
 

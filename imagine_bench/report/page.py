@@ -11,7 +11,7 @@ import jinja2
 
 from imagine_bench.report import plots, text
 from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
-from imagine_bench.report.sections import Page, Section, causes, imagination, success
+from imagine_bench.report.sections import Page, Section, causes, certificate, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, sweep, write_bytes
@@ -54,6 +54,7 @@ def report_page(result: BenchResult) -> Page:
 
 def _sections(data: ReportData) -> list[Section]:
     parts = [success.compared(data), success.success(data, _interval_words(data))]
+    parts += [certificate.world(data.result.certificate)] if data.result.certificate is not None else []
     parts += [success.area(data)] if data.areas else []
     parts += [success.gain(data)] if data.comparisons else []
     parts += [causes.causes(found)] if (found := causes.read_failures(data.result.folder)) else []
@@ -119,7 +120,7 @@ def summary_table(result: BenchResult) -> str:
         f"{protocol.evaluation_episodes} test episodes"
         f"{f'; trained first on dataset {protocol.dataset}' if protocol.dataset else ''}"
     )
-    return "\n".join([title, "", *aligned(rows), "", *text.answers(data)])
+    return "\n".join([title, "", *aligned(rows), "", *text.paired_answers(data), "", *text.answers(data)])
 
 
 def _thesis_row(data: ReportData, budget: int, name: str) -> list[str]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
 from imagine_bench.bench.progress import counted
-from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.interfaces import EXECUTIONS, TaskSpec
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, png
 from imagine_bench.judge.plans import Plan, make_plans, require_threshold
 from imagine_bench.report.analysis import chosen, markdown, provenance
@@ -36,7 +36,7 @@ Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.pl
 
 
 def plan_report(
-    run: Path | None, *, root: Path, task: str | None, count: int, execution: str, max_epistemic: float | None,
+    run: Path | None, *, root: Path, task: str | None, count: int, execution: str | None, max_epistemic: float | None,
     encoder: str | None, recorded: int = 0, record: Record | None = None,
 ) -> str:  # fmt: skip
     """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
@@ -50,7 +50,6 @@ def plan_report(
         ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
         BusyError: Another process makes the same plans.
     """
-    require_known("execution", execution, EXECUTIONS)
     if recorded < 0 or count < 1:
         raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
     require_threshold(max_epistemic)
@@ -59,6 +58,7 @@ def plan_report(
         protocol_of_agents(run)
         run = best_run(load_bench(run)).folder
     trained = load_trained(run, encoder=encoder)
+    execution = trained.task.execution(execution)
     name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
     folder = make_folder(run / "plans" / name)
     how: dict[str, Any] = {"execution": execution, "max_epistemic": max_epistemic}

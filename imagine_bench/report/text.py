@@ -12,7 +12,7 @@ from imagine_bench import statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.missing import known_agent, missing
 from imagine_bench.report.sections import DASH
-from imagine_bench.statistics import Estimate, PairedTests
+from imagine_bench.statistics import Estimate
 
 _NAMED = 4  # missing runs that are named; the others are counted
 
@@ -95,7 +95,8 @@ def answers(data: ReportData) -> list[str]:
     """The short answer, one sentence a finding, whatever the numbers say."""
     budget = data.decisive_budget
     sentences = [_unfinished(data)] if data.result.missing else []
-    sentences += [absent] if (absent := missing(data.result.protocol)) else []
+    absent = missing(data.result.protocol, certified=data.result.certificate is not None)
+    sentences += [absent] if absent else []
     if BASE_AGENT in data.scores:
         where = ", where the learners differ most," if data.spread(budget) > 0 and len(data.budgets) > 1 else ""
         sentences.append(
@@ -139,6 +140,32 @@ def paired_words(comparisons: Mapping[str, Mapping[int, Comparison]]) -> str:
     )
 
 
+def paired_answers(data: ReportData) -> list[str]:
+    """What tests from the same starts say of each agent beside DQN, at the budget of the short answer."""
+    budget = data.decisive_budget
+    said = [_paired_answer(agent, budget, each[budget]) for agent, each in data.comparisons.items()]
+    excess = {agent: each[budget] for agent, each in data.excess.items() if not math.isnan(each[budget])}
+    if excess:
+        named = "; ".join(f"“{agent_words(agent).title}” {value:.2f}" for agent, value in excess.items())
+        said.append(f"Macro-actions beyond the shortest plan, in the tests that were solved after {budget:,}: {named}.")
+    return [each for each in said if each]
+
+
+def _paired_answer(agent: str, budget: int, versus: Comparison) -> str:
+    if versus.paired is None:
+        return ""
+    alone, dqn_alone = versus.paired.first, versus.paired.second
+    verdict = "which of these trained agents is better is not shown"
+    if versus.paired_p < 1.0 - statistics.LEVEL:
+        verdict = f"these trained agents are {'better' if alone > dqn_alone else 'worse'} than those of DQN"
+    return (
+        f"From the same starts, after {budget:,} real episodes, “{agent_words(agent).title}” alone solves {alone:,} "
+        f"tests and DQN alone {dqn_alone:,} ({chance_words(versus.paired_p)}, McNemar's exact test, corrected): "
+        f"{verdict}; {percent(versus.paired_detectable)} points would have been shown. A run of it is "
+        f"ahead of one of DQN in {percent(versus.improvement)} % of pairs."
+    )
+
+
 def _largest_area(data: ReportData) -> str:
     budget = data.budgets[-1]
     areas = {agent: by_budget[budget] for agent, by_budget in data.areas.items()}
@@ -168,20 +195,11 @@ def _verdict(data: ReportData, agent: str) -> str:
     score = percent(data.scores[agent][budget].value)
     head = f"“{agent_words(agent).title}” solves {score}\u00a0%, {_points(difference)}"
     if math.isnan(difference.low):
-        return f"{head}; {_alone(comparisons[budget].paired)}one seed says nothing about how much of that is luck."
+        return f"{head}; one seed says nothing about how much of that is luck."
     interval = f"95 % interval {signed_percent(difference.low)} to {signed_percent(difference.high)}"
     chance = chance_words(comparisons[budget].p_adjusted)
     verdict = {1: "it is ahead", -1: "it is behind", 0: "no difference is shown"}[comparisons[budget].shown]
     return f"{head} ({interval}; {chance}, corrected): at this budget {verdict}. {_over_budgets(comparisons)}"
-
-
-def _alone(paired: PairedTests | None) -> str:
-    if paired is None:
-        return ""
-    return (
-        f"from the same starts it alone solves {paired.first} and DQN alone {paired.second} ({chance_words(paired.p)}, "
-        "McNemar's exact test of these two trained agents); "
-    )
 
 
 def chance_words(p: float) -> str:

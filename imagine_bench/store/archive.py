@@ -7,6 +7,7 @@ a bench is kept by copying them. What was not finished when it was kept is read 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -45,6 +46,8 @@ def archive_files(result: BenchResult) -> dict[str, str]:
         "environment": environment,
         "sessions": sessions,
     }
+    if result.certificate is not None:
+        facts["certificate"] = dataclasses.asdict(result.certificate)
     return {KEPT: json_text(facts), _RESULTS: results_csv(result)}
 
 

@@ -6,6 +6,7 @@ overwritten by another protocol, for its hash is in the name.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import time
 from collections.abc import Collection, Mapping
@@ -14,8 +15,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from imagine_bench import registry
+from imagine_bench.certificates.certificate import Certificate, certificate, from_json
 from imagine_bench.entrants import file_name
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, plain
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Result, read_as, type_of
@@ -33,6 +36,7 @@ from imagine_bench.store.files import (
 KEPT = "bench.json"
 """Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
 _PROTOCOL, _ENVIRONMENT, _SESSIONS = "protocol.json", "environment.json", "sessions.json"
+_CERTIFICATE = "certificate.json"
 _NAME = re.compile("-([0-9a-f]{12})$")
 """The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
 _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
@@ -96,6 +100,20 @@ class BenchStore:
             write_json(path, sealed(environment))  # last, so that a bench with an environment has sessions too
         return changed
 
+    def keep_certificate(self) -> None:
+        """Compute the certificate of the protocol's world and keep it, once; of a guest's whose rules fail, none."""
+        path, task = self.folder / _CERTIFICATE, self.protocol.task
+        if path.exists() or not isinstance(self.protocol, Protocol):
+            return
+        try:
+            found = certificate(self.protocol.spec(testing=True))
+        except Exception as error:
+            if registry.is_own(task):
+                raise
+            print(f"Note: {task} has no certificate ({type(error).__name__}: {plain(error)}).")
+            return
+        write_json(path, sealed(dataclasses.asdict(found)))
+
     def changed(self, environment: dict[str, Any]) -> list[str]:
         """Names of facts that decide the bits and are not as in the first session; none before there was one."""
         path = self.folder / _ENVIRONMENT
@@ -133,8 +151,24 @@ def bench_facts(folder: Path) -> dict[str, Any]:
             facts, sessions = kept["environment"], _with_times(kept["sessions"])
     else:
         facts, sessions = read_sealed(folder / _ENVIRONMENT, "a bench's environment"), _read_sessions(folder)
-    environment = {**facts, "sessions": sessions}
-    return {"environment": environment, "folder": folder, "wall_s": sum(session["wall_s"] for session in sessions)}
+    return {
+        "environment": {**facts, "sessions": sessions},
+        "folder": folder,
+        "wall_s": sum(session["wall_s"] for session in sessions),
+        **_certificate(folder),
+    }
+
+
+def _certificate(folder: Path) -> dict[str, Certificate]:
+    """``certificate`` of a bench's result, where it was kept: of agents that act, since 2026-11-25."""
+    path, what = folder / _CERTIFICATE, "a world's certificate"
+    if (folder / KEPT).exists():
+        path = folder / KEPT
+        values = read_json(path, "a kept bench").get("certificate")
+    else:
+        values = read_sealed(path, what) if path.exists() else None
+    with reading(path, what):
+        return {} if values is None else {"certificate": from_json(values)}
 
 
 def require_either(given: Path | None, task: str | None) -> None:

@@ -15,7 +15,7 @@ import platformdirs
 from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import TaskSpec, bundled_name
+from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
 from imagine_bench.rules import states_of
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
 
@@ -110,7 +110,8 @@ def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
 
     Raises as :func:`resolve`, and BusyError: another process trains it.
     """
-    looks_bundled = registry.is_own(spec.id) and any(name.startswith(f"{spec.encoder}-") for name in bundled())
+    named = registry.is_own(spec.id) and appearance in APPEARANCES
+    looks_bundled = named and any(name.startswith(f"{spec.encoder}-") for name in bundled())
     if not looks_bundled and bundled_name(spec.encoder, appearance, kind) not in bundled():
         path, recipe = cached(spec, appearance, kind), "codes" if kind == "codes" else "default"
         settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}

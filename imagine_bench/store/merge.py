@@ -172,6 +172,7 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
         environment={"command": commands, **benches},
         folder=root / file_name(protocol.task) / f"merged-{protocol.hash}",
         wall_s=sum(result.wall_s for result in results),
+        certificate=next((result.certificate for result in results if result.certificate is not None), None),
         missing=tuple(sentence for result in results for sentence in result.missing),
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout
+from imagine_bench.certificates.certificate import Certificate
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.files import first_difference
@@ -184,6 +185,7 @@ class BenchResult:
     environment: Mapping[str, Any]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
     folder: Path  #: Where the bench's files lie
     wall_s: float  #: Wall seconds of the bench, over all its sessions
+    certificate: Certificate | None = None  #: That of the world; None in results of before 2026-11-25
     whole: Protocol | None = None  #: The protocol of which this is a part; None if it is all of it
     missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
     made_with: str = ""  #: Of kept results, the hash that their protocol had then; names may have changed since

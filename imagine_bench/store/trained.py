@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.entrants import entrant
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Agent, AgentState, TaskSpec
+from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.protocols.task_types import Result
@@ -44,16 +44,16 @@ class Trained:
         return self.agent
 
 
-def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequence[tuple[str, Any]] = ()) -> Trained:
+def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
 
     ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
-    path, where the run used an encoder that is not bundled; ``overrides`` replace settings it ran with, those that it
-    has.
+    path, where the run used an encoder that is not bundled.
 
     Raises:
         ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
         UnknownNameError: No such encoder.
+        InvalidValueError: An agent that sees other observations than frames.
     """
     path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
     config = read_sealed(path, what)
@@ -63,15 +63,19 @@ def load_trained(folder: Path, *, encoder: str | None = None, overrides: Sequenc
     require_control(task, str(folder))
     with reading(path, what):
         protocol = Protocol.from_dict(config["protocol"])
+    if not protocol.shows_frames_alone:
+        raise InvalidValueError(
+            f"{folder} is of an agent that sees {protocol.observation} at {protocol.observation_size} pixels, and it "
+            "would be asked with 64 x 64 frames alone; give the run of one that sees these."
+        )
     spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
     snapshot = load_newest(folder / "checkpoints")
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
-    settings.update((name, value) for name, value in overrides if name in settings)
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
     agent = registry.make_agent(name, dataclasses.replace(spec.context(), overrides=as_it_ran))
     with reading(folder / "checkpoints", f"a checkpoint of {name!r}"):
-        agent.restore(_with_settings(snapshot.agent, overrides))
+        agent.restore(snapshot.agent)
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
         while agent.train_in_model():
             pass
@@ -147,13 +151,6 @@ def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool
     """Whether an encoder was given for the agents of the bench that see through another kind than this one."""
     found = encoders.identity(encoders.resolve(task, protocol.appearance, given))
     return found != used and found in (protocol.encoder, protocol.codes)
-
-
-def _with_settings(state: AgentState, overrides: Sequence[tuple[str, Any]]) -> AgentState:
-    """A snapshot that names other settings, as an agent does that is to take it up with them."""
-    held = state.values.get("settings", {})
-    changed = {name: value for name, value in overrides if name in held}
-    return dataclasses.replace(state, values={**state.values, "settings": {**held, **changed}}) if changed else state
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

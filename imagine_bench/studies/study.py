@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.appearance import appearance_name
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
@@ -195,6 +196,7 @@ def _imagined_right(runs: Sequence[RunResult]) -> NDArray[np.float64]:
 
 def _plan(study: Study, task: str, variant: Variant) -> tuple[ProtocolData, Encoders]:
     world = {"execution": study.execution, "appearance": study.appearance, **variant.world}
+    world["appearance"] = appearance_name(world["appearance"])
     world |= {name: tuple(sorted(value.items())) for name, value in world.items() if isinstance(value, Mapping)}
     return plan(
         task, study.preset, agents=(variant.agent,), seeds=study.seeds, budgets=study.budgets,

@@ -1,4 +1,4 @@
-"""A package of one's own with a task or an agent in it, ready to be changed: ``imagine-bench new``."""
+"""A package of one's own with a task, an agent or a world model in it, ready to be changed: ``imagine-bench new``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.store.files import make_folder, write_bytes
 
-KINDS = {"task": registry.TASK_GROUP, "agent": registry.AGENT_GROUP}
+KINDS = {"task": registry.TASK_GROUP, "agent": registry.AGENT_GROUP, "model": registry.WORLD_MODEL_GROUP}
 _PYPROJECT = """[build-system]
 requires = ["setuptools>=77"]
 build-backend = "setuptools.build_meta"
@@ -28,26 +28,27 @@ dependencies = ["imagine-bench"]
 
 [tool.setuptools]
 py-modules = ["{name}"]
-"""
-_TESTS = """from imagine_bench.testing import {kind}_tests
 
-test_contract = {kind}_tests("{name}")
+[tool.pytest.ini_options]
+addopts = ["--imagine-bench-{kind}={name}"]
 """
 
 
 def new_package(kind: str, name: str, out: Path) -> str:
-    """Write ``out/<name>/``: ``pyproject.toml``, ``<name>.py``, a small task or agent, and a test file that it passes.
+    """Write ``out/<name>/``: ``pyproject.toml``, and ``<name>.py``, which passes the checks as it is.
 
     Returns what to do next.
 
     Raises:
-        UnknownNameError: ``kind`` is neither ``"task"`` nor ``"agent"``.
+        UnknownNameError: Another kind than those of :data:`KINDS`.
         InvalidValueError: A name that no module can have or that is taken, or a folder that exists.
     """
     group = KINDS[require_known("kind of package", kind, KINDS)]
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
         raise InvalidValueError(f"{name!r} cannot be a module; give small letters, digits and _, such as my_{kind}.")
-    taken = {**registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.REGRESSORS}
+    taken = {
+        **registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.REGRESSORS, **registry.WORLD_MODELS
+    }  # fmt: skip
     if name in taken:
         raise InvalidValueError(f"{name!r} is a name of imagine_bench already; give another name.")
     folder = out.expanduser() / name
@@ -58,6 +59,5 @@ def new_package(kind: str, name: str, out: Path) -> str:
     code = jinja2.Environment(autoescape=False, keep_trailing_newline=True).from_string(template).render(**words)
     make_folder(folder)
     write_bytes(folder / f"{name}.py", code.encode())
-    write_bytes(folder / "pyproject.toml", _PYPROJECT.format(name=name, group=group).encode())
-    write_bytes(folder / f"test_{name}.py", _TESTS.format(kind=kind, name=name).encode())
+    write_bytes(folder / "pyproject.toml", _PYPROJECT.format(kind=kind, name=name, group=group).encode())
     return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name} (or pytest {folder})"

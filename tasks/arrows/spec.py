@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +59,7 @@ _TARGETS = PerformanceTargets(
     encoders={"clean": 0.995, "mild": 0.995, "strong": 0.98, "photo": 0.94},
     goes_on=True,
 )
-"""The first task's; the others share its physics and its encoders."""
+"""The first task's; the others that are registered share its physics and its encoders."""
 
 
 def _described(world: Arrows, goal: Goal) -> str:
@@ -88,7 +89,8 @@ def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str
     """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
     from ..frames import frames_of  # noqa: PLC0415
 
-    return frames_of(_maker(Arrows(cubes=rules.world.cubes)), rules, macrostates, appearance, rng)
+    scene = Arrows(cubes=rules.world.cubes, distractors=rules.world.distractors)
+    return frames_of(_maker(scene), rules, macrostates, appearance, rng)
 
 
 def spec_of(**world: Any) -> TaskSpec:
@@ -127,8 +129,15 @@ def _spec(world: Arrows) -> TaskSpec:
         facts=functools.partial(facts, rules, rules.horizon),
         render_macrostates=functools.partial(_rendered, rules),
         reference=name if name in _IN_THESIS else None,
-        targets=_TARGETS if name == "arrow_puzzle" else None,
+        targets=_targets(world, name),
     )
+
+
+def _targets(world: Arrows, name: str) -> PerformanceTargets | None:
+    if name == "arrow_puzzle":
+        return _TARGETS
+    objects = tuple(f"cube_{cube}" for cube in range(world.cubes))
+    return None if world in _NAMED or name == "arrows" else replace(_TARGETS, objects=objects, encoders={})
 
 
 def make_env(**options: Any) -> MacroEnv:

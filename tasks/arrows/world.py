@@ -31,7 +31,8 @@ class ArrowWorld(World):
         self._turns, self._layout = arrows.turns, layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
-        super().__init__(compile_arrow_scene(arrows.cubes), level, objects=objects, materials=materials)
+        model = compile_arrow_scene(arrows.cubes, arrows.distractors)
+        super().__init__(model, level, objects=objects, materials=materials, distractors=arrows.distractors)
         self._hand = int(self.model.body("hand").mocapid[0])
 
     @functools.cached_property

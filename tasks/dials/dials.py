@@ -27,7 +27,7 @@ class Dials:
     fickle: float = 0.0  #: probability that the human wants something else after a macro-action that ends nothing
     gesture: str | float = "always"  #: which frames show it: all, only the ``"first"``, or each with a probability
     lag: int = 0  #: macro-actions that a frame is old, 0 to 10
-    distractors: int = 0  #: things in view that move and are of no consequence, 0 to 4
+    distractors: int = 0  #: of no consequence, in view, 0 to 4: a screen of noise, the others balls that roll about
 
     FAMILY: ClassVar[str]
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
@@ -74,15 +74,13 @@ class Dials:
         for name in options:
             if name not in (*names, *others):
                 raise UnknownNameError("keyword argument", name, (*names, *others))
-        world = cls(**{name: options.pop(name) for name in names if name in options})
-        if world.distractors:
-            raise InvalidValueError(f"No environment shows distractors={world.distractors} yet; leave it out.")
-        return world
+        return cls(**{name: options.pop(name) for name in names if name in options})
 
     @property
     def looks(self) -> str:
         """What the name of encoders says of dials that change frames."""
-        return "" if self.gesture in ("always", 1.0) else "_hidden"
+        hidden = "" if self.gesture in ("always", 1.0) else "_hidden"
+        return hidden + (f"_distractors{self.distractors}" if self.distractors else "")
 
     def sight(self, always_shown: Callable[[State], bool] = lambda macrostate: False) -> GestureSight | None:
         """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""

@@ -25,7 +25,9 @@ _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
 _MAX_SKEW_RAD = math.radians(8)
 """Beyond it the last joint might leave its range, so the other pair of faces is gripped."""
-_PAD_THICKNESS_M, _PAD_HALF_WIDTH_M, _CLEARANCE_M = 0.008, 0.014, 0.003
+_FINGER_M, _FINGER_HALF_WIDTH_M, _CLEARANCE_M = 0.011, 0.014, 0.003
+"""How far a finger reaches beyond its opening, its back included, and what is left between it and other cubes."""
+_LEAST_OPENING_M = CUBE_EDGE_M / 2 + 0.002
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
@@ -79,13 +81,15 @@ class TurnExecutor:
             grip = self._reach(pose.position_m[:2], slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
-        along_x, along_y = (any(_crowds(each, pose, axis) for each in poses if each is not true) for axis in (0, 1))
-        skewed = abs(_skew_rad(pose)) > _MAX_SKEW_RAD
-        other_faces = (along_x and not along_y and not skewed) if clockwise else (along_y or skewed)
-        waypoints, error_m = (
-            _waypoints(grip, slot, _skew_rad(pose), clockwise, other_faces, slips),
-            max(grip.error_m, slot.error_m),
+        others = [each for each in poses if each is not true]
+        along_x_m, along_y_m = (
+            min((_room_m(each, pose, axis) for each in others), default=REST_OPENING_M) for axis in (0, 1)
         )
+        skewed = abs(_skew_rad(pose)) > _MAX_SKEW_RAD
+        begins_along_x = skewed or along_x_m > along_y_m or (clockwise and along_x_m == along_y_m)
+        opening_m = max(along_x_m if begins_along_x else along_y_m, _LEAST_OPENING_M)
+        waypoints = _waypoints(grip, slot, _skew_rad(pose), clockwise, begins_along_x != clockwise, slips, opening_m)
+        error_m = max(grip.error_m, slot.error_m)
         result, qpos, trajectory = yield from self.executor.perform(
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
@@ -109,21 +113,22 @@ def _skew_rad(pose: ObjectPose) -> float:
     return pose.yaw_rad - round(pose.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
 
 
-def _crowds(other: ObjectPose, gripped: ObjectPose, axis: int) -> bool:
-    """Whether fingers along x (axis 0) or y (1) of the gripped cube would touch the other one, which is that way."""
+def _room_m(other: ObjectPose, gripped: ObjectPose, axis: int) -> float:
+    """How far fingers along x (axis 0) or y (1) of the gripped cube can open for another one, if that is that way."""
     offset_m = np.abs(other.position_m[:2] - gripped.position_m[:2])
-    if offset_m[axis] < offset_m[1 - axis]:
-        return False
     half_m = CUBE_EDGE_M / 2 * (math.cos(_skew_rad(other)) + abs(math.sin(_skew_rad(other)))) + _CLEARANCE_M
-    beside = offset_m[1 - axis] < half_m + _PAD_HALF_WIDTH_M
-    away_m = math.dist(other.position_m[:2], gripped.position_m[:2]) if axis else offset_m[0]
-    return bool(beside and away_m < REST_OPENING_M + _PAD_THICKNESS_M + half_m)
+    if offset_m[axis] < offset_m[1 - axis] or offset_m[1 - axis] >= half_m + _FINGER_HALF_WIDTH_M:
+        return REST_OPENING_M
+    away_m = math.dist(other.position_m[:2], gripped.position_m[:2]) if axis else float(offset_m[0])
+    return min(REST_OPENING_M, away_m - half_m - _FINGER_M)
 
 
 def _waypoints(
-    grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool, slips: bool
+    grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool, slips: bool, opening_m: float
 ) -> list[Waypoint]:
     """Down over the cube as it stands, turned to the nominal slot's right angle, and back; or let go too early.
+
+    Fingers open as far as ``opening_m`` beside the cube where it stands, and at the nominal slot as at rest.
 
     The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above. A clockwise turn
     begins with the fingers along x, clear of the row, and ends along y; a counter-clockwise one goes the other way,
@@ -136,8 +141,8 @@ def _waypoints(
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2
     if slips:
         turn = [
-            Waypoint(name="open", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
-            Waypoint(name="lift", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M),
+            Waypoint(name="open", qpos_rad=grip.at_qpos_rad + before, opening_m=opening_m, min_duration_s=_OPEN_S),
+            Waypoint(name="lift", qpos_rad=grip.above_qpos_rad + before, opening_m=opening_m),
             Waypoint(name="turn", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         ]
     else:
@@ -147,8 +152,8 @@ def _waypoints(
             Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
         ]
     return [
-        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=REST_OPENING_M, blend_s=BLEND_S),
-        Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=REST_OPENING_M),
+        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=opening_m, blend_s=BLEND_S),
+        Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=opening_m),
         Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=_SQUEEZED_M, min_duration_s=_CLOSE_S),
         *turn,
         *back_to_rest(REST_OPENING_M, _SETTLE_S),

@@ -8,6 +8,7 @@ import math
 
 import mujoco
 
+from ..dials.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.hand import add_pointing_hand
@@ -34,13 +35,14 @@ _FOVY_DEG, _PITCH_RAD = 57.0, math.radians(5.5)
 
 
 @functools.cache
-def _compiled() -> mujoco.MjModel:
+def _compiled(distractors: int) -> mujoco.MjModel:
     spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "pick_place"
     add_tabletop(spec, TIMESTEP_S)
     add_objects(spec)
     add_pointing_hand(spec, IDLE_FINGERTIP_M)
     add_open_hand(spec, IDLE_PALM_M)
+    add_distractors(spec, distractors)
     for geom in spec.geoms:
         geom.solref, geom.solimp[:2] = (2 * TIMESTEP_S, 1.0), _SOLIMP
     let_arm_touch(spec)
@@ -50,6 +52,6 @@ def _compiled() -> mujoco.MjModel:
     return spec.compile()
 
 
-def compile_pick_scene() -> mujoco.MjModel:
+def compile_pick_scene(distractors: int = 0) -> mujoco.MjModel:
     """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
-    return copy.copy(_compiled())
+    return copy.copy(_compiled(distractors))

@@ -6,6 +6,7 @@ Importing this module is cheap: MuJoCo loads when an environment or a frame is m
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ from .rules import HANDED_OVER, N_OBJECTS, PickPlace, PickPlaceRules
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
+    from ..scenes.appearance import Appearance
+    from .world import PickWorld
 
 HORIZON = 50
 """Of no weight: an optimal agent needs 6 actions on average and is cut off once in 25,000 episodes."""
@@ -26,12 +29,21 @@ _OBJECTS = ("ball", "car", "cup")
 _PLACES = ("left", "middle", "right")
 
 
-def render_macrostates(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
-    from ..frames import frames_of  # noqa: PLC0415
+@functools.cache
+def _maker(distractors: int) -> Callable[[Appearance], PickWorld]:
+    """The same one for the same scene, so that what draws it is shared."""
     from .world import PickWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
 
-    return frames_of(PickWorld, _RULES, macrostates, appearance, rng)
+    return functools.partial(PickWorld, distractors=distractors)
+
+
+def _rendered(
+    rules: PickPlaceRules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator
+) -> Frame:
+    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
+    from ..frames import frames_of  # noqa: PLC0415
+
+    return frames_of(_maker(rules.world.distractors), rules, macrostates, appearance, rng)
 
 
 _CHAPTER_3 = ("dqn", "imagination_only")
@@ -72,7 +84,7 @@ SPEC = TaskSpec(
     encoder="pick_place",
     rules=_RULES,
     facts=functools.partial(facts, _RULES, HORIZON),
-    render_macrostates=render_macrostates,
+    render_macrostates=functools.partial(_rendered, _RULES),
     reference="pick_place",
     config_group="chapter_3",
     targets=PerformanceTargets(
@@ -103,7 +115,8 @@ def _spec(world: PickPlace) -> TaskSpec:
         SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
         encoder=SPEC.encoder + world.looks,
         sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
-        rules=rules, facts=functools.partial(facts, rules, HORIZON), reference=None, targets=None,
+        rules=rules, facts=functools.partial(facts, rules, HORIZON),
+        render_macrostates=functools.partial(_rendered, rules), reference=None,
     )  # fmt: skip
 
 
@@ -117,6 +130,6 @@ def make_env(**options: Any) -> MacroEnv:
     How the rules are read where the thesis is silent stands in ``docs/reference/environments.md``.
     """
     from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
-    from .world import PickWorld  # noqa: PLC0415
 
-    return MacroEnv(_spec(PickPlace.taken_from(options, MacroEnv.KEYWORDS)), PickWorld, **options)
+    world = PickPlace.taken_from(options, MacroEnv.KEYWORDS)
+    return MacroEnv(_spec(world), _maker(world.distractors), **options)

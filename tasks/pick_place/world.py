@@ -43,9 +43,10 @@ _GRIP_SHARE = 0.5
 class PickWorld(World):
     """One scene of pick-and-place, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance) -> None:
+    def __init__(self, level: Appearance, distractors: int = 0) -> None:
         objects = {spec.name: f"the {spec.name}" for spec in OBJECTS}
-        super().__init__(compile_pick_scene(), level, objects=objects, materials=("table_top", "skin", *MATERIALS))
+        model, materials = compile_pick_scene(distractors), ("table_top", "skin", *MATERIALS)
+        super().__init__(model, level, objects=objects, materials=materials, distractors=distractors)
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import require_known
+from imagine_bench.appearance import POINTS, appearance_name, factors_of
 from imagine_bench.interfaces import HELD_OUT
 
 _CHANNELS = 3
@@ -19,7 +21,7 @@ _CHANNELS = 3
 class Appearance:
     """Half-widths of uniform variation about the nominal scene; 0 means fixed."""
 
-    name: str  #: the level's name
+    name: str  #: the level's, or its factors
     object_offset_m: float  #: of every loose object's start, along x and along y
     object_yaw_rad: float  #: of every loose object's start
     hand_offset_m: float = 0.0  #: of the human's hand, along each axis, every frame until an object lies in its palm
@@ -82,13 +84,31 @@ LEVELS: dict[str, Appearance] = {
 }
 
 
-def appearance(name: str) -> Appearance:
-    """The level of that name.
+_FIELDS = {
+    "light": ("light_fraction",),
+    "colors": ("color_fraction",),
+    "camera": ("camera_offset_m", "camera_angle_rad"),
+    "pose": ("object_offset_m", "object_yaw_rad"),
+    "hand": ("hand_offset_m", "hand_yaw_rad"),
+}
+"""What each factor varies."""
 
-    Raises:
-        UnknownNameError: No such level; the message lists all of them.
-    """
-    return LEVELS[require_known("appearance", name, LEVELS)]
+
+def appearance(given: str | Mapping[str, float]) -> Appearance:
+    """The level of that name, or the point of these factors. Raises as :func:`.appearance_name`."""
+    name = appearance_name(given, LEVELS)
+    return LEVELS[name] if name in LEVELS else between(name, factors_of(name))
+
+
+def between(name: str, factors: Mapping[str, float]) -> Appearance:
+    """The point of these factors, by linear interpolation of each between the levels that are points."""
+    widths = dict[str, Any]()
+    for factor, fields in _FIELDS.items():
+        levels = {point.get(factor, 0.0): LEVELS[level] for level, point in POINTS.items()}
+        for each in fields:
+            at = [getattr(level, each) for level in levels.values()]
+            widths[each] = float(np.interp(factors.get(factor, 0.0), list(levels), at))
+    return Appearance(name=name, **widths)
 
 
 def looks_of(model: mujoco.MjModel) -> tuple[NDArray[np.float64], ...]:

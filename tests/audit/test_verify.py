@@ -13,7 +13,7 @@ import pytest
 from forger import FORGERIES
 from small_runs import Inline, context, do, small
 
-from imagine_bench.audit.verify import Replays, verdicts, verify
+from imagine_bench.audit.verify import Replays, price, verdicts, verify
 from imagine_bench.bench.bench import bench
 from imagine_bench.bench.evaluation import play_test_episode, replay
 from imagine_bench.bench.run_state import environments
@@ -41,6 +41,15 @@ def test_a_bench_that_was_not_touched_holds(finished: Path) -> None:
         "random seed 0: holds; 16 test episodes played again",
         "report: holds",
     ]
+
+
+def test_the_price_is_that_of_the_files(finished: Path) -> None:
+    found = verify(finished)
+    size = sum(len((finished / agent / "seed_0" / "episodes.npz").read_bytes()) for agent in ("table", "random"))
+    assert price(finished, found, 1.0) == (
+        f"32 test episodes in {size / 1024:.1f} KiB, {size / 32:.1f} bytes each; checked in 1.0 CPU s."
+    )
+    assert price(finished, [], 2.0).endswith("; checked in 2.0 CPU s.")
 
 
 def test_two_hundred_forgeries_are_found(finished: Path, tmp_path: Path) -> None:

@@ -72,8 +72,7 @@ def test_an_entrants_settings_are_its_own_and_checked() -> None:
 def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
     both = bench(*plan("arrow_puzzle", "smoke", agents=("dqn", SLOW), **_FEW), root=tmp_path, launcher=Inline())
     trained = load_trained(both.folder / "dqn-controller.discount=0.99" / "seed_0")
-    again = load_trained(trained.folder, overrides=(("controller.discount", 0.7),))
-    assert [each.agent.settings.controller.discount for each in (trained, again)] == [0.99, 0.7]
+    assert trained.agent.settings.controller.discount == 0.99
     assert [both.of(agent)[0].settings["controller"]["discount"] for agent in ("dqn", SLOW)] == [0.95, 0.99]
     assert re.search(r"chance +DQN +DQN \(discount 0.99\) +optimum", summary_table(both))
     for name, content in archive_files(both).items():

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench_fakes import Rememberer
 from imagine_bench.tasks.motion.executor import Simulation
 from small_runs import same_but_for_time, small
 
@@ -95,6 +96,17 @@ def test_agents_of_chance_are_asked_in_order(tmp_path: Path, in_lanes: list[int]
     do(tmp_path / "run", agent="random")
     do(tmp_path / "kinematic", execution="kinematic")
     assert not in_lanes
+
+
+def test_who_remembers_an_episode_is_told_of_each_and_plays_it_alone(tmp_path: Path, in_lanes: list[int]) -> None:
+    Rememberer.lengths.clear()
+    result = do(tmp_path / "run", agent="rememberer", budgets=(4,))
+    (row,) = result.checkpoints
+    assert not in_lanes and row.kept is not None
+    played = [*result.training_length.tolist(), *np.asarray(row.kept.lengths).tolist()]
+    asked = [length for length in Rememberer.lengths[len(played) :] if length]
+    assert Rememberer.lengths[: len(played)] == played and max(played) > 1
+    assert asked == [1] * len(asked) and len(asked) > 50, "asked about each macrostate on its own"
 
 
 def test_runs_share_the_cores_of_their_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

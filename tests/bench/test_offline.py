@@ -13,6 +13,7 @@ import pytest
 from bench_fakes import Pupil
 from small_runs import FORMATS, Inline, collected, final_arrays, measured, written
 
+from imagine_bench import registry
 from imagine_bench.bench import run_state
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.control import plan_control, run_observed
@@ -21,6 +22,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.report import summary_table, write_report
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.results import RunResult
 
@@ -69,7 +71,11 @@ def test_the_learner_sees_the_transitions_and_no_state(tmp_path: Path) -> None:
     assert [episode for episode, _ in pupil.shown] == np.repeat(np.arange(6), episodes.lengths).tolist()
     for _, transition in pupil.shown:
         assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
-    assert len(pupil.seen) == sum(row.mean_length * row.test_episodes for row in result.checkpoints), "it acts in tests"
+    tested = sum(row.mean_length * row.test_episodes for row in result.checkpoints)
+    rules = registry.task("arrow_puzzle").rules
+    asked = sum(not rules.is_terminal(state) for state in states_of(rules))
+    assert len(pupil.seen) == tested + asked, "it acts in tests, and for each macrostate, to find causes of failures"
+    assert all(seen.macrostate is None for seen in pupil.seen)
 
 
 def test_a_dataset_is_experience_and_budgets_count_it(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.bench.progress import ProgressBars, counted
+from imagine_bench.bench.progress import ProgressBars, RunKey, counted
 from imagine_bench.protocols.runs import Phase, Progress
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
 AGENTS, SEEDS = ("table", "random"), (0, 1, 2)
+BENCH = small(agents=AGENTS, seeds=SEEDS).hash
 
 
 class Terminal(io.StringIO):
@@ -33,7 +34,7 @@ def specs() -> list[FakeRunSpec]:
 
 def far(agent: str, seed: int, phase: Phase = "training") -> Progress:
     done = WORK if phase == "done" else 5
-    return Progress(agent=agent, seed=seed, phase=phase, done=done, work=WORK, episode=5)
+    return Progress(agent=agent, seed=seed, bench=BENCH, phase=phase, done=done, work=WORK, episode=5)
 
 
 def rows(terminal: Terminal) -> dict[int, str]:
@@ -63,7 +64,7 @@ def test_every_running_run_has_a_row_of_the_display(monkeypatch: pytest.MonkeyPa
 
 def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBars(specs()) as show:
-        show(Progress(agent="table", seed=0, phase="done", done=9, work=9, episode=4))
+        show(Progress(agent="table", seed=0, bench=BENCH, phase="done", done=9, work=9, episode=4))
         show(far("table", 0, "done"))
         show(far("table", 0, "done"))
     waiting, done, again = capsys.readouterr().err.splitlines()
@@ -72,7 +73,7 @@ def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.Capt
     assert again.startswith("1 of 6 runs done")
 
 
-def after_ten_hours(monkeypatch: pytest.MonkeyPatch, *told: Progress, done: dict[tuple[str, int], int]) -> None:
+def after_ten_hours(monkeypatch: pytest.MonkeyPatch, *told: Progress, done: dict[RunKey, int]) -> None:
     """Show all but the last at the beginning, the last one ten hours later."""
     now_s = [0.0]
     monkeypatch.setattr("imagine_bench.bench.progress.time.monotonic", lambda: now_s[0])
@@ -87,15 +88,17 @@ def test_time_left_is_of_what_no_session_has_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Three runs of 19 parts have done 9 each before, three of 5 nothing; 10 more take ten hours, 35 are left."""
-    before = {("table", seed): 9 for seed in SEEDS}
-    begins = Progress(agent="table", seed=0, phase="training", done=9, work=WORK)
+    before = {(BENCH, "table", seed): 9 for seed in SEEDS}
+    begins = Progress(agent="table", seed=0, bench=BENCH, phase="training", done=9, work=WORK)
     after_ten_hours(monkeypatch, begins, far("table", 0, "done"), done=before)
     assert "10:00:00 gone, 35:00:00 left" in capsys.readouterr().err
 
 
 def test_a_failed_run_is_named_at_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    begins = Progress(agent="table", seed=0, phase="training", done=9, work=WORK)
-    failed = Progress(agent="table", seed=1, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke")
+    begins = Progress(agent="table", seed=0, bench=BENCH, phase="training", done=9, work=WORK)
+    failed = Progress(
+        agent="table", seed=1, bench=BENCH, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke"
+    )
     after_ten_hours(monkeypatch, begins, failed, far("table", 0, "done"), done={})
     said, line = capsys.readouterr().err.splitlines()
     assert said == "table seed 1 failed: RuntimeError: it broke"
@@ -105,7 +108,9 @@ def test_a_failed_run_is_named_at_once(monkeypatch: pytest.MonkeyPatch, capsys: 
 def test_a_run_that_fails_leaves_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    failed = Progress(agent="table", seed=1, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke")
+    failed = Progress(
+        agent="table", seed=1, bench=BENCH, phase="failed", done=0, work=WORK, detail="RuntimeError: it broke"
+    )
     with ProgressBars(specs()) as show:
         show(far("table", 0))
         show(far("table", 1))

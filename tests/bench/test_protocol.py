@@ -59,9 +59,9 @@ def test_any_change_changes_the_hash():
         "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
         "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
         "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
-        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0,
+        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0, "split": "plan_length=2",
         "dataset": "random-3@0123456789ab", "settings_digest": "0123456789ab", "test_appearance": "strong",
-        "physics": (("pad_friction", 0.5),),
+        "physics": (("pad_friction", 0.5),), "observation": "state", "observation_size": 128,
     }  # fmt: skip
     assert {*changes, "after_episodes", "feedback_error"} >= {field.name for field in dataclasses.fields(Protocol)}
     after = dataclasses.replace(base, after=("arrow_puzzle",))

@@ -120,8 +120,8 @@ def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
     assert len(seen) > 20 and all(value is None for value in seen)
     seen.clear()
     do(tmp_path / "privileged", "nosy_privileged", agents=("nosy_privileged",))
-    optimal_action, *macrostates = seen
-    assert callable(optimal_action)
+    optimal_policy, *macrostates = seen
+    assert callable(optimal_policy)
     assert all(macrostate.shape == (4,) for macrostate in macrostates)
 
 

@@ -132,4 +132,8 @@ def test_settings_of_the_physics_are_refused_where_there_is_none(
 ) -> None:
     package("task", "lamps", tmp_path, monkeypatch)
     assert main(["bench", "--task", "lamps", "--agents", "random", "--physics", "pad_friction=0.5"]) == 2
-    assert "unexpected keyword argument 'physics'" in capsys.readouterr().err
+    assert "Physics settings change nothing in kinematic execution; leave" in capsys.readouterr().err
+    assert main(["bench", "--task", "lamps", "--agents", "random", "--execution", "physics"]) == 2
+    assert "No execution of lamps 'physics'. Known: kinematic." in capsys.readouterr().err
+    assert main(["bench", "--task", "lamps", "--agents", "random", "--observation", "state"]) == 2
+    assert "Task lamps cannot be run: " in (said := capsys.readouterr().err) and "argument 'observation'" in said

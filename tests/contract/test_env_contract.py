@@ -25,6 +25,7 @@ INFO_KEYS = {
     "action_mask",
     "fault_reason",
     "macrostate",
+    "shown",
     "is_success",
     "success",
     "legal",

@@ -151,6 +151,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", table(with_image(png((64, 64), "L"))), "an image is L of (64, 64) pixels"),
     ("lerobot", table(with_image(png((64, 64)))), "is damaged: its episodes are not those of its card"),
     ("lerobot", info(codebase_version="v2.1"), "it is of version v2.1"),
+    ("lerobot", info(features={"action": {}, "observation.images.top": {}}), "it has no next.reward, which 'imagine"),
     ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it"),
     ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),

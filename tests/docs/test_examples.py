@@ -21,7 +21,7 @@ from imagine_bench.bench.bench import bench, plan
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.results import BenchResult
 from imagine_bench.studies.study import _plan, load_study
-from imagine_bench.tools.check import agent_checks, report, task_checks
+from imagine_bench.testing.contract import checks, report
 
 EXAMPLES = ROOT / "docs" / "examples"
 _FEW = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0}
@@ -48,7 +48,7 @@ def run(tmp_path: Path, task: str, agent: str, **changes: object) -> BenchResult
 
 @pytest.mark.parametrize("example", ["own_agent"], indirect=True)
 def test_the_agent_keeps_the_contract_and_learns(example: ModuleType, tmp_path: Path) -> None:
-    assert report(agent_checks("own_agent")) == 0
+    assert report(checks(agent="own_agent")) == 0
     found = run(tmp_path, "pick_place", "own_agent", budgets=(5, 500), evaluation_episodes=50)
     few, many = found.success_rates("own_agent")[0]
     assert many > 0.6 > 2 * few
@@ -56,7 +56,7 @@ def test_the_agent_keeps_the_contract_and_learns(example: ModuleType, tmp_path: 
 
 @pytest.mark.parametrize("example", ["own_task"], indirect=True)
 def test_the_task_keeps_the_contract(example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report(task_checks("corridor")) == 0
+    assert report(checks("corridor")) == 0
     assert capsys.readouterr().out.count("ok  ") == 6  # its state cannot be kept, which is no duty
     found = run(tmp_path, "corridor", "oracle", budgets=(2,), evaluation_episodes=50)
     assert found.success_rates("oracle")[0, 0] >= registry.task("corridor").facts().optimum - 0.05 > 0.9

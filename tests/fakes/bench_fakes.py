@@ -97,6 +97,19 @@ class RulesImaginer(TableAgent):
         )
 
 
+class Rememberer(TableAgent):
+    """Counts how many frames it was shown since its episode began, and the lengths that it counted."""
+
+    lengths: list[int] = []  # noqa: RUF012 - how a test finds them
+
+    def begin_episode(self) -> None:
+        self.lengths.append(0)
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        self.lengths[-1] += 1
+        return super().act(observation, explore=explore)
+
+
 class FailingAgent(TableAgent):
     """Breaks in its third episode, with seed 1 only."""
 
@@ -117,7 +130,7 @@ class NosyAgent(TableAgent):
 
     def __init__(self, context: AgentContext) -> None:
         super().__init__(context)
-        self.seen.append(context.optimal_action)
+        self.seen.append(context.optimal_policy)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         self.seen.append(observation.macrostate)
@@ -176,6 +189,7 @@ AGENTS.update(
     imaginer=AgentEntry(make="bench_fakes:RulesImaginer", needs_encoder=False),
     failing=AgentEntry(make="bench_fakes:FailingAgent", needs_encoder=False),
     pupil=AgentEntry(make="bench_fakes:Pupil", needs_encoder=False),
+    rememberer=AgentEntry(make="bench_fakes:Rememberer", needs_encoder=False),
     nosy=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False),
     nosy_privileged=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False, privileged=True),
 )

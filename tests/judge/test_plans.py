@@ -275,9 +275,6 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     first, again = (next(make_plans(load_trained(result.folder), count=1, execution="kinematic")) for _ in range(2))
     assert np.array_equal(first.compared.rollout.actions, again.compared.rollout.actions)
     assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)
-    asked_otherwise = load_trained(result.folder, overrides=(("imagination.predicts_with", "network"), ("x", 1)))
-    assert asked_otherwise.agent.settings.imagination.predicts_with == "network"
-    assert asked_otherwise.agent.settings.imagination.weight_samples == 3
     with pytest.raises(ArtefactError, match=r"There is no .*config\.json, a run's configuration; give a run's folder"):
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"saw through encoder arrow_puzzle-clean@.*give the right file"):

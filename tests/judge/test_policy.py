@@ -33,7 +33,6 @@ from imagine_bench.judge.policy import (
 )
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.analysis import Measured
-from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.policy import PolicyAnalysis
 from imagine_bench.rules import fewest_actions, greedy
 from imagine_bench.store import encoders
@@ -243,26 +242,13 @@ def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: py
     assert [path.relative_to(folder).as_posix() for path in learners(folder)] == [
         "table/seed_0", "imaginer/seed_0", "imaginer/seed_1",
     ]  # fmt: skip
-    for command, held in (("policy", ".policy.lock"), ("generalise", ".generalisation.lock")):
-        with lock(folder / held, "This"):
-            assert main([command, str(folder)]) == 2
-        assert "is in use by process" in capsys.readouterr().err
+    with lock(folder / ".policy.lock", "This"):
+        assert main(["policy", str(folder)]) == 2
+    assert "is in use by process" in capsys.readouterr().err
     assert main(["policy", str(folder)]) == 0
     said = capsys.readouterr().out
     assert "| table | 9 | 1 |" in said and "| imaginer | 9 | 2 |" in said and str(folder / "policy") in said
     assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
-    assert main(["generalise", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert "imaginer, 9 episodes (2 seed(s))" in said and str(folder / "generalisation") in said
-    assert len((folder / "generalisation" / "transitions.csv").read_text().splitlines()) == 1 + 2 * 192 * 6
-    assert main(["generalise", str(folder), "--set", "imagination.temperatur=0"]) == 2
-    assert "No setting 'imagination.temperatur'" in capsys.readouterr().err
-
-
-def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None:
-    result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
-    with pytest.raises(ArtefactError, match=r"No agent of .* imagines"):
-        generalisation_report(result.folder, root=tmp_path, task=None, encoder=None)
 
 
 @pytest.mark.parametrize(
@@ -273,12 +259,11 @@ def test_a_bench_without_an_imagining_agent_has_no_model(tmp_path: Path) -> None
         ("docs", "There is no docs/protocol.json"),
     ],
 )
-@pytest.mark.parametrize("command", ["policy", "generalise"])
 def test_folders_without_agents_are_named(
-    command: str, folder: str, complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: str, complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(Path(__file__).parents[2])
-    assert main([command, folder]) == 2
+    assert main(["policy", folder]) == 2
     assert complaint in capsys.readouterr().err
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import rerun as rr
@@ -34,9 +36,12 @@ BY_DEPTH = {
 VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 
 
-def record(agent: Agent, path: Path, *, name: str = "imagination", **changes: object) -> Path:
-    settings = {"seed": 3, "world": {"execution": "kinematic"}, "appearance": "mild", "episodes": 2, **changes}
-    return record_run("arrow_puzzle", agent, name=name, path=path, **settings)  # type: ignore[arg-type]
+def record(
+    agent: Agent, path: Path, *, name: str = "imagination", execution: str = "kinematic", **changes: object
+) -> Path:
+    settings = {"seed": 3, "appearance": "mild", "episodes": 2, **changes}
+    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution=execution, appearance="mild")) as env:
+        return record_run("arrow_puzzle", agent, name=name, env=env, path=path, **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +118,11 @@ class _HandsOver(FakeImaginer):
 
 
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
-    options = {"name": "imagination", "seed": 0, "world": {}, "appearance": "clean", "episodes": 1}
-    path = record_run("pick_place", _HandsOver(), path=tmp_path / "chance.rrd", **options)  # type: ignore[arg-type]
+    with closing(gymnasium.make("imagine_bench/PickPlace-v0")) as env:
+        path = record_run(
+            "pick_place", _HandsOver(), name="imagination", seed=0, env=env, appearance="clean", episodes=1,
+            path=tmp_path / "chance.rrd",
+        )  # fmt: skip
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
     assert "/imagined/sampled_rollouts" not in contents(imagined)
 
@@ -177,7 +185,7 @@ def test_only_privileged_agents_see_the_macrostate(tmp_path: Path) -> None:
 
 
 def test_physics_moves_the_arm_and_stays_small(tmp_path: Path) -> None:
-    path = record(FakeImaginer(), tmp_path / "physics.rrd", world={"execution": "physics"})
+    path = record(FakeImaginer(), tmp_path / "physics.rrd", execution="physics")
     assert path.stat().st_size < 6e6  # 5 episodes in 15 MB, with room
     poses = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/scene/right_l6")
     actions = sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == "/real/reward")
@@ -210,7 +218,7 @@ def test_unknown_names_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"No agent 'dqm'\. Did you mean 'dqn'"):
         record(FakeAgent(), tmp_path / "a.rrd", name="dqm")
     with pytest.raises(UnknownNameError, match="physics"):
-        record(FakeAgent(), tmp_path / "a.rrd", world={"execution": "physical"})
+        record(FakeAgent(), tmp_path / "a.rrd", execution="physical")
     assert not list(tmp_path.iterdir())
 
 

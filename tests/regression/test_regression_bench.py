@@ -29,8 +29,8 @@ from imagine_bench.regression.interfaces import SCORES, Dataset, Mixtures, Predi
 from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
-from imagine_bench.report.generalisation import generalisation_report
 from imagine_bench.report.page import flat
+from imagine_bench.report.policy import policy_report
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import read_json
@@ -219,7 +219,7 @@ def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path:
     with pytest.raises(ArtefactError, match="is of a regression task, in which no agent acts"):
         load_trained(toy.folder)
     with pytest.raises(ArtefactError, match="Task 'toy_regression' is of a regression task"):
-        generalisation_report(None, root=tmp_path, task="toy_regression", encoder=None)
+        policy_report(None, root=tmp_path, task="toy_regression", encoder=None)
 
 
 def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ def walk(vector, steps=8):
     [
         ("ArrowPuzzle", {"appearance": "strong"}),
         ("ArrowPuzzle", {"appearance": "photo", "autoreset_mode": AutoresetMode.NEXT_STEP}),
-        ("PickPlace", {"appearance": "strong"}),
+        ("PickPlace", {"appearance": "strong", "distractors": 4}),
     ],
 )
 def test_the_second_process_draws_the_same_bits(task, options, at_once):

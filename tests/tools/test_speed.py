@@ -5,7 +5,9 @@ import json
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.tools.speed import figure_of, lanes_ratio, speed_report
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.tools.fidelity import Fidelity, measure_fidelity
+from imagine_bench.tools.speed import _slips, figure_of, lanes_ratio, measure_worlds, speed_report
 
 
 @pytest.mark.slow
@@ -27,6 +29,33 @@ def test_figures_are_measured_and_kept(tmp_path):
         assert len(exact) == 2 + len(errors) + 2 * len(spec.targets.encoders)
         for name in exact:
             assert figures[name]["met"], figures[name]
+
+
+def test_fidelity_of_any_world_counts_what_slips() -> None:
+    spec = registry.task("arrows:cubes=5,coupling=neighbour,slip=0.3")
+    found = measure_fidelity(spec, spec.targets, 40, "strong")
+    assert found.as_ruled == found.actions == len(found.slips) == 40, found.faults
+    assert [said for _, said in found.slips] == pytest.approx([0.3] * 40)
+    assert 0 < found.slipped_mm < 4 and found.other_objects_mm < 1
+    turned = sum(not slipped for slipped, _ in found.slips)
+    assert 20 < turned < 36
+    assert turned < len(found.error_deg) < 2 * turned  # all but turns of the last cube turn two
+
+
+def test_a_rate_is_judged_by_its_binomial_interval() -> None:
+    for slipped, met in ((0, False), (20, True), (40, False)):
+        found = Fidelity(slips=[(each < slipped, 0.2) for each in range(100)], slipped_mm=0.1)
+        rate, moved = _slips("w", found)
+        assert (rate.required, rate.met, moved.met) == ("10.0% to 31.0%", met, True)
+
+
+def test_a_world_that_another_measures_is_refused() -> None:
+    with pytest.raises(
+        InvalidValueError, match="arrow_puzzle_hard has no targets, for another task measures its scene"
+    ):
+        next(measure_worlds(["arrow_puzzle_hard"], ["clean"]))
+    with pytest.raises(UnknownNameError, match="No appearance 'dark'"):
+        next(measure_worlds(["arrows:cubes=2"], ["dark"]))
 
 
 def test_lanes_are_timed_beside_one_environment() -> None:

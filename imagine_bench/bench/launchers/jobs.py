@@ -49,7 +49,10 @@ class Failure:
     def progress(self) -> Progress:
         """What an observer is told of it."""
         spec = self.job.spec
-        return Progress(agent=spec.agent, seed=spec.seed, phase="failed", done=0, work=spec.work, detail=self.reason)
+        return Progress(
+            agent=spec.agent, seed=spec.seed, bench=spec.protocol.hash, phase="failed", done=0, work=spec.work,
+            detail=self.reason,
+        )  # fmt: skip
 
 
 def require_workers(workers: int) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,15 +15,18 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.models.ends import Gallery, key_of
 from imagine_bench.judge.models.truth import Questions, courses, lasting_actions, transitions
+from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.world_models import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 
 STATES = 400  # macrostates asked about at most; of more, values are not computed
+AFTER_THE_END = 200  # transitions that no training contains, at most
 FRAMES = 2  # frames of each macrostate in the questions of one step
 DEPTH, HISTORY = 10, 2
 """Macro-actions of each rollout, and macro-actions before them that a model is shown."""
 ROLLOUTS, RANKED, RANKED_DEPTH = 64, 5, 5
 """Rollouts; sequences that are ranked from each start, and their macro-actions."""
+COUNTERFACTUALS = 48  # macrostates in which every macro-action is imagined with the same draws
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
 
 Distribution = dict[State, float]
@@ -45,6 +49,7 @@ class Answers:
     rewards: NDArray[Any] | None  #: Shape (N, S, D).
     p_ended: NDArray[Any] | None  #: Shape (N, S, D).
     uncertainties: dict[str, NDArray[Any]]  #: Those offered, by name, each (N, D).
+    accepted: NDArray[np.bool_] | None  #: Whether a filter of its own keeps it. Shape (N, D).
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
 
@@ -62,6 +67,20 @@ def one_step(spec: TaskSpec, gallery: Gallery) -> Questions:
     rng = SeedTree(0).child("evaluation", "judge", "one_step", spec.id).generator()
     pairs = [pair for pair in transitions(spec.rules, rng, STATES) for _ in range(FRAMES)]
     return _questions(spec, gallery, [((state,), (action,)) for state, action in pairs], rng)
+
+
+def after_the_end(spec: TaskSpec, gallery: Gallery) -> Questions | None:
+    """Macro-actions in macrostates in which no episode goes on, which no training contains; None where there is none.
+
+    The scene obeys the same dynamics there (thesis 5.2.3, "Model Generalization").
+    """
+    rng = SeedTree(0).child("evaluation", "judge", "after_the_end", spec.id).generator()
+    over = [state for state in states_of(spec.rules) if spec.rules.is_terminal(state)]
+    pairs = list(itertools.product(over, range(spec.n_actions)))
+    if not pairs:
+        return None
+    chosen = np.sort(rng.choice(len(pairs), min(AFTER_THE_END, len(pairs)), replace=False))
+    return _questions(spec, gallery, [((pairs[index][0],), (pairs[index][1],)) for index in chosen], rng)
 
 
 def rollouts(spec: TaskSpec, gallery: Gallery) -> Questions:
@@ -89,6 +108,24 @@ def ranked(spec: TaskSpec, gallery: Gallery) -> Questions:
         for _ in range(RANKED)
     ]
     return _questions(spec, gallery, asked, rng)
+
+
+def counterfactuals(spec: TaskSpec, gallery: Gallery) -> tuple[Questions, ...]:
+    """The same frames of :data:`COUNTERFACTUALS` macrostates for each macro-action in turn."""
+    rng = SeedTree(0).child("evaluation", "judge", "counterfactuals", spec.id).generator()
+    states = list(dict.fromkeys(state for state, _ in transitions(spec.rules, rng, STATES)))
+    chosen = [
+        states[index] for index in np.sort(rng.choice(len(states), min(COUNTERFACTUALS, len(states)), replace=False))
+    ]
+    first = _questions(spec, gallery, [((state,), (0,)) for state in chosen], rng)
+    return tuple(
+        replace(
+            first,
+            actions=np.full_like(first.actions, action),
+            truth=tuple(courses(spec.rules, state, [action]) for state in chosen),
+        )
+        for action in range(spec.n_actions)
+    )
 
 
 def _questions(
@@ -131,6 +168,7 @@ def ask(
         states=_joined([states for states, _ in parts]),
         weights=_joined([weights_of(imagined) for _, imagined in parts]),
         **{each: _offered([getattr(part, each) for _, part in parts]) for each in ("rewards", "p_ended")},
+        accepted=_one_behind_another([part.accepted for _, part in parts]),
         uncertainties={each: np.concatenate([getattr(part, each) for _, part in parts]) for each in offered},
         cpu_s=cpu_s,
         steps=sum(int(np.prod(imagined.pictures.shape[:3])) for _, imagined in parts),
@@ -177,6 +215,11 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         np.pad(part, [(0, 0), (0, most - part.shape[1]), *[(0, 0)] * (part.ndim - 2)], constant_values=value)
         for part, value in zip(parts, fill, strict=True)
     ])  # fmt: skip
+
+
+def _one_behind_another(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:
+    there = [part for part in parts if part is not None]
+    return np.concatenate(there) if len(there) == len(parts) else None
 
 
 def _offered(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import multiprocessing
 import os
 import time
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.entrants import file_name
@@ -27,8 +29,10 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
 from imagine_bench.judge.models import asking
 from imagine_bench.judge.models.asking import Answers, Reader, ask, call
+from imagine_bench.judge.models.change import Streams, counterfactual_error, noticing, streams_of
 from imagine_bench.judge.models.ends import Gallery
-from imagine_bench.judge.models.scores import by_depth, one_step_scores, ranking_scores
+from imagine_bench.judge.models.scores import after_the_end, by_depth, one_step_scores, ranking_scores
+from imagine_bench.judge.models.trained import TrainedModel, is_run, load_model, model_entry
 from imagine_bench.judge.models.truth import Questions, shares
 from imagine_bench.machine import describe_environment
 from imagine_bench.rules import states_of
@@ -40,7 +44,8 @@ from imagine_bench.world_models import WorldModel
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
-_FORMAT = 2
+_FORMAT = 3
+_AFTER = 6  # transitions after the end whose pictures are kept
 _READ = 1_000  # frames that the reader is measured on
 _READER = "imagine_bench.agents.world_models.reader"
 
@@ -50,7 +55,7 @@ class Judgement:
     """What is judged. InvalidValueError: nothing to judge, or sizes, seeds or samples out of range."""
 
     task: str
-    models: tuple[str, ...]
+    models: tuple[str, ...]  #: Names, or folders of runs, whose agents are judged as they are: once
     sizes: tuple[int, ...] = SIZES  #: Transitions of the same data, ascending
     seeds: tuple[int, ...] = (0, 1, 2)
     samples: int = SAMPLES  #: Futures imagined of each question
@@ -65,7 +70,19 @@ class Judgement:
         if not 1 <= self.samples <= 1_000:
             raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
         for name in self.models:
-            registry.world_model_entry(name)
+            model_entry(name)
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
+        if registry.task(self.task).sight is not None:
+            raise InvalidValueError(
+                f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
+                "all of it. Judge a task without the dials gesture and lag."
+            )
+
+    @property
+    def cells(self) -> list[Cell]:
+        """Every fit that is judged, and every trained agent."""
+        whole = [(s, m, n) for s in self.seeds for m in self.models for n in self.sizes]
+        return [Cell(m, s, n) for s, m, n in whole if not is_run(m) or (s, n) == (self.seeds[0], self.sizes[-1])]
 
     @property
     def folder_name(self) -> str:
@@ -98,6 +115,9 @@ class _World:
     one_step: Questions
     rollouts: Questions
     ranked: Questions
+    counterfactuals: tuple[Questions, ...]
+    after_the_end: Questions | None
+    streams: dict[str, Streams] | None  #: None where not all of the world is asked about
 
 
 def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
@@ -110,7 +130,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     for seed in judgement.seeds:
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
-    cells = [Cell(m, s, n) for s in judgement.seeds for m in judgement.models for n in judgement.sizes]
+    cells = judgement.cells
     waiting = [cell for cell in cells if not (folder / cell.file).exists()]
     failed: dict[str, None] = {}
     with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:
@@ -149,28 +169,43 @@ def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
 
 
 def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """The scores of one model, fitted once, and a few of its pictures beside the truth."""
+    """The scores of one model, fitted once, and a few of its pictures beside the truth.
+
+    Raises:
+        ImagineBenchError: It cannot be made, or fails.
+    """
     world = prepare(judgement, folder)
-    entry = registry.world_model_entry(cell.model)
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     dataset = data_of(judgement, folder, cell.seed)
-    model, price = make(entry, world, judgement.appearance, seeds)
+    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds)
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
     fit_s = time.process_time() - begun_s
-    questions = {"one_step": world.one_step, "rollouts": world.rollouts, "ranked": world.ranked}
+    questions = {
+        "one_step": world.one_step, "rollouts": world.rollouts, "ranked": world.ranked, "after": world.after_the_end
+    }  # fmt: skip
     answers: dict[str, Answers] = {}
     for name, each in questions.items():
-        answers[name] = ask(
+        if each is not None:
+            answers[name] = ask(
             model, cell.model, each, samples=judgement.samples, reader=world.reader, gallery=world.gallery,
             rng=seeds.child(name).generator(),
         )  # fmt: skip
+    again = [
+        ask(model, cell.model, each, samples=judgement.samples, reader=world.reader, gallery=world.gallery,
+            rng=seeds.child("counterfactuals").generator())
+        for each in world.counterfactuals
+    ]  # fmt: skip
     steps = sum(each.steps for each in answers.values())
-    scores = one_step_scores(world.spec, world.one_step, answers["one_step"], visited(dataset, cell.transitions))
+    seen = model.visited if isinstance(model, TrainedModel) else visited(dataset, cell.transitions)
+    scores = one_step_scores(world.spec, world.one_step, answers["one_step"], seen)
     found = {
         **cell._asdict(), "data": dataset.episodes.hash, **scores,
         **by_depth(world.rollouts, answers["rollouts"]), **ranking_scores(world.spec, world.ranked, answers["ranked"]),
+        **after_the_end(world.after_the_end, answers.get("after"), answers["one_step"]),
+        **noticing(world.streams, answers["one_step"]),
+        "counterfactual": counterfactual_error(world.counterfactuals, again),
         "futures": {
             "real": [_named(world.spec, shares(course)) for course in world.rollouts.truth[0]],
             "imagined": [_named(world.spec, answers["rollouts"].distribution(0, step)) for step in range(asking.DEPTH)],
@@ -178,6 +213,8 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
         "fit_s": fit_s, "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps,
         "parameters": int(call(cell.model, "parameters", model.parameters)), **price,
     }  # fmt: skip
+    if isinstance(model, TrainedModel):  # what it cost is its bench's to say
+        found |= {"fit_s": math.nan, "parameters": math.nan}
     return found, _pictures(model, world, scores["worst"], seeds)
 
 
@@ -189,19 +226,23 @@ def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
 
 
 def make(
-    entry: registry.WorldModelEntry, world: _World, appearance: str, seeds: SeedTree
+    name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree
 ) -> tuple[WorldModel, dict[str, Any]]:
-    """A new model, and what was spent on it beforehand: the encoder's name and frames."""
+    """A new model, or a trained agent, and what was spent on it beforehand: the encoder's name and frames."""
+    if is_run(name):
+        trained = load_model(Path(name), spec.id)
+        return trained, trained.price
+    entry = registry.world_model_entry(name)
     if entry.privileged:
-        return registry.load(entry.make)(world.spec, world.gallery), {"encoder": "", "encoder_frames": 0}
-    path = None if entry.encoder_kind is None else encoders.own(world.spec, appearance, entry.encoder_kind)
+        return registry.make_world_model(name, spec, gallery), {"encoder": "", "encoder_frames": 0}
+    path = None if entry.encoder_kind is None else encoders.own(spec, appearance, entry.encoder_kind)
     context = AgentContext(
-        n_actions=world.spec.n_actions, preprocessing=world.spec.preprocessing, encoder=path, seeds=seeds,
-        config_group=world.spec.config_group,
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=seeds,
+        config_group=spec.config_group,
     )  # fmt: skip
     card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
     price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
-    return registry.load(entry.make)(context), price
+    return registry.make_world_model(name, context), price
 
 
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
@@ -239,10 +280,12 @@ def prepare(judgement: Judgement, folder: Path) -> _World:
 def _prepared(task: str, appearance: str, folder: Path) -> _World:
     spec = registry.task(task)
     gallery = Gallery(spec, appearance)
+    one_step = asking.one_step(spec, gallery)
     return _World(
-        spec=spec, gallery=gallery, reader=_reader(spec, appearance, folder),
-        one_step=asking.one_step(spec, gallery), rollouts=asking.rollouts(spec, gallery),
-        ranked=asking.ranked(spec, gallery),
+        spec=spec, gallery=gallery, reader=_reader(spec, appearance, folder), one_step=one_step,
+        rollouts=asking.rollouts(spec, gallery), ranked=asking.ranked(spec, gallery),
+        after_the_end=asking.after_the_end(spec, gallery),
+        counterfactuals=asking.counterfactuals(spec, gallery), streams=streams_of(spec, one_step),
     )  # fmt: skip
 
 
@@ -280,13 +323,20 @@ def reader_errors(reader: Reader, spec: TaskSpec, appearance: str) -> dict[str, 
 
 
 def _pictures(model: WorldModel, world: _World, worst: list[int], seeds: SeedTree) -> dict[str, NDArray[Any]]:
-    """The worst transitions and one rollout, imagined once more: before, likeliest real outcome, imagined of each.
+    """Transitions and a rollout, imagined once more: before, likeliest real outcome, imagined of each.
 
     ``right`` says whether what is imagined, as read, may happen.
     """
     rng = seeds.child("pictures").generator()
     found: dict[str, NDArray[Any]] = {}
-    for name, questions, rows in (("worst", world.one_step, worst), ("futures", world.rollouts, [0])):
+    shown_: list[tuple[str, Questions, list[int]]] = [
+        ("worst", world.one_step, worst),
+        ("futures", world.rollouts, [0]),
+    ]
+    if world.after_the_end is not None:
+        some = np.linspace(0, len(world.after_the_end.states) - 1, _AFTER).astype(int)
+        shown_.append(("after", world.after_the_end, sorted(set(some.tolist()))))
+    for name, questions, rows in shown_:
         imagined = model.imagine(questions.frames[rows], questions.actions[rows], 1, rng)
         read = asking.read_pictures(imagined, world.reader, world.gallery, len(world.spec.macrostate_names))[:, 0]
         pictures = imagined.pictures[:, 0]
@@ -310,7 +360,8 @@ def _pictures(model: WorldModel, world: _World, worst: list[int], seeds: SeedTre
 
 def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
-    cells = [Cell(m, s, n) for m in judgement.models for s in judgement.seeds for n in judgement.sizes]
+    order = {model: place for place, model in enumerate(judgement.models)}
+    cells = sorted(judgement.cells, key=lambda cell: order[cell.model])
     return [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from imagine_bench.judge.models.asking import RANKED, Answers
 from imagine_bench.judge.models.truth import Questions, expected_reward
 
 _TIE = 1e-9
+_MOST = 0.5  # share of a transition's frames in which a filter keeps it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,26 +94,38 @@ def value_losses(exact: Machine, imagined: Machine, starts: tuple[State, ...], h
 
 
 def worth_of_refusing(
-    questions: Questions, answers: Answers, exact: Machine, imagined: Machine, starts: tuple[State, ...], horizon: int
+    unknown: Floats, exact: Machine, imagined: Machine, starts: tuple[State, ...], horizon: int
 ) -> float:
     """Reward a start that planning gains where it avoids the macro-actions that the model knows least of.
 
-    The share that is avoided is the best of 5, 10, 20, 30, 40 and 50 %, chosen with the truth; NaN where the model
-    offers no epistemic uncertainty.
+    ``unknown`` (A, X) is the epistemic uncertainty. The share that is avoided is the best of 5, 10, 20, 30, 40 and
+    50 %, chosen with the truth; 0 where none gains.
     """
-    if "epistemic" not in answers.uncertainties:
-        return math.nan
-    states, pairs = _pairs(questions)
-    unknown = np.zeros(imagined.reward.shape)
-    for (state, action), rows in pairs.items():
-        unknown[action, states[state]] = answers.uncertainties["epistemic"][rows, 0].mean()
+    masks = [unknown <= np.quantile(unknown, 1.0 - share) for share in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)]
+    return max(0.0, *(_gained(mask, exact, imagined, starts, horizon) for mask in masks))
+
+
+def worth_of_filter(kept: Floats, exact: Machine, imagined: Machine, starts: tuple[State, ...], horizon: int) -> float:
+    """The same where it avoids what the model's own filter discards; ``kept`` (A, X) is the share that it keeps."""
+    return _gained(kept >= _MOST, exact, imagined, starts, horizon)
+
+
+def _gained(
+    allowed: NDArray[np.bool_], exact: Machine, imagined: Machine, starts: tuple[State, ...], horizon: int
+) -> float:
     rows = [exact.states.index(state) for state in starts]
-    without = plan_values(exact, optimal_plan(imagined, horizon))[rows].mean()
-    best = 0.0
-    for share in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5):
-        plan = optimal_plan(imagined, horizon, unknown <= np.quantile(unknown, 1.0 - share))
-        best = max(best, float(plan_values(exact, plan)[rows].mean() - without))
-    return best
+    plans = [optimal_plan(imagined, horizon, mask) for mask in (None, allowed)]
+    without, within = (plan_values(exact, plan)[rows].mean() for plan in plans)
+    return float(within - without)
+
+
+def mean_by_pair(questions: Questions, values: NDArray[Any]) -> Floats:
+    """Means of one number a question, (N,), by macro-action and macrostate asked about. Shape (A, X)."""
+    states, pairs = _pairs(questions)
+    found = np.zeros((1 + max(action for _, action in pairs), len(states)))
+    for (state, action), rows in pairs.items():
+        found[action, states[state]] = values[rows].mean()
+    return found
 
 
 def regrets(questions: Questions, answers: Answers, rules: Rules) -> Floats:

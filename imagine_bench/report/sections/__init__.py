@@ -71,6 +71,7 @@ class Table:
     header: Sequence[str]  # names of the columns
     rows: Sequence[Sequence[str | Cell]]  # as many cells each
     caption: str = ""  # the text below it
+    notes: Sequence[str] = ()  # sentences below that, a line each
     why_dash: str = ""  # why a cell may hold a dash instead of a number; shown where one does
     folded: str = ""  # words to unfold it by; empty for a table that is always shown
     prose: bool = False  # whether its cells hold sentences, which are aligned to the left

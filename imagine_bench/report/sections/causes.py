@@ -57,9 +57,10 @@ def causes(found: plots.Failures) -> Section:
     return Section(
         title="Why agents failed",
         words=(
-            "Truth is swapped in, one stage at a time, until the episode is solved: frames read right; then a perfect "
-            "plan in the agent's own model; then the truth about transitions that it never experienced; then all of "
-            "the truth; then physics as the rules say. The first stage that solves it names the cause.",
+            "What an optimal policy fails with the same draws of chance, too, was bad luck. Else truth is swapped in, "
+            "one stage at a time, until the episode is solved: frames read right; then a perfect plan in the agent's "
+            "own model; then the truth about transitions that it never experienced; then all of the truth; then "
+            "physics as the rules say. The first stage that solves it names the cause.",
         ),
         images=(figure,),
         tables=(causes_table(found),),

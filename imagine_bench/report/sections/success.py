@@ -15,6 +15,7 @@ from imagine_bench.report.text import (
     detectable_words,
     interval_text,
     lasting,
+    paired_answers,
     paired_words,
     percent,
     signed_percent,
@@ -76,7 +77,7 @@ def _scores(data: ReportData, interval_words: str) -> Table:
         rows.append([name, *[percent(share)] * len(data.budgets)])
     return Table(
         name="scores", header=_heads("solved (%) after", data), rows=rows,
-        caption=f"Columns: real training episodes; in brackets: {interval_words}.",
+        caption=f"Columns: real training episodes; in brackets: {interval_words}.", notes=paired_answers(data),
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from imagine_bench.agents.factored.planner import Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Imaginer, Label, ReplayReader, ValueReader
+from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 
@@ -270,19 +270,6 @@ def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     assert (greedy.p_terminated[:-1] <= 0.5).all()
     with pytest.raises(InvalidValueError, match="must lie in"):
         learner.imagine(frame((0, 1, 0)), actions=np.array([9]), depth=1, rng=np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("factored", [True, False])
-def test_replayed_gives_its_own_actions_in_order_and_no_labels(factored: bool) -> None:
-    learner = agent(dynamics__factored=factored)
-    assert isinstance(learner, ReplayReader)
-    assert [len(part) for part in learner.replayed()] == [0, 0]
-    done = [((0, 1, 0), 1), ((2, 1, 1), 0), ((0, 1, 0), 1)]
-    for code, action in done:
-        learner.observe(fake_codes.transition(code, action), episode=0)
-    learner.learn_label(Observation(frame=frame((1, 2, 0))), np.array([2]), Label(reward=1.0, terminated=True))
-    macrostates, actions = learner.replayed()
-    assert list(zip(map(tuple, macrostates.tolist()), actions.tolist(), strict=True)) == done
 
 
 def test_curiosity_outlearns_random_exploration() -> None:

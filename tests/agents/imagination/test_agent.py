@@ -16,7 +16,7 @@ from imagine_bench.agents.imagination import model_only
 from imagine_bench.agents.imagination.rollouts import Counts
 from imagine_bench.agents.replay import RealMemory
 
-from imagine_bench.capabilities import Imaginer, MapPredictor, ReplayReader, ValueReader
+from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.seeding import SeedTree
@@ -193,34 +193,6 @@ def test_imagine_changes_nothing_and_follows_its_generator(kind: str, monkeypatc
     assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
     assert len(greedy.actions) <= 5
     assert (greedy.p_terminated[:-1] <= 0.5).all()
-
-
-@imaginers
-def test_predict_map_is_imagination_without_noise(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    overrides = {"model.components": 1, "imagination.temperature": 0.0, "model.dropout": 0.01}
-    agent = MAKERS[kind](context(monkeypatch, overrides))
-    live(agent, range(4), np.random.default_rng(0))
-    assert isinstance(agent, MapPredictor) and isinstance(agent, Imaginer)
-    states, actions = np.arange(6).repeat(ACTIONS), np.tile(np.arange(ACTIONS), 6)
-    before, frames = agent.state(), np.stack([frame(int(state)) for state in states])
-    found, again = (agent.predict_map(frames, actions, np.random.default_rng(3)) for _ in range(2))
-    assert same(before, agent.state()) and np.array_equal(found, again) and found.shape == (18, 1)
-    steps = [
-        agent.imagine(frames[i], actions=actions[i : i + 1], depth=1, rng=np.random.default_rng(3)) for i in range(18)
-    ]
-    assert np.array_equal(found, [step.macrostates[0] for step in steps])
-    assert len(np.unique(found)) > 1
-
-
-@imaginers
-def test_what_it_did_is_remembered_as_far_as_its_memory_reaches(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = MAKERS[kind](context(monkeypatch, {"memory.real": 5}))
-    assert isinstance(agent, ReplayReader)
-    done = [(state % 6, state % ACTIONS) for state in range(7)]
-    for state, action in done:
-        agent.observe(transition(state, action, 0.0, 1), episode=0)
-    states, actions = agent.replayed()
-    assert sorted(zip(states[:, 0].tolist(), actions.tolist(), strict=True)) == sorted(done[2:])
 
 
 def test_shown_rollouts_stay_rejected_after_the_first_rejection(monkeypatch: pytest.MonkeyPatch) -> None:

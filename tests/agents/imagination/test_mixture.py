@@ -107,17 +107,6 @@ def test_temperature_scales_the_noise_around_a_component() -> None:
     assert (warm != cold).all()
 
 
-def test_likeliest_is_the_mean_of_the_largest_component() -> None:
-    mixture = random_mixture(2, N)
-    found = mdn.likeliest(mixture)
-    for pair in np.ndindex(2, N):
-        assert torch.equal(found[pair], mixture.means[pair][int(mixture.log_weights[pair].argmax())])
-    assert torch.equal(mdn.likeliest(mixture.map(lambda part: part[0])), found[0])
-    draws = [mdn.sample(mixture.map(lambda part: part[0]), 0.0, torch.Generator().manual_seed(s)) for s in range(99)]
-    distances = (torch.stack(draws) - found[0]).abs().sum(-1)  # [99, N]
-    assert 0.2 < (distances == 0.0).double().mean() < 1.0  # it is drawn, and so are others
-
-
 def test_average_is_over_coefficients_means_and_variances() -> None:
     samples = random_mixture(5, 2, N)
     averaged = mdn.average(samples)

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_latents import ACTIONS, CODES, LATENTS, SMALL, FakeEncoder, context, frame
-from imagine_bench.agents.dqn import DQN
+from fake_latents import ACTIONS, CODES, LATENTS, SMALL, FakeEncoder, context, frame, transition
 from imagine_bench.agents.memory import drqn, imagination
 from imagine_bench.agents.memory.agent import RememberingAgent
 from imagine_bench.agents.memory.recurrence import START, Recurrence
 from imagine_bench.agents.memory.sequences import SequenceMemory
 
 from imagine_bench import registry
-from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.interfaces import Observation
 
 UNITS = 5
 RECURRENT: dict[str, Any] = {
@@ -31,35 +30,43 @@ def make(monkeypatch: pytest.MonkeyPatch, name: str, **overrides: Any) -> Rememb
     return MAKERS[name](replace(context(monkeypatch, hyperparameters="fast"), overrides=given))
 
 
-def recall(agent: DQN, episodes: range, rng: np.random.Generator) -> None:
+def recall(agent: RememberingAgent, episodes: range, rng: np.random.Generator) -> None:
     """Training in a world where the second macro-action is to be what the first frame said."""
     for number in episodes:
+        agent.begin_episode()
         cue = int(rng.integers(ACTIONS))
-        before, rewards, actions = Observation(frame=frame(1 + cue)), [0.0, 0.0], []
-        for step in range(2):
-            actions.append(agent.act(before, explore=True))
-            rewards[step] = float(step == 1 and actions[step] == cue)
-            after = before.followed_by(actions[step], frame(0))
-            transition = Transition(
-                observation=before, action=actions[step], reward=rewards[step], next_observation=after,
-                terminated=step == 1, truncated=False,
-            )  # fmt: skip
-            agent.observe(transition, episode=number)
-            before = after
+        for step, shown in enumerate((1 + cue, 0)):
+            action = agent.act(Observation(frame=frame(shown)), explore=True)
+            reward = (1.0 if action == cue else -1.0) if step else 0.0
+            agent.observe(transition(shown, action, reward, 0, terminated=step == 1), episode=number)
 
 
-def recalled(agent: DQN) -> float:
-    """Share of cues and first macro-actions after which the second is right."""
-    pasts = [(cue, first) for cue in range(ACTIONS) for first in range(ACTIONS)]
-    seen = [Observation(frame=frame(1 + cue)).followed_by(first, frame(0)) for cue, first in pasts]
-    return float(np.mean([agent.act(now, explore=False) == cue for now, (cue, _) in zip(seen, pasts, strict=True)]))
+def second(agent: RememberingAgent, cue: int) -> int:
+    """What is done greedily after the cue was shown and something was done."""
+    agent.begin_episode()
+    agent.act(Observation(frame=frame(1 + cue)), explore=False)
+    return agent.act(Observation(frame=frame(0)), explore=False)
 
 
-@pytest.mark.parametrize("name", MAKERS)
-def test_what_the_first_frame_said_is_done_later(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    agent = make(monkeypatch, name, **{"controller.learning_rate": 5e-3, "recurrence.units": 16})
-    recall(agent, range(260), np.random.default_rng(0))
-    assert recalled(agent) == 1.0
+def remembered(agent: RememberingAgent, frames: list[int], actions: list[int]) -> torch.Tensor:
+    """The state of the last frame."""
+    return agent.perception.recall([frame(each) for each in frames], actions)[0]
+
+
+LEARNING: dict[str, Any] = {
+    "recurrence.units": 16, "controller.learning_rate": 5e-3, "model.batch_size": 16, "model.spread": 1.0,
+    "model.learning_rate": 5e-3, "model.reward_hidden": (32,), "controller.epsilon_decay": 0.01,
+    "memory.imagined": 200, "memory.real": 1000,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "episodes"), [("drqn", 120), pytest.param("imagination_memory", 260, marks=pytest.mark.slow)]
+)
+def test_what_the_first_frame_said_is_done_later(monkeypatch: pytest.MonkeyPatch, name: str, episodes: int) -> None:
+    agent = make(monkeypatch, name, **LEARNING)
+    recall(agent, range(episodes), np.random.default_rng(0))
+    assert [second(agent, cue) for cue in range(ACTIONS)] == list(range(ACTIONS))
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -67,8 +74,7 @@ def test_acting_greedily_changes_nothing(monkeypatch: pytest.MonkeyPatch, name: 
     agent = make(monkeypatch, name)
     recall(agent, range(4), np.random.default_rng(1))
     before = agent.state()
-    seen = Observation(frame=frame(2)).followed_by(1, frame(0))
-    chosen = [agent.act(each, explore=False) for each in (seen, Observation(frame=frame(3)), seen)]
+    chosen = [second(agent, cue) for cue in (1, 2, 1)]
     after = agent.state()
     assert chosen[0] == chosen[2]
     assert all(np.array_equal(before.arrays[key], after.arrays[key]) for key in before.arrays)
@@ -88,18 +94,35 @@ def test_a_restored_agent_goes_on_in_the_same_bits(monkeypatch: pytest.MonkeyPat
 
 def test_memory_depends_on_every_frame_and_action(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make(monkeypatch, "drqn")
-    base = Observation(frame=frame(1)).followed_by(0, frame(0)).followed_by(2, frame(0))
-    others = [
-        Observation(frame=frame(2)).followed_by(0, frame(0)).followed_by(2, frame(0)),
-        Observation(frame=frame(1)).followed_by(1, frame(0)).followed_by(2, frame(0)),
-        Observation(frame=frame(1)).followed_by(0, frame(0)).followed_by(0, frame(0)),
-        Observation(frame=frame(0)),
-    ]
-    found = agent.perceive(base)
+    found = remembered(agent, [1, 0, 0], [0, 2])
     assert torch.equal(found[:LATENTS], CODES[0])
-    for other in others:
-        state = agent.perceive(other)
+    for frames, actions in (([2, 0, 0], [0, 2]), ([1, 0, 0], [1, 2]), ([1, 0, 0], [0, 0]), ([0], [])):
+        state = remembered(agent, frames, actions)
         assert torch.equal(state[:LATENTS], found[:LATENTS]) and not torch.allclose(state[LATENTS:], found[LATENTS:])
+
+
+def test_what_is_seen_while_acting_is_the_state_and_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch, "drqn")
+    frames = [frame(1), frame(0), frame(2)]
+    actions = [agent.act(Observation(frame=each), explore=False) for each in frames[:2]]
+    whole = remembered(agent, [1, 0, 2], actions)
+    assert torch.equal(agent.perceive(frames[1]), remembered(agent, [1, 0], actions[:1])), "it was acted on"
+    assert torch.equal(agent.perceive(frames[2]), whole), "it would be the next"
+    agent.begin_episode()
+    assert torch.equal(agent.perceive(frames[2]), remembered(agent, [2], []))
+
+
+def test_what_is_lived_is_stored_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch, "drqn", **{"controller.updates_per_step": 0})
+    agent.observe(transition(1, 2, 0.0, 4), episode=0)  # of a demonstrator: the agent did not act
+    agent.observe(transition(4, 0, 0.0, 5, truncated=True), episode=0)
+    agent.observe(transition(3, 1, 0.0, 2), episode=1)
+    rows = agent.real.arrays()
+    assert rows["step"].tolist() == [0, 1, 0] and rows["before"].tolist() == [START, 2, START]
+    first = remembered(agent, [1], [])[LATENTS:].numpy()
+    assert np.allclose(
+        rows["stored"], np.stack([np.zeros(UNITS, np.float32), first, np.zeros(UNITS, np.float32)]), atol=1e-6
+    )
 
 
 def filled(
@@ -171,7 +194,7 @@ def test_rollouts_carry_what_they_imagine(monkeypatch: pytest.MonkeyPatch) -> No
     agent = make(monkeypatch, "imagination_memory")
     assert isinstance(agent, imagination.ImaginingMemoryAgent)
     own, model = agent.imagination, agent.imagination.model
-    state = agent.perceive(Observation(frame=frame(2))).unsqueeze(0)
+    state = agent.perceive(frame(2)).unsqueeze(0)
     generator = torch.Generator().manual_seed(0)
     weights = own.draw_weights(generator)
     latents, actions = [state[:, :LATENTS]], [1, 2, 0]
@@ -207,7 +230,7 @@ def test_a_new_task_keeps_dynamics_and_what_remembers(monkeypatch: pytest.Monkey
 def test_lone_frames_begin_without_a_past(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = make(monkeypatch, "imagination_memory")
     lone, _ = agent.perception.posterior(frame(3))
-    assert torch.allclose(lone, agent.perceive(Observation(frame=frame(3))), atol=1e-6)
+    assert torch.allclose(lone, agent.perceive(frame(3)), atol=1e-6)
     mu, sigma = agent.perception.encoder.encode(np.stack([frame(3), frame(1)]))
     assert torch.allclose(mu[0], lone, atol=1e-6) and not sigma[:, LATENTS:].any()
     assert agent.read_frames(np.stack([frame(4)])).tolist() == FakeEncoder().read_macrostate(CODES[4:5]).tolist()

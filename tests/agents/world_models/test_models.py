@@ -81,6 +81,18 @@ def test_latent_models_offer_three_uncertainties(name: str, quick: Callable[[str
     assert (found.modal == 0).all() == (name == "gaussian")
 
 
+def test_the_filter_discards_what_its_threshold_says_and_all_that_follows(quick: Callable[[str], WorldModel]) -> None:
+    model = quick("mdn_thesis")
+    assert isinstance(model, latent.LatentModel)
+    first = imagined(model).epistemic
+    assert first is not None
+    model.imagination.filter.threshold = float(np.median(first[:, 0]))
+    kept = imagined(model).accepted
+    assert kept is not None and kept.dtype == bool
+    assert np.array_equal(kept[:, 0], first[:, 0] <= model.imagination.filter.threshold)
+    assert not (kept[:, 1:] & ~kept[:, :-1]).any()
+
+
 def test_the_structured_model_knows_what_it_never_tried() -> None:
     model = made("structured")
     assert isinstance(model, StructuredModel)

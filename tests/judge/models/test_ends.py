@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Frame, Rules, State, TaskSpec
-from imagine_bench.judge.models.asking import FRAMES, Answers, ask, one_step, ranked, rollouts
+from imagine_bench.judge.models.asking import FRAMES, Answers, after_the_end, ask, one_step, ranked, rollouts
 from imagine_bench.judge.models.ends import Copy, Exact, Gallery
-from imagine_bench.judge.models.scores import by_depth, one_step_scores, ranking_scores
+from imagine_bench.judge.models.scores import after_the_end as scores_after_the_end
+from imagine_bench.judge.models.scores import by_depth, filter_scores, one_step_scores, ranking_scores
 from imagine_bench.judge.models.truth import Questions
 from imagine_bench.world_models import Imagined, WorldModel
 
 ERRORS = (
     "total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "end_error",
-    "end_ece", "end_brier", "value_loss", "worst_value_loss",
+    "end_ece", "end_brier", "reward_ece", "reward_brier", "value_loss", "worst_value_loss",
 )  # fmt: skip
 
 
@@ -59,7 +60,7 @@ def test_exact_is_without_any_error(task: str) -> None:
     scores = world.scores(model)
     assert {name: scores[name] for name in ERRORS} == pytest.approx(dict.fromkeys(ERRORS, 0.0), abs=1e-12)
     assert scores["regret"] == 0.0 and scores["worth_of_refusing"] == 0.0
-    assert math.isnan(scores["auroc_epistemic"])  # there is no error to tell from the rest
+    assert math.isnan(scores["auroc_wrong"]) and math.isnan(scores["best_skill"])  # there is no error to find
     deep = by_depth(world.rollouts, world.answers(model, world.rollouts))
     assert deep["tv_by_depth"] == pytest.approx([0.0] * 10, abs=1e-12)
 
@@ -100,7 +101,7 @@ def test_copy_scores_what_enumeration_says(task: str) -> None:
     alive = [state for state in rules.states if not rules.is_terminal(state)]
     stays = [reached(rules, state, [action]).get(state, 0.0) for state in alive for action in range(rules.n_actions)]
     assert scores["total_variation"] == pytest.approx(1.0 - np.mean(stays))
-    assert math.isnan(scores["reward_error"]) and math.isnan(scores["auroc_epistemic"])
+    assert math.isnan(scores["reward_error"]) and math.isnan(scores["auroc_wrong"])
     deep = by_depth(world.rollouts, world.answers(Copy(), world.rollouts))["tv_by_depth"]
     pairs = list(zip(world.rollouts.states, world.rollouts.asked.tolist(), strict=True))
     for depth in (1, 2, 5):
@@ -119,6 +120,27 @@ def test_copy_loses_what_always_doing_the_same_loses() -> None:
     found = one_step_scores(short, world.one_step, world.answers(Copy(), world.one_step), set())
     assert found["value_loss"] == pytest.approx(np.mean(losses))
     assert found["worst_value_loss"] == pytest.approx(max(losses))
+    assert found["value_loss_by_start"] == pytest.approx(losses)
+
+
+def test_after_the_end_is_what_no_training_contains() -> None:
+    world = asked("arrow_puzzle")
+    questions = after_the_end(world.spec, world.gallery)
+    assert questions is not None and len(questions.states) == 200
+    rules = world.spec.rules
+    assert all(rules.is_terminal(state) for state in questions.states)
+    assert not set(questions.states) & set(world.one_step.states)
+    for state, steps in zip(questions.states, questions.truth, strict=True):
+        ((after, _),) = steps[0]
+        assert sum(a != b for a, b in zip(state, after, strict=True)) == 1, "a macro-action still turns a cube"
+    exact, still = Exact(world.spec, world.gallery), Copy()
+    found = [
+        scores_after_the_end(questions, world.answers(model, questions), world.answers(model, world.one_step))
+        for model in (exact, still)
+    ]
+    assert [each["after_the_end"] for each in found] == [0.0, 1.0]
+    assert found[0]["auroc_after_the_end"] == 0.5 and math.isnan(found[1]["auroc_after_the_end"])
+    assert math.isnan(scores_after_the_end(None, None, world.answers(still, world.one_step))["after_the_end"])
 
 
 class Mistaken(Exact):
@@ -147,6 +169,59 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert scores["outcome_brier"] == pytest.approx(2 * share)
     charged = {pairs[row // FRAMES] for row, away in enumerate(scores["by_question"]) if away}
     assert charged == wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
-    assert scores["auroc_epistemic"] == 1.0 and scores["risk"][0] == 0.0 and scores["risk"][-1] == pytest.approx(share)
+    assert (
+        scores["auroc_wrong"] == scores["best_skill"] == 1.0
+        and scores["risk"][0] == 0.0
+        and scores["risk"][-1] == pytest.approx(share)
+    )
     assert 0.0 < scores["where"]["coordinate"]["left arrow"] < share
     assert scores["where"]["coordinate"]["pointed cube"] == 0.0
+    assert math.isnan(scores["filter_keeps"]) and math.isnan(scores["worth_of_filter"])  # it offers no filter
+
+
+class Filtered(Mistaken):
+    """Its filter discards what it has wrong."""
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        found = super().imagine(frames, actions, samples, rng)
+        assert found.epistemic is not None
+        return dataclasses.replace(found, accepted=found.epistemic < 0.5)
+
+
+def test_a_filter_is_worth_what_its_mistakes_would_cost() -> None:
+    world = asked("arrow_puzzle")
+    rules = world.spec.rules
+    goals = {
+        (state, action)
+        for state, action in zip(world.one_step.states, world.one_step.asked[:, 0].tolist(), strict=True)
+        if any(o.terminated and not o.success for o in rules.outcomes(state, action))
+    }
+    scores = world.scores(Filtered(world, set(sorted(goals)[::3])))
+    assert scores["filter_skill"] == scores["best_skill"] == 1.0 and scores["filter_error"] == 0.0
+    assert scores["filter_keeps"] == pytest.approx(1.0 - scores["total_variation"])
+    assert scores["worth_of_filter"] <= scores["value_loss"] + 1e-9
+
+
+def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
+    away = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+    epistemic = np.array([[0.9], [0.3], [0.5], [0.1], [0.1]])
+    found = filter_scores(epistemic, epistemic <= 0.4, away)
+    assert found["filter_keeps"] == pytest.approx(3 / 5) and found["filter_error"] == pytest.approx(1 / 3)
+    assert found["filter_skill"] == pytest.approx(1 / 2 - 1 / 3)
+    assert found["best_skill"] == pytest.approx(1 - 1 / 3)  # between 0.1 and 0.3
+    assert filter_scores(-epistemic, None, away)["best_skill"] == 0.0  # to discard nothing
+    assert math.isnan(filter_scores(epistemic, None, np.zeros(5))["best_skill"])
+
+
+def test_rewards_are_judged_as_outcomes() -> None:
+    world = asked("pick_place")
+
+    class Greedy(Exact):
+        def imagine(self, *given: Any) -> Imagined:
+            found = super().imagine(*given)
+            return dataclasses.replace(found, rewards=np.full(found.pictures.shape[:3], 4.9))
+
+    scores = world.scores(Greedy(world.spec, world.gallery))
+    wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
+    assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
+    assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))

@@ -42,6 +42,8 @@ def test_what_is_right_is_taken_as_it_is() -> None:
         ({"probabilities": np.full(SHAPE, 0.2)}, "sum to 0.8 over S; they must sum to 1"),
         ({"probabilities": np.full(SHAPE, -0.25)}, "probabilities outside of [0, 1]"),
         ({"p_ended": np.full(SHAPE, 1.5)}, "p_ended outside of [0, 1]"),
+        ({"accepted": np.zeros((3, 2))}, "accepted of float64; give an array of bool"),
+        ({"accepted": np.zeros((2, 2), dtype=bool)}, "accepted of shape (2, 2); give (3, 2)"),
         ({"epistemic": np.zeros(3)}, "gave epistemic of shape (3,); give (3, 2)"),
     ],
 )

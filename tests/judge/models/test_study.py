@@ -29,6 +29,7 @@ version = "1.0"
 nearest = "their_models:ENTRY"
 raises = "their_models:RAISES"
 late = "their_models:LATE"
+unmade = "their_models:UNMADE"
 """
 _MORE = """
 class Raises(Nearest):
@@ -47,6 +48,10 @@ def raises(context):
 def late(context):
     return Late()
 
+def unmade(context):
+    return context.nothing
+
+UNMADE = WorldModelEntry(make="their_models:unmade", title="unmade")
 RAISES = WorldModelEntry(make="their_models:raises", title="raises")
 LATE = WorldModelEntry(make="their_models:late", title="late")
 """
@@ -81,11 +86,12 @@ _WORDS = ("judge", "--task", "pick_place", "--sizes", "20", "60", "--seeds", "10
 
 @pytest.mark.usefixtures("guest")
 def test_a_model_of_theirs_is_judged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [*_WORDS, "--out", str(tmp_path), "--models", "nearest", "raises", "late", "copy", "exact"]
+    words = [*_WORDS, "--out", str(tmp_path), "--models", "nearest", "raises", "late", "unmade", "copy", "exact"]
     assert main(words) == 1
     said = capsys.readouterr()
     assert "World model raises: fit() failed (RuntimeError: out of luck)." in said.err
     assert "World model late: imagine() failed (KeyError: 'depth')." in said.err
+    assert "World model unmade (their_models:unmade) cannot be used (AttributeError: " in said.err
     assert "nearest frame" in said.out and "exact" in said.out
     (folder,) = (path.parent for path in tmp_path.glob("*/judgement.json"))
     assert len(list(folder.glob("nearest-seed*.json"))) == 2 and not list(folder.glob("raises-*"))
@@ -127,5 +133,7 @@ def test_nonsense_is_refused() -> None:
         Judgement(task="pick_place", models=("oracle",))
     with pytest.raises(InvalidValueError, match="ascending numbers"):
         Judgement(task="pick_place", models=("copy",), sizes=(30, 20))
+    with pytest.raises(InvalidValueError, match=r"hide or delay a part .* without the dials gesture and lag"):
+        Judgement(task="arrows:cubes=2,lag=1", models=("copy",))
     with pytest.raises(InvalidValueError, match="samples is 0"):
         Judgement(task="pick_place", models=("copy",), samples=0)

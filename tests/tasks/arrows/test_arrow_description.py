@@ -172,8 +172,8 @@ def test_names_of_other_tasks_are_refused():
     for id_ in ("Arrows", "ArrowPuzzle", "PickPlace"):
         with pytest.raises(UnknownNameError, match="No keyword argument 'cubez'"):
             gymnasium.make(f"imagine_bench/{id_}-v0", cubez=3)
-    with pytest.raises(InvalidValueError, match="No environment shows distractors=2 yet"):
-        gymnasium.make("imagine_bench/Arrows-v0", distractors=2)
+        with pytest.raises(InvalidValueError, match="distractors is 5; give an integer from 0 to 4"):
+            gymnasium.make(f"imagine_bench/{id_}-v0", distractors=5)
 
 
 def test_turns_are_coupled_to_the_right_and_shuffled():

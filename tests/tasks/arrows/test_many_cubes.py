@@ -1,5 +1,6 @@
 """One to six cubes: placed and read back, turned with no neighbour moved, turned in twos, and slipping."""
 
+import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import Arrows
@@ -36,6 +37,18 @@ def test_a_turn_of_any_cube_moves_no_neighbour(cubes):
         assert world.read().macrostate == wanted
         shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
         assert np.delete(shift_m, cube).max(initial=0.0) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [1034, 1084])
+def test_fingers_open_no_wider_than_there_is_room(seed):
+    """With these seeds cubes stand so near that fingers opened as wide as at rest would move one by 0.4 mm or more."""
+    env = gymnasium.make("imagine_bench/Arrows-v0", cubes=6, forbid="none", appearance="strong").unwrapped
+    env.reset(seed=seed)
+    before = env.world.object_poses()
+    assert not env.step(3)[-1]["fault"]
+    shift_m = np.linalg.norm(env.world.object_poses()[:, :3] - before[:, :3], axis=1)
+    assert np.delete(shift_m, 1).max() < 1e-4 < shift_m[1]
+    env.close()
 
 
 def test_coupled_cubes_are_turned_in_one_macro_action():

@@ -100,8 +100,3 @@ def test_what_happens_is_as_often_as_the_rules_say(name, execution, steps):
     for said, came in walk(name, execution, steps).reshape(steps, 2, 2).transpose(1, 2, 0):
         assert abs(came.sum() - said.sum()) <= 3.5 * np.sqrt((said * (1 - said)).sum())
         assert 0 < came.sum() < steps
-
-
-def test_dials_that_no_environment_shows_are_refused():
-    with pytest.raises(ValueError, match="No environment shows distractors=1 yet; leave it out"):
-        gymnasium.make("imagine_bench/PickPlace-v0", distractors=1)

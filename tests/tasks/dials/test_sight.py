@@ -75,7 +75,9 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
 
 
 @pytest.mark.parametrize("id_", IDS)
-@pytest.mark.parametrize("dials", [{"gesture": "first"}, {"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}])
+@pytest.mark.parametrize(
+    "dials", [{"gesture": "first", "distractors": 2}, {"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}]
+)
 def test_lanes_and_singles_are_equal(id_, dials):
     vector = gymnasium.make_vec(f"{id_}-vector-v0", num_envs=4, threads=1, **KINEMATIC, **dials)
     sync = gymnasium.make_vec(

@@ -15,22 +15,22 @@ from imagine_bench.tasks.macro_env import MacroEnv
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.interfaces import AgentState
-from imagine_bench.tools.check import agent_checks, report, task_checks
+from imagine_bench.testing.contract import checks, report
 
 
 def test_a_task_of_ours_keeps_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
-    assert report(task_checks("arrow_puzzle")) == 0
+    assert report(checks("arrow_puzzle")) == 0
     assert capsys.readouterr().out.count("ok  ") == 7
 
 
 @pytest.mark.parametrize("agent", ["oracle", "dqn"])
 def test_our_agents_keep_the_contract(agent: str) -> None:
-    assert report(agent_checks(agent)) == 0
+    assert report(checks(agent=agent)) == 0
 
 
 def test_the_command_says_what_holds(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check"]) == 2
-    assert "give --task or --agent" in capsys.readouterr().err
+    assert "give --task, --agent or --model" in capsys.readouterr().err
     assert main(["check", "--agent", "random"]) == 0
     assert capsys.readouterr().out.startswith("ok     it is made\n")
 
@@ -70,7 +70,7 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
     def check(what: str, **changes: Any) -> str:
         monkeypatch.setattr(registry, "task", lambda name: dataclasses.replace(spec, **changes))
-        chosen = {words: check for words, check in task_checks("arrow_puzzle").items() if what in words}
+        chosen = {words: check for words, check in checks("arrow_puzzle").items() if what in words}
         assert report(chosen) == len(chosen) == 1
         return next(_failed(capsys))
 
@@ -113,6 +113,6 @@ class _Moody:
 
 def test_wrong_agents_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(registry, "make_agent", lambda name, context: _Moody())
-    assert report(agent_checks("dqn")) == 2
+    assert report(checks(agent="dqn")) == 2
     moody, forgetful = _failed(capsys)
     assert "asked twice with explore=False, it acts otherwise" in moody and "it acts otherwise" in forgetful

@@ -1,0 +1,60 @@
+"""How frames look, by name: a level, or factors from 0 to 1, such as ``light=0.5,camera=0.2``.
+
+Three levels are points of these factors; ``photo`` is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.interfaces import APPEARANCES
+
+FACTORS = ("light", "colors", "camera", "pose", "hand")
+"""Brightness; colors; the camera's pose; how objects lie at the start; the hand's pose."""
+POINTS: Mapping[str, Mapping[str, float]] = {
+    "clean": {},
+    "mild": {"light": 0.5, "pose": 0.5, "hand": 0.5},
+    "strong": dict.fromkeys(FACTORS, 1.0),
+}
+"""Levels by their factors, ascending; what is not named is 0."""
+_EXAMPLE = "light=0.5,camera=0.2"
+
+
+def appearance_name(given: str | Mapping[str, float], known: Iterable[str] = APPEARANCES) -> str:
+    """The one name of an appearance: a level's where it is one, else its factors above 0 in the order of FACTORS.
+
+    Raises:
+        UnknownNameError: No level or factor of that name.
+        InvalidValueError: A factor that is twice there, or no number from 0 to 1.
+    """
+    if not isinstance(given, Mapping) and not (isinstance(given, str) and "=" in given):
+        return require_known("appearance", given, (*known, f"factors such as {_EXAMPLE}"))
+    shares = factors_of(given)
+    said = ",".join(f"{name}={share}" for name, share in shares.items())
+    return next((level for level, point in POINTS.items() if point == shares), said)
+
+
+def factors_of(given: str | Mapping[str, float]) -> dict[str, float]:
+    """The factors above 0, in the order of FACTORS, of a mapping or a text. Raises as :func:`appearance_name`."""
+    shares = dict[str, float]()
+    for name, share in given.items() if isinstance(given, Mapping) else _pairs(given):
+        if name not in FACTORS:
+            raise UnknownNameError("factor of appearance", name, FACTORS)
+        if name in shares:
+            raise InvalidValueError(f"Appearance {brief(given)} names {name} twice; give it once.")
+        try:
+            shares[name] = -1.0 if isinstance(share, bool) else float(share)
+        except (TypeError, ValueError, OverflowError):
+            shares[name] = -1.0
+        if not 0.0 <= shares[name] <= 1.0:
+            raise InvalidValueError(f"Appearance has {name}={brief(share)}; give a number from 0 to 1.")
+    return {name: shares[name] for name in FACTORS if shares.get(name)}
+
+
+def _pairs(text: str) -> Iterator[tuple[str, str]]:
+    for pair in text.split(","):
+        name, equals, share = pair.partition("=")
+        if not equals:
+            raise InvalidValueError(f"Appearance {brief(text)} is not of the form {_EXAMPLE}.")
+        yield name, share

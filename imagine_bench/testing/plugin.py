@@ -1,0 +1,63 @@
+"""A plug-in of pytest: ``pytest --imagine-bench-task NAME`` adds the contract's checks to whatever tests there are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+_GUESTS = ("task", "agent", "model")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options as those of ``imagine-bench check``."""
+    group = parser.getgroup("imagine-bench", "the contract of imagine_bench's guests")
+    for guest in _GUESTS:
+        group.addoption(f"--imagine-bench-{guest}", metavar="NAME", help=f"check this {guest}")
+
+
+def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Add a test for each check."""
+    chosen = {guest: config.getoption(f"imagine_bench_{guest}") for guest in _GUESTS}
+    if not any(chosen.values()):
+        return
+    from imagine_bench.errors import ImagineBenchError  # noqa: PLC0415 - nothing where no option is given
+    from imagine_bench.testing.contract import checks  # noqa: PLC0415 - as above
+
+    try:
+        found = checks(**chosen)
+    except ImagineBenchError as error:
+        raise pytest.UsageError(str(error)) from error
+    name = chosen["agent"] or chosen["model"] or chosen["task"]
+    for words, check in ((f"{name}: {what}", check) for what, check in found.items()):
+        items.append(Check.from_parent(session, name=words, nodeid=f"imagine-bench::{words}", check=check))
+
+
+class Check(pytest.Item):
+    """One sentence of the contract."""
+
+    def __init__(self, *, check: Callable[[], None], **given: Any) -> None:
+        super().__init__(**given)
+        self._check = check
+
+    def runtest(self) -> None:
+        """Pass, fail, or be skipped where the guest may do without what is checked."""
+        from imagine_bench.testing.common import NotOffered  # noqa: PLC0415 - as above
+
+        try:
+            self._check()
+        except NotOffered as why:
+            pytest.skip(str(why))
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        """The sentence that says what is wrong; of an error that is not ours, where it happened."""
+        from imagine_bench.errors import ImagineBenchError  # noqa: PLC0415 - as above
+
+        if isinstance(excinfo.value, ImagineBenchError):
+            return str(excinfo.value)
+        return super().repr_failure(excinfo, style)
+
+    def reportinfo(self) -> tuple[str, None, str]:
+        """The sentence itself."""
+        return "imagine_bench", None, self.name

@@ -1,0 +1,116 @@
+"""Agents built to fail for one known reason, trained and tested in real benches, are charged exactly that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import flawed_agents  # noqa: F401 - registers its agents
+import gymnasium
+import pytest
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.audit import why
+from imagine_bench.bench.bench import bench
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Rules, State
+from imagine_bench.protocols.control import protocol
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import episode_seed
+from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.store.results import Checkpoint
+from imagine_bench.store.trained import load_trained
+
+
+def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint, why.Tested]:
+    """A bench of one agent, and the causes of its last test's failures."""
+    few: dict[str, Any] = {
+        "agents": (agent,), "seeds": (0,), "budgets": (150,), "evaluation_episodes": 40, "execution": "kinematic",
+        "open_loop_starts": 0, "recorded_episodes": 0, "sampled_futures": 0,
+    }  # fmt: skip
+    folder = bench(protocol(task, "smoke", **{**few, **changes}), {}, root=root, launcher=Inline()).folder
+    run = load_bench(folder).runs[0]
+    analysis = why.WhyAnalysis(registry.task(task), appearance="clean")
+    (found,) = analysis.measure(load_trained(run.folder))
+    failed = [test for test, each in enumerate(run.checkpoints[0].solved or "") if each == "0"]
+    assert list(found.causes) == failed, "every failure has a cause, and nothing else has"
+    return run.checkpoints[0], found
+
+
+@pytest.mark.parametrize(
+    ("agent", "cause", "task"),
+    [
+        ("blind", "misread", "arrows:cubes=2"),
+        ("bad", "values", "arrows:cubes=2"),
+        ("not_greedy", "planning", "pick_place"),
+        ("wrong_model", "model", "pick_place"),
+        ("timid", "unexperienced", "pick_place"),
+        ("timid_modeller", "unexperienced", "arrows:cubes=2"),
+    ],
+)
+def test_one_flaw_is_the_cause_of_every_failure(agent: str, cause: str, task: str, tmp_path: Path) -> None:
+    _, found = asked(tmp_path, agent, task)
+    assert set(found.causes.values()) == {cause} and len(found.causes) > 20
+
+
+def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None:
+    """In contact physics, where the planner takes cubes to be elsewhere."""
+    changes: dict[str, Any] = {"execution": "physics", "physics": (("plan_error_mm", 30.0),), "budgets": (1,)}
+    row, found = asked(tmp_path, "sound", "arrows:cubes=2", evaluation_episodes=6, **changes)
+    assert set(found.causes.values()) == {"fault"} and row.faults > 0
+
+
+def best_sets(rules: Rules, horizon: int) -> list[dict[State, set[int]]]:
+    """The macro-actions of largest return with 1 to ``horizon`` left, by the definition."""
+    value, found = dict.fromkeys(states_of(rules), 0.0), list[dict[State, set[int]]]()
+    for _ in range(horizon):
+        q = {
+            state: [
+                sum(o.probability * (o.reward + (0.0 if o.terminated else value[o.macrostate])) for o in outcomes)
+                for outcomes in (rules.outcomes(state, action) for action in range(rules.n_actions))
+            ]
+            for state in value
+        }
+        value = {state: max(each) for state, each in q.items()}
+        found.append({s: {a for a, each in enumerate(q[s]) if each > value[s] - 1e-6} for s in value})
+    return found
+
+
+@pytest.mark.parametrize("task", ["arrows:cubes=2,slip=0.7", "arrows:cubes=3,fickle=0.2,slip=0.4"])
+def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, tmp_path: Path) -> None:
+    """An optimal policy lives each test again in the real environment, whose generator draws the same.
+
+    Among equals it does what the agent does, as 'unlucky' says.
+    """
+    row, found = asked(tmp_path, "bad", task, evaluation_episodes=120, budgets=(1,))
+    assert row.kept is not None and row.beliefs is not None
+    spec = registry.task(task)
+    sets, usual = best_sets(spec.rules, spec.horizon), dict(zip(states_of(spec.rules), row.beliefs.action, strict=True))
+    env, missed = gymnasium.make(spec.env_id, execution="kinematic"), set[int]()
+    whole = set[int]()
+    for test in found.causes:
+        terminated = False
+        env.reset(seed=episode_seed("evaluation", 0, test))
+        for action in row.kept.actions_of(test):
+            _, _, terminated, _, _ = env.step(action)
+        if terminated:
+            continue  # later draws are not known, and an end hides whether the human changed their mind
+        whole.add(test)
+        _, info = env.reset(seed=episode_seed("evaluation", 0, test))
+        over, left = False, spec.horizon
+        while not over:
+            state, left = tuple(info["macrostate"].tolist()), left - 1
+            best = sets[left][state]
+            _, _, terminated, truncated, info = env.step(usual[state] if usual[state] in best else min(best))
+            over = terminated or truncated
+        missed |= set() if info["is_success"] else {test}
+    env.close()
+    assert {test for test in whole if found.causes[test] == "unlucky"} == missed
+    assert 3 < len(missed) < len(whole) - 5
+
+
+def test_what_frames_hide_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    for task in ("arrows:cubes=2,gesture=first", "pick_place:lag=1"):
+        with pytest.raises(InvalidValueError, match="hide something, or are old"):
+            asked(tmp_path, "bad", task, evaluation_episodes=2, budgets=(1,))

@@ -1,0 +1,61 @@
+"""Trained agents are judged by their pictures: what they say those show counts for nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fake_reader import BlindReader
+from small_runs import Inline, small
+
+from imagine_bench.bench import bench as benches
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.judge.models import study
+from imagine_bench.judge.models.study import Judgement, judge, kept
+from imagine_bench.judge.models.trained import load_model, model_entry
+from imagine_bench.report.judge import judgement_report
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    wanted = small(budgets=(2,), agents=("table", "imaginer"), seeds=(0,))
+    result = benches.bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    return {run.agent: run.folder for run in result.runs}
+
+
+def test_right_macrostates_beside_black_frames_are_fog(
+    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "_reader", lambda spec, appearance, folder: BlindReader(len(spec.macrostate_names)))
+    run = str(runs["imaginer"])
+    judgement = Judgement(task="arrow_puzzle", models=(run, "copy"), sizes=(20, 40), seeds=(1000, 1001), samples=1)
+    monkeypatch.setattr(study.asking, "STATES", 20)
+    folder, failed = judge(judgement, tmp_path, workers=1)
+    assert failed == []
+    found = [cell for cell in kept(folder, judgement) if cell["model"] == run]
+    assert [(cell["seed"], cell["transitions"]) for cell in found] == [(1000, 40)], "it learns nothing here: once"
+    assert found[0]["nothing"] == found[0]["total_variation"] == found[0]["after_the_end"] == 1.0
+    assert found[0]["fit_s"] is None
+    seen = found[0]["where"]["in its data"]
+    assert set(seen) <= {"seen", "never"}
+    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(
+        ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read"), 0.0
+    )))  # fmt: skip
+    assert "imaginer, seed 0  " in judgement_report(folder, judgement)
+    study._prepared.cache_clear()
+    study._data.cache_clear()
+
+
+def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path]) -> None:
+    assert model_entry(str(runs["table"])).title == "table, seed 0"
+    with pytest.raises(InvalidValueError, match="does not imagine"):
+        load_model(runs["table"], "arrow_puzzle")
+    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
+        load_model(runs["imaginer"], "pick_place")
+
+
+def test_what_it_experienced_is_what_the_bench_counted(runs: dict[str, Path]) -> None:
+    visited = load_model(runs["imaginer"], "arrow_puzzle").visited
+    assert 0 < len(visited) <= 2 * 20
+    assert all(len(state) == 4 and 0 <= action < 6 for state, action in visited)

@@ -1,0 +1,159 @@
+"""Appearance by factors: names, the levels as their points, and that a factor varies what it says and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, looks_of
+
+from imagine_bench import registry
+from imagine_bench.appearance import FACTORS, POINTS, appearance_name, factors_of
+from imagine_bench.data.collect import collect, policy_of
+from imagine_bench.errors import ImagineBenchError
+from imagine_bench.judge.models.study import Judgement
+from imagine_bench.protocols.control import protocol
+from imagine_bench.store import encoders
+
+
+def make(task="Arrows", **options):
+    env = gymnasium.make(f"imagine_bench/{task}-v0", execution="kinematic", disable_env_checker=True, **options)
+    return env.unwrapped
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("mild", "mild"),
+        ("photo", "photo"),
+        ({}, "clean"),
+        ({"light": 0, "hand": 0.0}, "clean"),
+        ("light=0.5,pose=0.50,hand=5e-1", "mild"),
+        (dict.fromkeys(FACTORS, 1), "strong"),
+        ("camera=0.2,light=0.5", "light=0.5,camera=0.2"),
+        ({"camera": np.float64(0.2), "light": 0.5, "pose": 0}, "light=0.5,camera=0.2"),
+        ("hand=1", "hand=1.0"),
+    ],
+)
+def test_one_appearance_has_one_name(given, name):
+    assert appearance_name(given) == name == appearance_name(name) == appearance(given).name
+    wanted = protocol("arrow_puzzle", "smoke", agents=("random",), appearance=name)
+    if isinstance(given, str):
+        assert protocol("arrow_puzzle", "smoke", agents=("random",), appearance=given).hash == wanted.hash
+        assert Judgement(task="arrow_puzzle", models=("copy",), appearance=given).appearance == name
+
+
+def test_names_are_read_back_as_the_factors_they_say():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        shares = {name: float(rng.choice([0.0, 0.5, 1.0, rng.uniform()])) for name in FACTORS if rng.random() < 0.6}
+        name = appearance_name(shares)
+        assert (POINTS.get(name) or factors_of(name) if "=" in name else POINTS[name]) == factors_of(shares)
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ("strng", "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, "),
+        ("light=2", "Appearance has light='2'; give a number from 0 to 1."),
+        ({"light": -0.1}, "Appearance has light=-0.1; give a number from 0 to 1."),
+        ({"light": True}, "Appearance has light=True; give a number from 0 to 1."),
+        ({"light": None}, "Appearance has light=None; give a number from 0 to 1."),
+        ("light=nan", "Appearance has light='nan'; give a number from 0 to 1."),
+        ("light=high", "Appearance has light='high'; give a number from 0 to 1."),
+        (
+            "ligth=0.5",
+            "No factor of appearance 'ligth'. Did you mean 'light'? Known: light, colors, camera, pose, hand.",
+        ),
+        ("light=0.5,light=0.5", "names light twice; give it once."),
+        ("light=0.5,strong", "is not of the form light=0.5,camera=0.2."),
+        (3, "No appearance '3'."),
+    ],
+)
+def test_bad_appearances_end_with_one_sentence(given, complaint):
+    asks = [appearance_name, lambda given: make(appearance=given)]
+    asks += [lambda given: protocol("arrow_puzzle", "smoke", appearance=given)] if isinstance(given, str) else []
+    for ask in asks:
+        with pytest.raises(ImagineBenchError) as caught:
+            ask(given)
+        assert complaint in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("level", POINTS)
+def test_levels_are_points_of_the_factors(level):
+    found = between(level, POINTS[level])
+    assert found == LEVELS[level]
+    widths = {field.name for field in dataclasses.fields(found)} - {"name", "pool", "gamma_half_width", "noise_std"}
+    half = between("", dict.fromkeys(FACTORS, 0.25))
+    assert all(
+        getattr(LEVELS["clean"], each) < getattr(half, each) < getattr(LEVELS["strong"], each) for each in widths
+    )
+
+
+@pytest.mark.parametrize("task", ["Arrows", "PickPlace"])
+@pytest.mark.parametrize("level", POINTS)
+def test_levels_and_their_factors_give_the_same_frames(task, level):
+    factors = ",".join(f"{name}={POINTS[level].get(name, 0)}" for name in FACTORS)
+    named, said, given = (make(task, appearance=each) for each in (level, factors, dict(POINTS[level])))
+    for seed in range(3):
+        frames = [env.reset(seed=seed)[0] for env in (named, said, given)]
+        for action in (0, 2, 1):
+            frames += [env.step(action)[0] for env in (named, said, given)]
+        for index in range(0, len(frames), 3):
+            np.testing.assert_array_equal(frames[index], frames[index + 1])
+            np.testing.assert_array_equal(frames[index], frames[index + 2])
+    said.set_state(named.get_state())
+
+
+SEEN = {"light": (1, 2), "colors": (3,), "camera": (4, 5)}
+"""Of each factor, where in ``looks_of`` it shows; the other two show in positions."""
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_factor_varies_what_it_says_and_by_as_much_as_it_says(factor):
+    """Within 200 draws nearly as far as the interpolated width, never further; everything else stays."""
+    env, still = make(appearance={factor: 0.4}), make()
+    rng, level = np.random.default_rng(0), between("", {factor: 0.4})
+    usual = [each.copy() for each in looks_of(still.model)]
+    reach = np.zeros((len(usual), 200))
+    cubes, hands = np.empty((200, 3, 7)), np.empty((200, 3))
+    for draw in range(200):
+        env.world.place((0, 1, 2, 1), rng)
+        env.world.vary(rng)
+        looks = zip(looks_of(env.model), usual, strict=True)
+        reach[:, draw] = [np.abs(now - then).max() for now, then in looks]
+        cubes[draw], hands[draw] = env.world.object_poses(), env.data.mocap_pos[0]
+    changed = set(np.flatnonzero(reach.max(axis=1)).tolist()) - {0}
+    assert changed == set(SEEN.get(factor, ()))
+    apart_m = np.ptp(cubes[:, :, :2], axis=0).max() / 2
+    assert 0.95 * level.object_offset_m < apart_m <= level.object_offset_m * (1 + 1e-9)
+    assert (np.ptp(hands, axis=0).max() > 0) == (factor == "hand")
+    if factor == "hand":
+        assert np.ptp(hands, axis=0) / 2 == pytest.approx(level.hand_offset_m, rel=0.1)
+    if factor == "light":
+        assert reach[1].max() == pytest.approx(level.light_fraction * usual[1].max(), rel=0.05)
+
+
+def test_an_own_point_has_an_encoder_of_its_own_trained_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path))
+    calls = []
+
+    def train(spec, *, appearance, out, **_):
+        calls.append(appearance)
+        (out / f"{spec.encoder}-{appearance}.safetensors").write_bytes(b"weights")
+
+    spec, name = registry.task("arrow_puzzle"), "light=0.5,camera=0.2"
+    monkeypatch.setattr(registry, "load", lambda code: train)
+    paths = [encoders.own(spec, name, "latents") for _ in range(2)]
+    assert calls == [name] and paths[0] == paths[1] and paths[0].is_file() and tmp_path in paths[0].parents
+    assert encoders.find(encoders.identity(paths[0])) == paths[0]
+    assert encoders.own(spec, "mild", "latents") == encoders.bundled()["arrow_puzzle-mild"] and calls == [name]
+
+
+def test_a_dataset_says_its_appearance_by_its_one_name():
+    spec = registry.task("arrow_puzzle")
+    made = {"episodes": 1, "seed": 0, "execution": "kinematic"}
+    _, _, card = collect(spec, policy_of("random", spec, 0), appearance="camera=0.5,light=0.50", **made)
+    assert card["appearance"] == "light=0.5,camera=0.5"
