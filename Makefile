@@ -9,6 +9,7 @@ PYTEST ?= -n auto --dist loadfile
 takes_bench := TASK PRESET AGENTS SEEDS BUDGETS APPEARANCE EXECUTION ENCODER VARIANTS LAUNCHER WORKERS DEVICE ARGS
 takes_peers := $(takes_bench)
 takes_study := TASK VARIANTS LAUNCHER WORKERS ARGS
+takes_suite := EXPERIMENT AGENTS SEEDS LAUNCHER WORKERS ARGS
 takes_plan := TASK EXECUTION ENCODER ARGS
 takes_policy := TASK ENCODER ARGS
 takes_judge := TASK MODELS SEEDS APPEARANCE WORKERS ARGS
@@ -42,7 +43,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan policy judge verify why study view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan policy judge verify why study suite view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -77,6 +78,9 @@ why: ready  ## Give every failed test episode of the newest bench the one cause 
 
 study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench study $(options)
+
+suite: ready  ## Run the ladder of experiments, each of which turns one dial; EXPERIMENT=memory runs one
+	@$(BIN)/imagine-bench suite $(options)
 
 view: ready  ## Open the newest recording in the Rerun viewer
 	@$(BIN)/imagine-bench view $(options)

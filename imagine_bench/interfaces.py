@@ -183,7 +183,7 @@ class RuleFacts:
     """What the rules alone say about a task, computed by enumeration."""
 
     chance_level: float  #: success probability of a uniformly random agent within the horizon
-    optimum: float  #: success probability of an optimal agent within the horizon
+    optimum: float  #: largest success probability of any policy within the horizon
     optimal_return: float  #: mean undiscounted return of an optimal agent over the start states
     mean_plan_length: float  #: mean number of actions of an optimal agent over the start states
 

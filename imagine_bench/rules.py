@@ -265,15 +265,16 @@ def greedy(policy: NDArray[np.int64], n_actions: int) -> Floats:
 def facts(rules: Rules, horizon: int) -> RuleFacts:
     """Chance level, optimum and plan length of a task, exactly.
 
-    The optimal agent is the stationary one with the largest undiscounted return; all figures are means over the
-    start macrostates, truncated at ``horizon`` actions.
+    Figures are means over the start macrostates, truncated at ``horizon`` actions. The optimum is that of all policies,
+    also of those that count actions; the optimal agent is the stationary one with the largest undiscounted return.
     """
     tables = tabulate(rules)
+    best = horizon_optimum(tables, horizon)
     optimal = evaluate(tables, greedy(optimal_policy(tables), rules.n_actions), horizon)
     chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / rules.n_actions), horizon)
     return RuleFacts(
         chance_level=float(chance.success[tables.starts].mean()),
-        optimum=float(optimal.success[tables.starts].mean()),
+        optimum=float(best.success[tables.starts].mean()),
         optimal_return=float(optimal.returns[tables.starts].mean()),
         mean_plan_length=float(optimal.length[tables.starts].mean()),
     )

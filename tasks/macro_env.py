@@ -1,12 +1,12 @@
-"""The one Gymnasium environment: exact rules, a world that acts and can be read, and images of it."""
+"""The one Gymnasium environment: exact rules, a world that acts and can be read, and what is observed of it."""
 
 from __future__ import annotations
 
 import copy
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -15,33 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, ArmMotion, Frame, Motion, Outcome, PhysicsSettings, Shape3D, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, TaskSpec
 from imagine_bench.rules import states_of
 
 from .dials.gesture import hides
 from .dials.lag import Lag
+from .frames import frames_of
 from .motion.executor import MacroResult, finish
 from .motion.executor import Motion as Acting
 from .observations import Observer
-from .rendering import Renderer, View, image_size
-from .scene_reader import DRAWN_GROUPS, arm_motion_of, body_names, poses_of, shapes_of
+from .rendering import Renderer, image_size
+from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA, SCENE_GROUP
+from .scenes.cameras import FRAME_PX, agent_camera, human_camera_view
+from .scenes.constants import HUMAN_CAMERA
 from .window import HAS_PYGAME, Window
 from .world import World, WorldState
 
-FRAME_PX = 64
-MAX_MOTION_HZ = 1000
 _WINDOW_HZ = 25.0  # images a second of a window
-_ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
-_AGENT_VIEW = View(camera=AGENT_CAMERA, width=FRAME_PX, height=FRAME_PX, groups=(SCENE_GROUP,))
-
-
-def human_camera_view(camera: str, width: int, height: int) -> View:
-    """A view for people: everything in it, soft edges, shadows and sky."""
-    quality = {"shadow_px": 2048, "samples": 4, "slices": 28}
-    return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS, sky=True, **quality)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +52,7 @@ class EnvState:
     under_way: tuple[tuple[Any, ...], ...] = field(default=((), ()), repr=False)
 
 
-class MacroEnv(gymnasium.Env[Any, np.int64]):
+class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
     Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
@@ -135,20 +127,16 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         level = appearance_level(appearance)
-        self._make_world, self.world = make_world, make_world(level)
+        self._window = Window(spec.title) if self.render_mode == "human" else None
+        FilmedScene.__init__(self, make_world(level), motion_hz or (_WINDOW_HZ if self._window else 0.0))
         self.world.set_physics(settings)
+        self._make_world, self._begun = make_world, False
         self._kind = (spec.id, self._execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
-        self._agent_camera = agent_camera(self.world.model)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self._observing_camera)
         self.observation_space = self._observer.space
         self._render_camera = Renderer(self.world.model, human_camera_view(camera, *image_size(width, height)))
-        self._human_camera: Renderer | None = None
-        self._window = Window(spec.title) if self.render_mode == "human" else None
-        self.capture_motion_hz = motion_hz or (_WINDOW_HZ if self._window else 0.0)
-        self._begun, self._people = False, self._mocap()
-        self._latest: MacroResult | None = None
         self._macrostate = self._shown = self._starts[0]
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
@@ -290,45 +278,6 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         )  # fmt: skip
         self._steps, (self._lag.kept, self._shown_lag.kept) = state.steps, state.under_way
 
-    # --- SceneReader ---------------------------------------------------------------------------------------------
-
-    @property
-    def capture_motion_hz(self) -> float:
-        """Samples a simulated second that :meth:`step` keeps of a motion, 0 (none) to 1000; nothing else changes."""
-        return self._capture_motion_hz
-
-    @capture_motion_hz.setter
-    def capture_motion_hz(self, rate_hz: float) -> None:
-        if not isinstance(rate_hz, (int, float)) or not 0 <= rate_hz <= MAX_MOTION_HZ:
-            raise InvalidValueError(f"Motion cannot be captured at {brief(rate_hz)} Hz; give 0 to {MAX_MOTION_HZ}.")
-        self._capture_motion_hz = float(rate_hz)
-
-    def shapes(self) -> tuple[Shape3D, ...]:
-        """Every drawable part, arm included."""
-        return shapes_of(self.world.model)
-
-    def motion(self) -> Motion:
-        """The motion of the latest macro-action as captured, else one sample of the standing scene.
-
-        People stand still meanwhile; what they do when it is over is one sample more.
-        """
-        latest, model, data = self._latest, self.world.model, self.world.data
-        standing = poses_of(model, data.qpos[None], *self._mocap())
-        if latest is None or not len(latest.time_s):
-            return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
-        time_s, poses = latest.time_s, poses_of(model, latest.qpos, *self._people)
-        if not all(np.array_equal(*pair) for pair in zip(self._people, self._mocap(), strict=True)):
-            time_s = np.append(time_s, time_s[-1] + _ANSWER_S)
-            poses = np.concatenate([poses, standing])
-        return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
-
-    def arm_motion(self) -> ArmMotion:
-        """The arm during the latest macro-action as captured, else one sample of the standing scene."""
-        latest, model, data = self._latest, self.world.model, self.world.data
-        if latest is None or not len(latest.time_s):
-            return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
-        return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
-
     def frame_of(self, macrostate: Sequence[int], rng: np.random.Generator | None = None) -> Frame:
         """The frame (64, 64, 3) that a macrostate would show, without going there: nothing changes here.
 
@@ -337,66 +286,9 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         Raises:
             InvalidValueError: Not a macrostate of this task.
         """
-        from .frames import frames_of  # noqa: PLC0415  (a scene of its own, which itself needs this module)
-
         there = np.array([self._start({"macrostate": macrostate})], dtype=np.int64)
         rng = np.random.default_rng(0) if rng is None else rng
         return frames_of(self._make_world, self._rules, there, self._kind[2], rng)[0]
-
-    def agent_view(self) -> Frame:
-        """The frame that agents see, drawn now. Shape (64, 64, 3)."""
-        return self.world.develop(self._agent_camera.frame(self.world.data, self.world.model))
-
-    def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """An image of the whole scene with the arm. Shape (height, width, 3)."""
-        view = human_camera_view(HUMAN_CAMERA, *image_size(width, height))
-        if self._human_camera is None or self._human_camera.view != view:
-            if self._human_camera is not None:
-                self._human_camera.close()
-            self._human_camera = Renderer(self.world.model, view)
-        return self._human_camera.frame(self.world.data)
-
-    def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
-        return np.stack([self.human_view(width, height) for _ in self.replay()])
-
-    def agent_film(self) -> Frame:
-        """What the agent's camera sees at each sample that :meth:`arm_motion` gives. Shape (K, 64, 64, 3)."""
-        return np.stack([self.agent_view() for _ in self.replay()])
-
-    # --- MuJoCo --------------------------------------------------------------------------------------------------
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The compiled scene."""
-        return self.world.model
-
-    @property
-    def data(self) -> mujoco.MjData:
-        """The scene's state; only to be read."""
-        return self.world.data
-
-    def replay(self) -> Iterator[float]:
-        """Set the scene to each captured sample of the latest macro-action in turn; at the end it stands as before.
-
-        Yields:
-            Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
-        """
-        world, latest = self.world, self._latest
-        if latest is None or not len(latest.time_s):
-            yield 0.0
-            return
-        standing, people = world.data.qpos.copy(), self._mocap()
-        try:
-            world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
-            for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
-                world.data.qpos[:] = qpos
-                world.update()
-                yield time_s
-        finally:
-            world.data.qpos[:] = standing
-            world.data.mocap_pos[:], world.data.mocap_quat[:] = people
-            world.update()
 
     # --- details -------------------------------------------------------------------------------------------------
 
@@ -412,9 +304,7 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """The camera of an image that is observed; the agent's own where that is the same."""
         if part == "human":
             return Renderer(self.world.model, human_camera_view(HUMAN_CAMERA, size, size))
-        if size == FRAME_PX:
-            return self._agent_camera
-        return Renderer(self.world.model, replace(_AGENT_VIEW, width=size, height=size))
+        return self._agent_camera if size == FRAME_PX else agent_camera(self.world.model, size)
 
     def _vary(self, *, move_objects: bool = True) -> None:
         """Draw how this moment looks, and where that is hidden by chance, whether the gesture is seen."""
@@ -426,10 +316,6 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
         """Be in a macrostate, once a moment, of which the frame that is due may show less, or another."""
         self._macrostate = macrostate
         self._shown = self._shown_lag.deliver(self.world.shown(macrostate))
-
-    def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""
-        return self.world.data.mocap_pos.copy(), self.world.data.mocap_quat.copy()
 
     def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
         if not isinstance(options, Mapping):
@@ -494,8 +380,3 @@ class MacroEnv(gymnasium.Env[Any, np.int64]):
             "ik_error_m": np.float64(0.0 if latest is None else latest.ik_error_m),
             "action_mask": self.action_masks().view(np.int8),
         }
-
-
-def agent_camera(model: mujoco.MjModel) -> Renderer:
-    """The agent's view of a model."""
-    return Renderer(model, _AGENT_VIEW)

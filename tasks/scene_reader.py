@@ -1,17 +1,25 @@
-"""A compiled scene as plain shapes and motions, for drawing elsewhere."""
+"""A scene for people: as plain shapes and motions, to be drawn elsewhere, and as images."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import ArmMotion, Floats, Shape3D
+from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.interfaces import ArmMotion, Floats, Frame, Motion, Shape3D
 
+from .motion.executor import MacroResult
+from .rendering import Renderer, image_size
 from .scenes.arm import ARM_JOINTS, FINGER_JOINTS, TCP_SITE
-from .scenes.constants import ARM_GROUP, SCENE_GROUP, SETTING_GROUP
+from .scenes.cameras import DRAWN_GROUPS, agent_camera, human_camera_view
+from .scenes.constants import HUMAN_CAMERA
+from .world import World
 
-DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
+MAX_MOTION_HZ = 1000
+_ANSWER_S = 0.05  # so long after a macro-action people answer it, in a recording
 _PLANE_HALF_THICKNESS_M = 0.005
 _KINDS = {
     mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
@@ -115,3 +123,113 @@ def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Flo
         time_s=time_s, joint_rad=joints, joint_rad_s=speeds, gripper_m=fingers,
         joint_command_rad=commands, gripper_command_m=grips, tcp_in_world=poses,
     )  # fmt: skip
+
+
+class FilmedScene:
+    """A world and its latest macro-action, for people: as shapes, as motion, and as images.
+
+    Args:
+        world: The scene.
+        motion_hz: :attr:`capture_motion_hz`.
+    """
+
+    def __init__(self, world: World, motion_hz: float) -> None:
+        self.world, self.capture_motion_hz = world, motion_hz
+        self._agent_camera = agent_camera(world.model)
+        self._human_camera: Renderer | None = None
+        self._latest: MacroResult | None = None
+        self._people = self._mocap()
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+        return self.world.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The scene's state; only to be read."""
+        return self.world.data
+
+    @property
+    def capture_motion_hz(self) -> float:
+        """Samples a simulated second that :meth:`step` keeps of a motion, 0 (none) to 1000; nothing else changes."""
+        return self._capture_motion_hz
+
+    @capture_motion_hz.setter
+    def capture_motion_hz(self, rate_hz: float) -> None:
+        if not isinstance(rate_hz, (int, float)) or not 0 <= rate_hz <= MAX_MOTION_HZ:
+            raise InvalidValueError(f"Motion cannot be captured at {brief(rate_hz)} Hz; give 0 to {MAX_MOTION_HZ}.")
+        self._capture_motion_hz = float(rate_hz)
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable part, arm included."""
+        return shapes_of(self.world.model)
+
+    def motion(self) -> Motion:
+        """The motion of the latest macro-action as captured, else one sample of the standing scene.
+
+        People stand still meanwhile; what they do when it is over is one sample more.
+        """
+        latest, model, data = self._latest, self.world.model, self.world.data
+        standing = poses_of(model, data.qpos[None], *self._mocap())
+        if latest is None or not len(latest.time_s):
+            return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
+        time_s, poses = latest.time_s, poses_of(model, latest.qpos, *self._people)
+        if not all(np.array_equal(*pair) for pair in zip(self._people, self._mocap(), strict=True)):
+            time_s = np.append(time_s, time_s[-1] + _ANSWER_S)
+            poses = np.concatenate([poses, standing])
+        return Motion(body_names=body_names(model), time_s=time_s, poses_in_world=poses)
+
+    def arm_motion(self) -> ArmMotion:
+        """The arm during the latest macro-action as captured, else one sample of the standing scene."""
+        latest, model, data = self._latest, self.world.model, self.world.data
+        if latest is None or not len(latest.time_s):
+            return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
+        return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
+
+    def agent_view(self) -> Frame:
+        """The frame that agents see, drawn now. Shape (64, 64, 3)."""
+        return self.world.develop(self._agent_camera.frame(self.world.data, self.world.model))
+
+    def human_view(self, width: int = 640, height: int = 480) -> Frame:
+        """An image of the whole scene with the arm. Shape (height, width, 3)."""
+        view = human_camera_view(HUMAN_CAMERA, *image_size(width, height))
+        if self._human_camera is None or self._human_camera.view != view:
+            if self._human_camera is not None:
+                self._human_camera.close()
+            self._human_camera = Renderer(self.world.model, view)
+        return self._human_camera.frame(self.world.data)
+
+    def film(self, width: int = 640, height: int = 480) -> Frame:
+        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        return np.stack([self.human_view(width, height) for _ in self.replay()])
+
+    def agent_film(self) -> Frame:
+        """What the agent's camera sees at each sample that :meth:`arm_motion` gives. Shape (K, 64, 64, 3)."""
+        return np.stack([self.agent_view() for _ in self.replay()])
+
+    def replay(self) -> Iterator[float]:
+        """Set the scene to each captured sample of the latest macro-action in turn; at the end it stands as before.
+
+        Yields:
+            Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
+        """
+        world, latest = self.world, self._latest
+        if latest is None or not len(latest.time_s):
+            yield 0.0
+            return
+        standing, people = world.data.qpos.copy(), self._mocap()
+        try:
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
+            for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
+                world.data.qpos[:] = qpos
+                world.update()
+                yield time_s
+        finally:
+            world.data.qpos[:] = standing
+            world.data.mocap_pos[:], world.data.mocap_quat[:] = people
+            world.update()
+
+    def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""
+        return self.world.data.mocap_pos.copy(), self.world.data.mocap_quat.copy()

@@ -17,6 +17,7 @@ from imagine_bench import __version__
 from imagine_bench.cli.analysis import Judge, Plan, Policy, Verify, Why
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
+from imagine_bench.cli.suite import Suite
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
 from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
 from imagine_bench.store.files import reason
@@ -34,6 +35,7 @@ Command = (
     | Verify
     | Why
     | Study
+    | Suite
     | Dataset
     | View
     | Encoder
@@ -84,7 +86,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except (ModuleNotFoundError, MemoryError, RecursionError, UnicodeError) as error:
         return _say(_words(error))
     except KeyboardInterrupt:
-        resumes = isinstance(command, Bench | Judge | Study)
+        resumes = isinstance(command, Bench | Judge | Study | Suite)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
         return _say(f"interrupted; the same command {then}.", INTERRUPTED)
     return 0

@@ -35,9 +35,11 @@ QUESTIONS = {
     "Which outcomes, how likely?": {
         "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps",
         "after_the_end": "after the end", "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
-        "outcome_ece": "calibration error", "outcome_brier": "Brier", "reward_error": "reward error",
-        "reward_ece": "its calibration", "reward_brier": "its Brier", "end_error": "end error",
-        "end_ece": "its calibration", "end_brier": "its Brier",
+        "outcome_ece": "calibration error", "outcome_brier": "Brier",
+    },
+    "Which rewards and ends?": {
+        "reward_error": "reward error", "reward_ece": "calibration error", "reward_brier": "Brier",
+        "end_error": "end error", "end_ece": "calibration error", "end_brier": "Brier",
     },
     "What do mistakes cost?": {
         "value_loss": "value loss", "worst_value_loss": "from the worst start", "regret": "regret of 1 of 5",
@@ -46,7 +48,7 @@ QUESTIONS = {
         "auroc_wrong": "AUROC, wrong", "auroc_never": "never seen", "auroc_either": "either",
         "auroc_after_the_end": "after the end", "auroc_noisy": "aleatoric, noisy", "auroc_several": "modal, several",
         "filter_keeps": "its filter keeps",
-        "filter_error": "error of that", "filter_skill": "skill of its threshold", "best_skill": "of the best one",
+        "filter_error": "error of that", "filter_skill": "skill of its filter", "best_skill": "of the best threshold",
         "worth_of_refusing": "worth of refusing", "worth_of_filter": "worth of its filter",
     },
     "Does it notice?": {
@@ -63,15 +65,17 @@ COLUMNS = {name: words for columns in QUESTIONS.values() for name, words in colu
 _WORDS = {
     "Which outcomes, how likely?": "Total variation to the exact distribution, 0 for equal ones and 1 for those that "
     "share nothing, also of transitions after the end of an episode, which no data contains; missed and invented "
-    "outcomes a transition; the share of pictures that show nothing of this world. A reward counts as the nearest that "
-    "the rules give.",
+    "outcomes a transition; the share of pictures that show nothing of this world.",
+    "Which rewards and ends?": "Error of the expected reward, in units of reward, and of the probability of the end. "
+    "For calibration and Brier score a reward counts as the nearest that the rules give.",
     "What do mistakes cost?": "V* - V of the policy that is optimal in the model, mean over starts, and the exact "
     "return that the sequence ranked first of five leaves to the best. In units of reward.",
     "Does it know?": "AUROC of the epistemic uncertainty for transitions imagined wrongly, never seen in the data, or "
     "either, and for those after the end; of the aleatoric for random ones; of the modal for several outcomes. Skill: "
-    "the share of wrong ones that a filter discards, less that of right ones. Worth: reward a start that planning "
-    "gains without the macro-actions it knows least of (the best share, chosen with the truth), and without those that "
-    "its own filter discards.",
+    "the share of wrong ones that a filter discards, less that of right ones; the best threshold of the epistemic "
+    "uncertainty is chosen with the truth, and a filter may read more. Worth: reward a start that planning gains "
+    "without the macro-actions it knows least of (the best share, chosen with the truth), and without those that its "
+    "own filter discards.",
     "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
     f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: what it imagines of two macro-actions with the "
@@ -81,17 +85,8 @@ _WORDS = {
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
 _SHARES = {
-    *(
-        "total_variation",
-        "tv_5",
-        "tv_10",
-        "after_the_end",
-        "nothing",
-        "outcome_ece",
-        "reward_ece",
-        "end_error",
-        "end_ece",
-    ),
+    *("total_variation", "tv_5", "tv_10", "after_the_end", "nothing"),
+    *("outcome_ece", "reward_ece", "end_error", "end_ece"),
     *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
@@ -123,8 +118,9 @@ def by_model(found: Sequence[dict[str, Any]]) -> Cells:
 
 def scores(cells: Sequence[dict[str, Any]], name: str) -> list[float]:
     """A score of each cell, by name; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
+    digits = 3 if name.endswith("_s") else 9  # what takes less than a millisecond takes nothing
     values = [cell["tv_by_depth"][int(name[3:]) - 1] if name.startswith("tv_") else cell[name] for cell in cells]
-    return [math.nan if value is None else float(value) for value in values]
+    return [math.nan if value is None else round(float(value), digits) for value in values]
 
 
 def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
@@ -172,11 +168,13 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     )  # fmt: skip
     images = [*_futures(judgement, pictures), *_risk_images(judgement, cells, largest)]
     by_question = {title: _question_section(title, judgement, cells) for title in QUESTIONS}
-    outcomes, costs, *others = by_question.values()
+    outcomes, rewards, costs, *others = by_question.values()
     sections = [
-        Section(title="In short", words=[_reader_words(folder)], tables=[short], images=images),
+        Section(title="In short", words=[_reader_words(folder)], tables=[short]),
+        Section(title="One future, and the errors of the surest answers", images=images),
         Section(title="How much data does it need?", images=[_curve_image(judgement, cells)]),
         replace(outcomes, images=[_depth_image(judgement, cells, largest)]),
+        rewards,
         replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
         _where_section(spec, judgement, cells, largest, pictures),
         *others,

@@ -283,6 +283,7 @@ def lanes_ratio(spec: TaskSpec, execution: str, lanes: int, turns: int, *, block
             many.step(rng.integers(spec.n_actions, size=lanes))
 
     together()
+    together()  # by now the process that draws beside this one has begun
     times = [[timeit.timeit(each, number=1) for each in (alone, together)] for _ in range(blocks)]
     one.close()
     many.close()

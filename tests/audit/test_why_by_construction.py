@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import flawed_agents  # noqa: F401 - registers its agents
 import gymnasium
 import pytest
+from flawed_agents import Sound
 from small_runs import Inline
 
 from imagine_bench import registry
@@ -29,6 +29,7 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
         "agents": (agent,), "seeds": (0,), "budgets": (150,), "evaluation_episodes": 40, "execution": "kinematic",
         "open_loop_starts": 0, "recorded_episodes": 0, "sampled_futures": 0,
     }  # fmt: skip
+    Sound.task = task
     folder = bench(protocol(task, "smoke", **{**few, **changes}), {}, root=root, launcher=Inline()).folder
     run = load_bench(folder).runs[0]
     analysis = why.WhyAnalysis(registry.task(task), appearance="clean")

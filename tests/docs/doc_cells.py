@@ -296,6 +296,17 @@ def policy_failure(agent: str, episodes: str) -> str:
     return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
 
 
+def caused(agent: str, episodes: str, cause: str) -> str:
+    """Failed tests of all seeds, or the share of them that has a cause, %."""
+    runs = [
+        run["failures"][episodes] for run in _json("arrow_puzzle-mild-why/why.json")["runs"] if run["agent"] == agent
+    ]
+    count = sum(sum(run.values()) for run in runs)
+    if cause == "all":
+        return f"{count:,}"
+    return percent(sum(run.get(cause, 0) for run in runs) / count) if count else "–"
+
+
 def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
     """A count over the plans of an agent; ``solved`` with Wilson's interval where they are of one run."""
     found = [each for each in _json(f"{folder}/plans.json") if each["agent"] == agent]
@@ -326,6 +337,23 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
         rows = [row for row in csv.DictReader(file) if (row["agent"], row["depth"]) == (agent, depth)]
     value = float(np.mean([float(row[measure]) for row in rows]))
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
+
+
+def judged(model: str, transitions: str, score: str, folder: str) -> str:
+    """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
+    with (RESULTS / folder / "scores.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["model"], row["transitions"]) == (model, transitions)]
+    values = [float(row[score]) for row in rows if row[score]]
+    if not values:
+        return "–"
+    digits = 2 if score.startswith(("auroc", "total", "counter")) or "skill" in score else 1
+    value, *ends = (f"{number:.{digits}f}" for number in (statistics.iqm(values), *_ends(values, digits == 2)))
+    few = f" ({len(values)} of {len(rows)})" if len(values) < len(rows) else ""
+    return (value if "nan" in ends or len({value, *ends}) == 1 else f"{value} [{', '.join(ends)}]") + few
+
+
+def _ends(values: list[float], share: bool) -> tuple[float, float]:
+    return statistics.interval(values, share=share)
 
 
 # Regression, speed, rules ----------------------------------------------------------------------------------------
@@ -399,7 +427,8 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     for function in (
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
-        last_of, two_answers, thesis_plans, policy, policy_failure, plans, futures, choice, thesis_error,
-        claim, decomposed, speed, margin, walked, goals_and_starts, chance_exact, shortest, price, price_to, coverage,
+        last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
+        thesis_error, claim, decomposed, speed, margin, walked, goals_and_starts, chance_exact, shortest, price,
+        price_to, coverage,
     )
 }  # fmt: skip

@@ -6,18 +6,20 @@ import pytest
 
 from imagine_bench import registry
 
-WORLDS = tuple(name for name in registry.TASKS if registry.task(name).targets is not None)
+_MEASURED = [task for task in map(registry.task, registry.TASKS) if task.targets is not None]
+WORLDS = tuple(task.id for i, task in enumerate(_MEASURED) if task.encoder not in [e.encoder for e in _MEASURED[:i]])
 """The first task of each scene."""
 
 
 def draw_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let views for people be drawn without shadows and soft edges, which cost a software renderer 30 ms each."""
 
-    from imagine_bench.tasks import macro_env
+    from imagine_bench.tasks import macro_env, scene_reader
     from imagine_bench.tasks.rendering import View
-    from imagine_bench.tasks.scene_reader import DRAWN_GROUPS
+    from imagine_bench.tasks.scenes.cameras import DRAWN_GROUPS
 
     def view(camera: str, width: int, height: int) -> View:
         return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS)
 
-    monkeypatch.setattr(macro_env, "human_camera_view", view)
+    for module in (macro_env, scene_reader):
+        monkeypatch.setattr(module, "human_camera_view", view)

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from episodes import EPISODES, arrays_of, simulated, solved
 
 from imagine_bench import registry
 
@@ -23,7 +24,6 @@ WORLDS = [
     "arrows:cubes=4,goal=3210,coupling=neighbour,slip=0.4",
 ]
 LARGEST = "arrows:cubes=6,coupling=neighbour,slip=0.1,fickle=0.2"
-EPISODES = 100_000
 
 
 def status(world, directions, pointed):
@@ -121,41 +121,22 @@ def test_rules_say_what_the_oracle_says(name):
     assert spec.horizon == (named or max(10, 2 * max(starts.values())))
 
 
-def simulated(spec, found, leads, choose):
-    """Share of successes among many episodes of the oracle's, all played at once; ``choose`` gives actions of rows."""
-    index = {pair: row for row, pair in enumerate(found)}
-    most = max(map(len, leads.values()))
-    reached, share = (
-        np.zeros((spec.n_actions, len(index), most), dtype=np.int64),
-        np.zeros((spec.n_actions, len(index), most)),
-    )
-    for (pair, action), chances in leads.items():
-        reached[action, index[pair], : len(chances)] = [index[each] for each in chances]
-        share[action, index[pair], : len(chances)] = list(chances.values())
-    limits = share.cumsum(axis=2)
-    over, won = (np.array([what in kinds for what in found.values()]) for kinds in (("goal", "illegal"), ("goal",)))
-    rng = np.random.default_rng(1)
-    starts = np.array([index[state[:-1], state[-1]] for state in spec.rules.start_states])
-    row = starts[rng.integers(len(starts), size=EPISODES)]
-    for _ in range(spec.horizon):
-        action = choose(row, rng)
-        drawn = (rng.random((len(row), 1)) > limits[action, row]).sum(axis=1).clip(max=most - 1)
-        row = np.where(over[row], row, reached[action, row, drawn])
-    return won[row].mean()
-
-
 def _facts_agree(name):
+    """Chance and optimum, by the other statement of the rules and another solver, and in episodes of both."""
     spec = registry.task(name)
-    found, leads, _ = oracle(spec.rules.world)
-    facts, policy = spec.facts(), np.array([spec.rules.optimal_action((*each, cube)) for each, cube in found])
-    for expected, share in (
-        (
-            facts.chance_level,
-            simulated(spec, found, leads, lambda row, rng: rng.integers(spec.n_actions, size=len(row))),
-        ),
-        (facts.optimum, simulated(spec, found, leads, lambda row, rng: policy[row])),
-    ):
-        assert share == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / EPISODES) + 1e-5)
+    found, leads, depth = oracle(spec.rules.world)
+
+    def outcomes(pair, action):
+        chances = leads[pair, action].items()
+        return [(to, chance, found[to] != "going on", found[to] == "goal") for to, chance in chances]
+
+    world = arrays_of([pair for pair, length in depth.items() if length], spec.n_actions, outcomes)
+    optimum, chance, policy = solved(world, spec.horizon)
+    facts = spec.facts()
+    assert (facts.optimum, facts.chance_level) == pytest.approx((optimum, chance), abs=1e-9)
+    for expected, how in ((facts.chance_level, None), (facts.optimum, policy)):
+        limit = 4 * np.sqrt(expected * (1 - expected) / EPISODES) + 1e-5
+        assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
 
 
 @pytest.mark.parametrize("name", WORLDS)
