@@ -71,7 +71,7 @@ AGENTS: dict[str, AgentEntry] = {
     "oracle": AgentEntry(
         make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True,
         observes=OBSERVATIONS,
-        description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
+        description="Is told what frames show, remembers it and knows the rules: acts optimally. The ceiling, no learner.",
     ),
     "dqn": AgentEntry(
         make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS", title="DQN",
