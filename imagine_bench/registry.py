@@ -86,6 +86,18 @@ AGENTS: dict[str, AgentEntry] = {
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
     ),
+    "drqn": AgentEntry(
+        make="imagine_bench.agents.memory.drqn:make", settings="imagine_bench.agents.memory.settings:DRQN",
+        title="DQN + memory",
+        description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
+        "sequences as R2D2 does.",
+    ),
+    "imagination_memory": AgentEntry(
+        make="imagine_bench.agents.memory.imagination:make", title="imagination + memory",
+        settings="imagine_bench.agents.memory.settings:IMAGINATION_MEMORY",
+        description="Like imagination + uncertainty, but the world model is recurrent (MDN-RNN), and rollouts carry "
+        "what it remembers.",
+    ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make", encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
