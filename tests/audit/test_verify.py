@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from forger import FORGERIES
 from small_runs import Inline, context, do, small
 
-from imagine_bench.audit.verify import Replays, price, verdicts, verify
+from imagine_bench.audit.verify import Replays, _verify_test, price, verdicts, verify
 from imagine_bench.bench.bench import bench
 from imagine_bench.bench.evaluation import play_test_episode, replay
 from imagine_bench.bench.run_state import environments
@@ -111,6 +112,16 @@ def test_kept_episodes_are_small_and_come_back(tmp_path: Path) -> None:
         )
         assert row.kept.success.sum() == row.successes and row.kept.returns.mean() == row.mean_return
     assert size < 5_000
+
+
+def test_a_run_that_keeps_no_test_episodes_says_so(finished: Path) -> None:
+    run = load_bench(finished).runs[0]
+    row = dataclasses.replace(run.checkpoints[0], kept=None)
+    with (
+        environments(small(), observation="state") as envs,
+        pytest.raises(ArtefactError, match="keeps no test"),
+    ):
+        _verify_test(row, 8, "evaluation", Replays(*envs))
 
 
 def test_what_is_not_there_is_said_in_a_line_a_run(finished: Path, tmp_path: Path) -> None:
