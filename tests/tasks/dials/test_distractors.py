@@ -75,6 +75,9 @@ def test_neither_rules_nor_physics_notice(id_):
     start = plain.start_states[0]
     for env in scenes:
         env.reset(seed=1, options={"macrostate": start})
+    model = scenes[1].model
+    drawn = [index for index in range(model.ngeom) if model.geom(index).name.startswith(("screen_", "distractor_"))]
+    assert len(drawn) == 35 and not (model.geom_contype[drawn] | model.geom_conaffinity[drawn]).any()
     for action in (0, 1, 3):
         steps = [env.step(action) for env in scenes]
         assert steps[0][1:4] == steps[1][1:4] and not steps[0][4]["fault"]
