@@ -42,15 +42,17 @@ def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: floa
 class Controller(nn.Module):
     """Action values of latents: a network, a slowly updated target network, and Adam.
 
-    The generator draws the initial weights; its device is the controller's.
+    The generator draws the initial weights of the dense network that it has where none is given; its device is the
+    controller's.
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: ControllerSettings, generator: torch.Generator
-    ) -> None:
+        self, latent_size: int, n_actions: int, settings: ControllerSettings, generator: torch.Generator,
+        network: nn.Module | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.n_actions, self.settings = n_actions, settings
-        self.network = self.target = mlp((latent_size, *settings.hidden, n_actions), generator)
+        self.network = self.target = network or mlp((latent_size, *settings.hidden, n_actions), generator)
         if settings.target_rate < 1.0:
             self.target = copy.deepcopy(self.network).requires_grad_(False)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate, fused=True)
@@ -107,11 +109,19 @@ class DQN:
         self.rng = seeds.child("exploration").generator()
         self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
-        self.controller = Controller(perception.latent_size, n_actions, settings.controller, weights)
-        prioritised = settings.memory.priority > 0.0
-        self.real = RealMemory(settings.memory.real, perception.latent_size, device, prioritised=prioritised)
+        self.controller = self.new_controller(weights)
+        self.real = self.new_memory(device)
         self.meters = Meters()
         self.steps = self.updates = 0
+
+    def new_controller(self, generator: torch.Generator) -> Controller:
+        """One that has learned nothing."""
+        return Controller(self.perception.latent_size, self.n_actions, self.settings.controller, generator)
+
+    def new_memory(self, device: torch.device) -> RealMemory:
+        """One that is empty."""
+        settings = self.settings.memory
+        return RealMemory(settings.real, self.perception.latent_size, device, prioritised=settings.priority > 0.0)
 
     @property
     def tested(self) -> Controller:
@@ -128,8 +138,11 @@ class DQN:
         return encoder.read_macrostate(encoder.encode(frames)[0])
 
     def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
-        mu, _ = self.perception.posterior(observation.frame)
-        return controller.values(mu.unsqueeze(0))[0].cpu().numpy()
+        return controller.values(self.perceive(observation.frame).unsqueeze(0))[0].cpu().numpy()
+
+    def perceive(self, frame: Frame) -> Tensor:
+        """The state that the controller reads: here the mean latents of the frame. Shape (Z,)."""
+        return self.perception.posterior(frame)[0]
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act epsilon-greedily on the mean latents; greedily, and changing nothing, without ``explore``."""
@@ -139,16 +152,21 @@ class DQN:
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Store the transition, and learn from replayed ones N_R times; DivergedError if a loss is not finite."""
-        now = self.perception.posterior(transition.observation.frame)
-        then = self.perception.posterior(transition.next_observation.frame)
-        self.real.add(now, transition.action, transition.reward, then, transition.terminated)
+        state = self.store(transition)
         self.learn_values(self.real, self.settings.controller.updates_per_step)
-        self.learn_more(now[0], episode)
+        self.learn_more(state, episode)
         self.meters.count("time/controller_s")
         self.steps += 1
 
+    def store(self, transition: Transition) -> Tensor:
+        """Add a real transition to the memory; the state that it began in. Shape (Z,)."""
+        now = self.perception.posterior(transition.observation.frame)
+        then = self.perception.posterior(transition.next_observation.frame)
+        self.real.add(now, transition.action, transition.reward, then, transition.terminated)
+        return now[0]
+
     def learn_more(self, z: Tensor, episode: int) -> None:
-        """What a subclass does after the updates on real transitions, with the mean latents (Z,) it acted in."""
+        """What a subclass does after the updates on real transitions, with the state (Z,) it acted in."""
 
     def learn_values(self, memory: Transitions, updates: int) -> None:
         """Update the controller on batches of a memory, if that holds anything yet."""

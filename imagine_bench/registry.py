@@ -71,7 +71,7 @@ AGENTS: dict[str, AgentEntry] = {
     "oracle": AgentEntry(
         make="imagine_bench.agents.baselines:make_oracle", learns=False, needs_encoder=False, privileged=True,
         observes=OBSERVATIONS,
-        description="Is shown the true state and the rules and acts optimally: the ceiling, no learner.",
+        description="Is told what frames show, remembers it, knows the rules, acts optimally: the ceiling, no learner.",
     ),
     "dqn": AgentEntry(
         make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS", title="DQN",
@@ -85,6 +85,18 @@ AGENTS: dict[str, AgentEntry] = {
         make="imagine_bench.agents.imagination.agent:make_uncertainty", title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
+    ),
+    "drqn": AgentEntry(
+        make="imagine_bench.agents.memory.drqn:make", settings="imagine_bench.agents.memory.settings:DRQN",
+        title="DQN + memory",
+        description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
+        "sequences as R2D2 does.",
+    ),
+    "imagination_memory": AgentEntry(
+        make="imagine_bench.agents.memory.imagination:make", title="imagination + memory",
+        settings="imagine_bench.agents.memory.settings:IMAGINATION_MEMORY",
+        description="Like imagination + uncertainty, but the world model is recurrent (MDN-RNN), and rollouts carry "
+        "what it remembers.",
     ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.agent:make", encoder_kind="codes",

@@ -1,4 +1,4 @@
-"""Frames to latents for one learner: the encoder, and a cache of the last two frames."""
+"""Frames to latents for one learner: the encoder, and a cache of the last frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from imagine_bench.interfaces import DEVICES, AgentContext, Frame
 from ..networks.allocator import keep_freed_memory
 from .encoder import Encoder
 
-_CACHED = 2
+_CACHED = 64
+"""Frames kept: those of the episodes that a learner with memory looks back at."""
 
 
 class Perception:

@@ -17,7 +17,7 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
-from ..dqn import DQN, Controller, epsilon
+from ..dqn import DQN, epsilon
 from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..networks.precision import settle
@@ -39,6 +39,7 @@ class ImaginingAgent(DQN):
     """
 
     settings: Settings
+    imagination_kind = Imagination
 
     def __init__(
         self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
@@ -46,7 +47,9 @@ class ImaginingAgent(DQN):
     ) -> None:  # fmt: skip
         super().__init__(perception, n_actions, settings, seeds, device)
         size, node = perception.latent_size, seeds.child("imagination")
-        self.imagination = Imagination(size, n_actions, settings, filtered=filtered, seeds=node, device=device)
+        self.imagination = self.imagination_kind(
+            size, n_actions, settings, filtered=filtered, seeds=node, device=device
+        )
 
     def learn_more(self, z: Tensor, episode: int) -> None:
         """N_E model updates; from ``start_episode`` on, imagine from ``z`` (Z,) and make N_I updates on that.
@@ -65,16 +68,20 @@ class ImaginingAgent(DQN):
     def learn_model(self) -> None:
         """N_E updates of the world model on real transitions."""
         model, draws = self.imagination.model, self.imagination.generators
-        settings, size = model.settings, model.settings.batch_size
         with self.meters.cpu_time("time/model_s"):
-            rows = settings.updates_per_step * size  # for all updates at once, which is quicker
-            sampled = self.real.sample(rows, draws["replay"], spread=settings.spread, balance=settings.balance)
-            for batch in sampled.split(size):
+            for batch in self.draw_model_batches(draws["replay"]):
                 losses = model.update(batch, draws["dropout"])
                 for name, value in asdict(losses).items():
                     self.meters.add(f"loss/{name}", value)
                 self.updates += 1
         self.meters.count("time/model_s")
+
+    def draw_model_batches(self, generator: torch.Generator) -> Iterable[Batch]:
+        """Real transitions for the N_E updates of the world model, drawn at once, which is quicker."""
+        settings = self.settings.model
+        rows = settings.updates_per_step * settings.batch_size
+        sampled = self.real.sample(rows, generator, spread=settings.spread, balance=settings.balance)
+        return sampled.split(settings.batch_size)
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
@@ -114,8 +121,7 @@ class ImaginingAgent(DQN):
         Reward, termination, controller, memories and the schedule of exploration begin anew.
         """
         self.imagination.reset_for_new_task()
-        size, settings = self.perception.latent_size, self.settings.controller
-        self.controller = Controller(size, self.n_actions, settings, self._replay)  # a generator that snapshots hold
+        self.controller = self.new_controller(self._replay)  # a generator that snapshots hold
         self.real.clear()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
         self.steps = self.updates = 0
@@ -128,7 +134,7 @@ class ImaginingAgent(DQN):
         InvalidValueError if there is no depth to imagine, or actions are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
-        start = self.perception.posterior(frame)[0].unsqueeze(0)  # [1, Z]
+        start = self.perceive(frame).unsqueeze(0)  # [1, Z]
         return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
     def sample_futures(

@@ -80,19 +80,24 @@ class Imagination:
         self, latent_size: int, n_actions: int, settings: Settings, *, filtered: bool, seeds: SeedTree,
         device: torch.device,
     ) -> None:  # fmt: skip
-        self.settings, self.filter = settings.imagination, EpistemicFilter(settings, active=filtered)
+        self._all_settings, self.settings = settings, settings.imagination
+        self.filter = EpistemicFilter(settings, active=filtered)
         self.generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
             for name in ("weights", "replay", "dropout", "rollouts")
         }
-        self.model = WorldModel(latent_size, n_actions, settings.model, self.generators["weights"])
+        self.model = self.new_model(latent_size, n_actions, settings)
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
 
+    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> WorldModel:
+        """A world model that has learned nothing, of states of so many numbers."""
+        return WorldModel(state_size, n_actions, settings.model, self.generators["weights"])
+
     def reset_for_new_task(self) -> None:
-        """Keep the network of the dynamics; everything else begins anew, moments of the optimiser included."""
-        known, model = self.model.dynamics.state_dict(), self.model
-        self.model = WorldModel(model.latent_size, model.n_actions, model.settings, self.generators["weights"])
-        self.model.dynamics.load_state_dict(known)
+        """Keep what predicts states; everything else begins anew, moments of the optimiser included."""
+        known = self.model
+        self.model = self.new_model(known.latent_size, known.n_actions, self._all_settings)
+        self.model.keep_dynamics_of(known)
         self.memory.clear()
         self.filter.reset()
 
@@ -113,9 +118,15 @@ class Imagination:
         _require_numbers(predicted.log_weights)
         next_z = mdn.sample(predicted, self.settings.temperature, generator).clamp(-LATENT_LIMIT, LATENT_LIMIT)
         _require_numbers(next_z)
+        next_z = self.state_after(z, action, next_z)
         reward, p_terminated = model.predict_outcome(z, action, next_z)
         reward_std = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
         return Imagined(next_z, reward, p_terminated, samples, reward_std)
+
+    def state_after(self, z: Tensor, action: Tensor, predicted: Tensor) -> Tensor:
+        """The states that follow N states ``z`` after actions (N,), given what was predicted of them: all there is."""
+        del z, action
+        return predicted
 
     def ignorance(self, z: Tensor, action: Tensor) -> Tensor:
         """Epistemic variance of where actions (N,) lead from z (N, Z), reduced as the filter does, at most 1: (N,).

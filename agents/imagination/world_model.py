@@ -83,26 +83,31 @@ class RewardTerminationHead(nn.Module):
 class WorldModel(nn.Module):
     """Dynamics, reward and termination, trained together from batches of transitions.
 
-    The generator draws the initial weights; its device is the model's.
+    The generator draws the initial weights; its device is the model's. ``predicted`` says how many of the numbers of a
+    state its dynamics predict, the first ones: None for all.
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
-    ) -> None:
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator, *,
+        predicted: int | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
-        self.members = settings.members
-        sizes = (latent_size + n_actions, *settings.dynamics_hidden, mdn.output_size(settings.components, latent_size))
+        self.members, self.predicted = settings.members, latent_size if predicted is None else predicted
+        outputs = mdn.output_size(settings.components, self.predicted)
+        sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
         self.dynamics = _member_mlp(sizes, self.members, settings, generator)
         self.head = RewardTerminationHead(latent_size, n_actions, settings, generator)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.head.networks)
+        self.clipped: tuple[nn.Module, ...] = self.networks
         self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
     def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Mean losses of dynamics (summed over members), reward and termination, under new dropout masks."""
         masks, *head_masks = [network.draw_masks(len(batch.action), dropout) for network in self.networks]
-        likelihood = mdn.log_likelihood(self._mixture(batch.z, batch.action, masks), batch.next_z)  # [E, B]
+        target = batch.next_z[:, : self.predicted]
+        likelihood = mdn.log_likelihood(self._mixture(batch.z, batch.action, masks), target)  # [E, B]
         reward, logit = self.head(batch.z, batch.action, batch.next_z, head_masks)
         return (
             -likelihood.mean(dim=1).sum(),  # no member's loss reads another
@@ -121,9 +126,9 @@ class WorldModel(nn.Module):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
         self.optimiser.zero_grad()
         terms.sum().backward()
-        for network in self.networks:
+        for part in self.clipped:
             if self.settings.gradient_clip is not None:
-                nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
+                nn.utils.clip_grad_norm_(part.parameters(), self.settings.gradient_clip)
         self.optimiser.step()
         for network in self.networks:
             if self.settings.max_norm is not None:
@@ -135,8 +140,14 @@ class WorldModel(nn.Module):
         settings = self.settings
         inputs = torch.cat([z, self._one_hot[action]], dim=-1).expand(self.members, -1, -1)  # [E, N, Z + A]
         outputs = self.dynamics(inputs, masks)  # [E, N, K (1 + 2 Z)]
-        mixture = mdn.from_outputs(outputs, settings.components, self.latent_size, math.log(settings.sigma_floor))
-        return replace(mixture, means=mixture.means + z.unsqueeze(-2)) if settings.predict_change else mixture
+        mixture = mdn.from_outputs(outputs, settings.components, self.predicted, math.log(settings.sigma_floor))
+        if not settings.predict_change:
+            return mixture
+        return replace(mixture, means=mixture.means + z[..., : self.predicted].unsqueeze(-2))
+
+    def keep_dynamics_of(self, other: WorldModel) -> None:
+        """Take over what another model of the same shape knows of where actions lead."""
+        self.dynamics.load_state_dict(other.dynamics.state_dict())
 
     @torch.no_grad()
     def draw_weights(self, count: int, dropout: torch.Generator) -> Masks | None:

@@ -1,13 +1,19 @@
-"""Draws the plots of the pages from docs/results: ``python docs/img/draw.py``."""
+"""Draws the pictures of the pages, from docs/results or from the scene: ``python docs/img/draw.py [NAME ...]``."""
 
 import csv
 import json
+import sys
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import matplotlib as mpl
 import numpy as np
 
-from imagine_bench import reference, statistics
+from imagine_bench import appearance, reference, registry, statistics
+from imagine_bench.report import plots
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -132,8 +138,59 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
+def why() -> None:
+    """Failures by cause, as the report draws them."""
+    kept = RESULTS / "arrow_puzzle-mild-why"
+    tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
+    found: plots.Failures = {}
+    for run in json.loads((kept / "why.json").read_text())["runs"]:
+        for budget, counts in run["failures"].items():
+            before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
+            found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
+    figure = plots.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
+    figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
+
+
+DIALS = ({}, {"slip": 0.5}, {"fickle": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
+FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
+TURNS = {"start": None, "left turned": 0, "middle turned": 2, "right turned": 4}
+"""Frames of a row of dials, and the macro-action before each."""
+
+
+def walk(options: Mapping[str, Any]) -> list[np.ndarray]:
+    """Frames of the same episode in a world of these dials."""
+    with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", forbid="none", **options) as env:
+        frames = [env.reset(seed=2, options={"macrostate": (3, 2, 2, 1)})[0]]
+        return frames + [env.step(action)[0] for action in TURNS.values() if action is not None]
+
+
+def looks(factor: str) -> list[np.ndarray]:
+    """Frames of one macrostate where one factor of appearance varies."""
+    world, rng = registry.task("arrow_puzzle"), np.random.default_rng(1)
+    return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * len(TURNS)), factor or "clean", rng))
+
+
+def dials() -> None:
+    """Each dial as frames of one episode, and each factor of appearance as frames of one macrostate."""
+    figure = plt.figure(figsize=(11, 7.6), layout="constrained")
+    left, right = figure.subfigures(1, 2, wspace=0.03)
+    rows = {
+        left: [(walk(each), "".join(f"{n}={v}" for n, v in each.items()) or "no dial") for each in DIALS],
+        right: [(looks(each), each or "clean") for each in FACTORS],
+    }
+    for part, strips in rows.items():
+        for (frames, said), cells in zip(strips, part.subplots(len(strips), len(TURNS)), strict=True):
+            for frame, axes in zip(frames, cells, strict=True):
+                axes.imshow(frame, interpolation="nearest")
+                axes.set(xticks=[], yticks=[])
+            cells[0].set_ylabel(said, fontsize=8)
+        for axes, title in zip(part.axes, TURNS if part is left else ("one macrostate", "", "", ""), strict=False):
+            axes.set_title(title, fontsize=8)
+    figure.savefig(HERE / "dials.png", dpi=110)
+
+
+PICTURES = {each.__name__: each for each in (learning_curves, thesis_settings, mild, margins, why, dials)}
+
 if __name__ == "__main__":
-    learning_curves()
-    thesis_settings()
-    mild()
-    margins()
+    for name in sys.argv[1:] or PICTURES:
+        PICTURES[name]()

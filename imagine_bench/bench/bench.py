@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
@@ -13,11 +14,12 @@ from imagine_bench.bench.launchers.jobs import Failure, Job, Launcher
 from imagine_bench.bench.progress import ProgressBars, RunKey
 from imagine_bench.errors import RunFailedError, SetupError, require_modules
 from imagine_bench.machine import describe_environment, gl_renderer
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
 from imagine_bench.protocols.task_types import Encoders, Result, require_options, task_type
 from imagine_bench.store import run_folder
-from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench
+from imagine_bench.store.bench_folder import BenchStore, bench_folder, certificate_of, load_bench
 from imagine_bench.store.files import sweep
 
 _SAVE_EVERY_S = 10.0
@@ -77,12 +79,13 @@ def carry_out(
             if store.missing():
                 missing += len(store.missing())
                 work.append((store, paths))
+        if any(task_type(store.protocol.task).draws for store, _ in work):
+            gl_renderer()  # fails here, in one sentence, rather than in every run
+        environment, certify = describe_environment() if work else {}, functools.cache(certificate_of)
         for store, _ in work:
-            if task_type(store.protocol.task).draws:
-                gl_renderer()  # fails here, in one sentence, rather than in every run
-            _warn(store.begin_session(describe_environment()), store.folder)
-            if registry.has_task(store.protocol.task):
-                store.keep_certificate()
+            _warn(store.begin_session(environment), store.folder)
+            if isinstance(store.protocol, Protocol):
+                store.keep_certificate(certify)
         return _in_stages(work, launcher), missing
 
 

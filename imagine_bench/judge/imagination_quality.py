@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ImaginedRollout, Imaginer
-from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, State, TaskSpec
+from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
 from imagine_bench.judge.calibration import auroc
 from imagine_bench.rules import Belief, advance, by_macrostate, is_random
 from imagine_bench.seeding import Purpose, SeedTree
@@ -132,37 +132,39 @@ def imagine_sampled_rollouts(
 
 
 def sampled_rollouts_from(
-    agent: Imaginer, spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, appearance: str, seeds: SeedTree
-) -> tuple[ComparedRollout, ...]:
-    """Imagine one start several times: the real ``frame``, which shows ``macrostate``. See :func:`examples`."""
+    agent: Imaginer, spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, appearance: str, seeds: SeedTree,
+    before: Sequence[State] = (),
+) -> tuple[ComparedRollout, ...]:  # fmt: skip
+    """Imagine one start several times: the real ``frame``, seen in ``macrostate`` after those ``before``."""
     frames, states = [frame] * SAMPLED_ROLLOUTS, [macrostate] * SAMPLED_ROLLOUTS
     rng = seeds.child("reality").generator()
-    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=SAMPLED_DEPTH)
+    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=SAMPLED_DEPTH, before=before)
 
 
 def _greedy_rollouts(
     agent: Imaginer, spec: TaskSpec, frames: Iterable[Frame], states: Iterable[Macrostate], appearance: str,
-    seeds: SeedTree, rng: np.random.Generator, *, depth: int,
+    seeds: SeedTree, rng: np.random.Generator, *, depth: int, before: Sequence[State] = (),
 ) -> tuple[ComparedRollout, ...]:  # fmt: skip
     found = []
     for index, (frame, state) in enumerate(zip(frames, states, strict=True)):
         rollout = agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator())
         start: dict[str, Any] = {"frame": frame, "macrostate": state, "rollout": rollout}
-        found.append(compare_rollout(spec, **start, appearance=appearance, rng=rng))
+        found.append(compare_rollout(spec, **start, appearance=appearance, rng=rng, before=before))
     return tuple(found)
 
 
 def compare_rollout(
     spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, rollout: ImaginedRollout, appearance: str,
-    rng: np.random.Generator,
+    rng: np.random.Generator, before: Sequence[State] = (),
 ) -> ComparedRollout:  # fmt: skip
-    """Put the truth beside a rollout imagined from ``frame``, which shows ``macrostate`` (M,).
+    """Put the truth beside a rollout imagined from ``frame``, which is seen in ``macrostate`` (M,).
 
-    The rules give states and rewards, the kinematic mode gives frames. Where the rules leave several outcomes to
-    chance, the one that was imagined is taken if it is among them, else ``rng`` draws.
+    The rules give states and rewards, the kinematic mode gives frames: those that the agent would really see after the
+    macrostates ``before`` of the same episode, old or hiding something where the task's are. Where the rules leave
+    several outcomes to chance, the one that was imagined is taken if it is among them, else ``rng`` draws.
     Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
     """
-    state = tuple(int(value) for value in macrostate)
+    start = state = tuple(int(value) for value in macrostate)
     over = spec.rules.is_terminal(state)
     real: list[tuple[State, float, bool]] = []
     for action, imagined in zip(rollout.actions, rollout.macrostates, strict=True):
@@ -171,18 +173,36 @@ def compare_rollout(
             outcome = _choose(spec.rules.outcomes(state, int(action)), tuple(imagined.tolist()), rng)
             state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
         real.append((state, reward, over))
-    states = np.array([state for state, _, _ in real], dtype=np.int64)
-    frames = spec.render_macrostates(states, appearance, rng) if real else ()
-    return beside_reality(rollout, frame, macrostate, frames, real)
+    seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)[len(before) + 1 :]
+    frames = spec.render_macrostates(np.array(seen), appearance, rng) if real else ()
+    read = [(as_read(spec, shown), reward, over) for shown, (_, reward, over) in zip(seen, real, strict=True)]
+    return beside_reality(rollout, frame, macrostate, frames, read)
+
+
+def as_read(spec: TaskSpec, shown: Sequence[int]) -> State:
+    """What an encoder reads in a frame that shows this: one more than the last value of a coordinate that is hidden."""
+    pairs = zip(spec.macrostate_values, shown, strict=True)
+    return tuple(len(values) if value < 0 else int(value) for values, value in pairs)
+
+
+def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
+    """What the frame shows that the agent sees in each macrostate of an episode; -1 for what it hides."""
+    if sight is None:
+        return states
+    shown = []
+    for step, state in enumerate(states):
+        chances, whats = zip(*sight.seen(state, step), strict=True)
+        shown.append(whats[0 if len(whats) == 1 else int(rng.choice(len(whats), p=chances))])
+    return [shown[max(0, step - sight.lag)] for step in range(len(states))]
 
 
 def beside_reality(
     rollout: ImaginedRollout, frame: Frame, macrostate: Sequence[int] | Macrostate, frames: Sequence[Frame] | Frame,
     real: Sequence[tuple[State, float, bool]],
 ) -> ComparedRollout:  # fmt: skip
-    """An imagined rollout from a ``frame`` that shows ``macrostate``, and what really came of it.
+    """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and what really came of it.
 
-    ``frames`` and ``real`` (macrostate, reward, whether the episode has ended) have an entry for each macro-action
+    ``frames`` and ``real`` (what they show, reward, whether the episode has ended) have an entry for each macro-action
     that was carried out.
     """
     done = len(real)

@@ -163,12 +163,7 @@ class Protocol(ProtocolData):
 
     def spec(self, *, testing: bool) -> TaskSpec:
         """The task with the starts that training or tests have. Raises InvalidValueError: another split than here."""
-        spec = task(self.task)
-        if self.split is None:
-            return spec
-        found = split_of(spec.rules, self.split)
-        rules = StartingFrom(spec.rules, found.test if testing else found.train)
-        return dataclasses.replace(spec, rules=cast("Rules", rules))
+        return spec_of(self.task, self.split, testing=testing)
 
     @property
     def looks(self) -> str:
@@ -193,6 +188,16 @@ class Protocol(ProtocolData):
     def encoder_of(self, kind: str) -> str | None:
         """Identity of the encoder for the agents that take this kind."""
         return self.codes if kind == "codes" else self.encoder
+
+
+def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:
+    """See :meth:`Protocol.spec`."""
+    spec = task(name)
+    if split is None:
+        return spec
+    found = split_of(spec.rules, split)
+    rules = StartingFrom(spec.rules, found.test if testing else found.train)
+    return dataclasses.replace(spec, rules=cast("Rules", rules))
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -6,7 +6,7 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.capabilities import Imaginer, ValueReader, begin_episode
-from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, TaskSpec
+from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
 from imagine_bench.recording.blueprint import blueprint
@@ -96,7 +96,7 @@ class _EpisodeRecorder:
     ) -> None:
         self._recording, self._spec, self._agent, self._appearance = recording, spec, agent, appearance
         self._privileged, self._seed = privileged, seed
-        self._clock_s, self._env_step = 0.0, -1
+        self._clock_s, self._env_step, self._episode = 0.0, -1, list[State]()
 
     def record(self, env: gymnasium.Env[Any, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
@@ -105,14 +105,16 @@ class _EpisodeRecorder:
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
             self._recording.stream.set_time("imagined_depth", sequence=0)
         observation = self._log_frame(env.unwrapped, episode, seen, info)
+        self._episode = []
         done, step, heading = False, 0, f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
             action = int(self._agent.act(observation, explore=False))
-            self._describe(heading, macrostate, f"Next: {self._spec.action_names[action]}.")
+            self._describe(heading, info, f"Next: {self._spec.action_names[action]}.")
             self._log_values(observation, action)
             self._recording.stream.disable_timeline("imagined_depth")
             self._log_imagination(observation.frame, macrostate, episode, step)
+            self._episode.append(tuple(macrostate.tolist()))
             seen, reward, terminated, truncated, info = env.step(np.int64(action))
             self._clock_s += macro_duration_s(env.unwrapped)
             observation = self._log_frame(env.unwrapped, episode, seen, info)
@@ -121,14 +123,14 @@ class _EpisodeRecorder:
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
             outcome = f"Done: {self._spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
-        self._describe(heading, np.asarray(info["macrostate"]), "Solved." if info["is_success"] else "Not solved.")
+        self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.")
         self._clear_predictions()
         self._clock_s += _STILL_S
 
     def _log_frame(self, scene: Any, episode: int, seen: Any, info: dict[str, Any]) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
         observation = Observation.of(seen, info, privileged=self._privileged)
-        frame = observation.frame if observation.frame.size else scene.agent_view()
+        frame = observation.frame if observation.frame.size else self._unseen_frame(scene, info)
         self._env_step += 1
         sequences = {"env_step": self._env_step, "episode": episode}
         self._recording.set_clocks(self._clock_s, **sequences)
@@ -139,10 +141,19 @@ class _EpisodeRecorder:
             log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
         return observation
 
-    def _describe(self, heading: str, macrostate: NDArray[np.int64], last: str) -> None:
-        """What has happened, what the frame shows, what comes next."""
-        pairs = zip(self._spec.macrostate_names, self._spec.value_names(macrostate), strict=True)
-        seen = "\n".join(f"- {name}: {value}" for name, value in pairs)
+    def _unseen_frame(self, scene: Any, info: Mapping[str, Any]) -> Frame:
+        """For people, the frame of an agent that sees something else: as late as that, and hiding as much."""
+        shown = np.asarray(info.get("shown", info["macrostate"]))
+        if np.array_equal(shown, info["macrostate"]):
+            return np.asarray(scene.agent_view())
+        return self._spec.render_macrostates(shown[None], self._appearance, np.random.default_rng(self._env_step))[0]
+
+    def _describe(self, heading: str, info: Mapping[str, Any], last: str) -> None:
+        """What has happened, what is true, and what the frame shows where that is something else; what comes next."""
+        spec, truth = self._spec, info["macrostate"]
+        names = [spec.value_names(each) for each in (truth, info.get("shown", truth))]
+        rows = zip(spec.macrostate_names, *names, strict=True)
+        seen = "\n".join(f"- {name}: {now}" + f" (frame: {shown})" * (now != shown) for name, now, shown in rows)
         self._recording.text("/real/text", f"*{self._spec.description}*\n\n{heading}\n\n{seen}\n\n**{last}**")
 
     def _log_values(self, observation: Observation, action: int) -> None:
@@ -170,7 +181,8 @@ class _EpisodeRecorder:
         spec, seeds = self._spec, SeedTree(self._seed)
         rng = seeds.child("recording", episode, step).generator()
         rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
-        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "appearance": self._appearance}
+        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "before": self._episode}
+        seen["appearance"] = self._appearance
         compared = compare_rollout(spec, **seen, rollout=rollout, rng=rng)
         self._recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
         self._uncertainty_bars(compared)

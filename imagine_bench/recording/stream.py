@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -55,7 +56,7 @@ class Recording:
 def recording_file(path: Path, task: str, layout: rrb.Blueprint) -> Iterator[Recording]:
     """A recording that is closed however the block ends, and gets its name only if it is complete."""
     partial = path.with_name(f"{path.stem}.partial.rrd")
-    stream = rr.RecordingStream(f"imagine_bench_{task}")
+    stream = rr.RecordingStream(re.sub(r"\W+", "_", f"imagine_bench_{task}"))
     stream.save(partial, default_blueprint=layout)
     try:
         yield Recording(stream)

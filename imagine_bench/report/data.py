@@ -13,6 +13,7 @@ import numpy as np
 from imagine_bench import reference, statistics
 from imagine_bench.interfaces import RuleFacts, TaskSpec
 from imagine_bench.report.missing import known_agent, known_task
+from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
@@ -163,6 +164,8 @@ def collect(result: BenchResult) -> ReportData:
     """Compute a report's numbers."""
     spec = known_task(result.protocol.task)
     facts, agents, is_here = spec.facts(), result.protocol.agents, bool(spec.action_names)
+    if result.protocol.split is not None and is_here:
+        facts = rule_facts(result.protocol.spec(testing=True).rules, spec.horizon)
     if (known := result.certificate) is not None:  # what is hidden or late counts there, and the tests' own starts
         exact = {name: getattr(known, name) for name in ("chance_level", "optimum", "optimal_return")}
         facts = dataclasses.replace(facts, **exact)

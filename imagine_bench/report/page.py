@@ -42,6 +42,7 @@ def report_page(result: BenchResult) -> Page:
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
         f"{f'trained first on dataset {protocol.dataset} · ' if protocol.dataset else ''}"
+        f"{f'tests start where training never does, {protocol.split} · ' if protocol.split else ''}"
         f"protocol {result.protocol_hash}",
         question=text.question(data),
         answers=text.answers(data),

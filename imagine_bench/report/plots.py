@@ -113,10 +113,10 @@ def success_figure(data: ReportData) -> Figure:
 
 def plan_lengths_figure(lengths: Sequence[tuple[int, int]]) -> Figure:
     """Starts by the fewest macro-actions that they need; those that need -1 cannot be solved."""
-    figure = Figure(figsize=(6.0, 2.2), layout="constrained")
+    figure = Figure(figsize=(9.2, 2.4), layout="constrained")
     axes = figure.add_subplot()
     names = ["none" if length < 0 else str(length) for length, _ in lengths]
-    axes.bar_label(axes.bar(names, [count for _, count in lengths], color=_COLORS[2], width=0.6), fmt="{:,.0f}")
+    axes.bar_label(axes.bar(names, [count for _, count in lengths], color=_COLORS[2], width=0.5), fmt="{:,.0f}")
     axes.margins(y=0.2)
     axes.grid(visible=False, axis="x")
     axes.set(xlabel="macro-actions of the shortest plan", ylabel="starts")

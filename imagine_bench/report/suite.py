@@ -193,10 +193,10 @@ def levels_csv(result: SuiteResult) -> str:
         for found in levels:
             if found.scale is not None:
                 head = [experiment, found.level.name, found.level.task, found.level.episodes, agent]
-                tail = [found.scale.chance, found.scale.optimum, round(found.train_cpu_s, 1), found.bench]
+                tail = [found.scale.chance, found.scale.optimum, round(found.train_cpu_s, 1)]
                 rows += [
-                    [*head, seed, "" if math.isnan(value) else value, *tail]
-                    for seed, value in zip(result.suite.seeds, found.values.tolist(), strict=True)
+                    [*head, seed, "" if math.isnan(value) else value, *tail, bench]
+                    for seed, value, bench in zip(result.suite.seeds, found.values.tolist(), found.benches, strict=True)
                 ]
     return csv_text(rows)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +19,7 @@ from imagine_bench import registry
 from imagine_bench.certificates.certificate import Certificate, certificate, from_json
 from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError, plain
-from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.control import Protocol, spec_of
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Result, read_as, type_of
 from imagine_bench.store import run_folder
@@ -100,19 +100,13 @@ class BenchStore:
             write_json(path, sealed(environment))  # last, so that a bench with an environment has sessions too
         return changed
 
-    def keep_certificate(self) -> None:
-        """Compute the certificate of the protocol's world and keep it, once; of a guest's whose rules fail, none."""
-        path, task = self.folder / _CERTIFICATE, self.protocol.task
-        if path.exists() or not isinstance(self.protocol, Protocol):
-            return
-        try:
-            found = certificate(self.protocol.spec(testing=True))
-        except Exception as error:
-            if registry.is_own(task):
-                raise
-            print(f"Note: {task} has no certificate ({type(error).__name__}: {plain(error)}).")
-            return
-        write_json(path, sealed(dataclasses.asdict(found)))
+    def keep_certificate(self, certify: Callable[[str, str | None], Certificate | None]) -> None:
+        """Keep the certificate of the protocol's world, which is what ``certify`` says of its task and split, once."""
+        path, protocol = self.folder / _CERTIFICATE, self.protocol
+        if isinstance(protocol, Protocol) and not path.exists():
+            found = certify(protocol.task, protocol.split)
+            if found is not None:
+                write_json(path, sealed(dataclasses.asdict(found)))
 
     def changed(self, environment: dict[str, Any]) -> list[str]:
         """Names of facts that decide the bits and are not as in the first session; none before there was one."""
@@ -125,6 +119,17 @@ class BenchStore:
         """Note how long this session has lasted, so that a kill loses little of the count."""
         self._sessions[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
         write_json(self.folder / _SESSIONS, sealed({"sessions": self._sessions}))
+
+
+def certificate_of(task: str, split: str | None) -> Certificate | None:
+    """The certificate of a task from the starts that tests have; None of a guest's whose rules fail."""
+    try:
+        return certificate(spec_of(task, split, testing=True))
+    except Exception as error:
+        if registry.is_own(task):
+            raise
+        print(f"Note: {task} has no certificate ({type(error).__name__}: {plain(error)}).")
+        return None
 
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:

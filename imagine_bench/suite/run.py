@@ -1,7 +1,6 @@
-"""Running a suite: a bench for each level and agent, all of them as one piece of work; what is done is only read.
+"""Running a suite: a bench for each level, agent and seed, all of them as one piece of work; what is done is only read.
 
-Since a level of an agent is a bench of its own, another agent, another seed's failure or another experiment costs none
-of those that are there, and experiments that share a level share its runs.
+So another agent, seed or experiment costs none of those that are there, and experiments share the runs of a level.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from imagine_bench.bench.bench import carry_out, plan
 from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders
 from imagine_bench.statistics import Estimate
@@ -36,7 +36,7 @@ class LevelResult:
     values: NDArray[np.float64]  #: Success share, or AUROC, of each seed; NaN where there is none. Shape (seeds,).
     scale: Scale | None  #: None where nothing was run
     train_cpu_s: float  #: Mean CPU seconds of training a run; NaN likewise
-    bench: str  #: Task and folder of its bench, below the folder of all benches
+    benches: tuple[str, ...]  #: Task and folder of the bench of each seed, below the folder of all benches
     environment: dict[str, Any]  #: Of its first session; empty likewise
 
 
@@ -59,8 +59,8 @@ class SuiteResult:
         return score(np.column_stack([each.values for each in found]), scales, trials=trials)
 
 
-def plan_level(suite: Suite, level: Level, agent: str) -> tuple[ProtocolData, Encoders]:
-    """The bench of a level and an agent; one that cannot carry over what it learned has no earlier task.
+def plan_level(suite: Suite, level: Level, agent: str) -> tuple[tuple[Protocol, ...], Encoders]:
+    """The benches of a level and an agent, one a seed; who cannot carry over what it learned has no earlier task.
 
     An encoder that no one has trained yet is trained now. Raises as :func:`.bench.plan`.
     """
@@ -70,12 +70,14 @@ def plan_level(suite: Suite, level: Level, agent: str) -> tuple[ProtocolData, En
         "open_loop_starts": 0, "sampled_futures": 0, "recorded_episodes": 0, **level.protocol,
     }  # fmt: skip
     try:
-        return plan(level.task, "quick", **shared)
+        whole, paths = plan(level.task, "quick", **shared)
     except InvalidValueError:
         if "after" not in shared:
             raise
         alone = {name: value for name, value in shared.items() if name not in ("after", "after_episodes")}
-        return plan(level.task, "quick", **alone)
+        whole, paths = plan(level.task, "quick", **alone)
+    assert isinstance(whole, Protocol), "of a control task"
+    return tuple(dataclasses.replace(whole, seeds=(seed,)) for seed in whole.seeds), paths
 
 
 def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher) -> SuiteResult:
@@ -85,15 +87,18 @@ def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Laun
     """
     pairs = [(each, agent) for each in suite.experiments for agent in agents]
     planned = {(e.name, a): [plan_level(suite, level, a) for level in e.levels] for e, a in pairs}
-    work = {protocol.hash: (protocol, paths) for benches in planned.values() for protocol, paths in benches}
+    work: dict[str, tuple[ProtocolData, Encoders]] = {
+        protocol.hash: (protocol, paths)
+        for levels in planned.values() for protocols, paths in levels for protocol in protocols
+    }  # fmt: skip
     failures, _ = carry_out(list(work.values()), root=root, launcher=launcher)
     return SuiteResult(
         suite=suite,
         agents=tuple(agents),
         levels={
             (each.name, agent): tuple(
-                _read(each, level, protocol, root)
-                for level, (protocol, _) in zip(each.levels, planned[each.name, agent], strict=True)
+                _read(each, level, protocols, root)
+                for level, (protocols, _) in zip(each.levels, planned[each.name, agent], strict=True)
             )
             for each, agent in pairs
         },
@@ -105,20 +110,20 @@ def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Laun
     )
 
 
-def _read(experiment: Experiment, level: Level, protocol: ProtocolData, root: Path) -> LevelResult:
-    folder = bench_folder(root, protocol)
-    values, scale, seconds, environment = np.full(len(protocol.seeds), math.nan), None, math.nan, dict[str, Any]()
-    if not BenchStore(folder, protocol).missing():
-        result = load_bench(folder)
-        assert isinstance(result, BenchResult), "of a control task"
-        values = np.array([_value(experiment, run) for run in result.of(protocol.agents[0])])
-        scale = _scale(experiment, result)
-        seconds = float(np.mean([run.checkpoints[-1].train_cpu_s for run in result.runs]))
-        environment = dict(result.environment)
+def _read(experiment: Experiment, level: Level, protocols: Sequence[Protocol], root: Path) -> LevelResult:
+    folders = [bench_folder(root, protocol) for protocol in protocols]
+    unfinished = [BenchStore(*pair).missing() for pair in zip(folders, protocols, strict=True)]
+    loaded = [] if any(unfinished) else [load_bench(folder) for folder in folders]
+    results = [result for result in loaded if isinstance(result, BenchResult)]
+    runs = [run for result in results for run in result.runs]
     return LevelResult(
-        level=level, values=values, scale=scale, train_cpu_s=seconds, bench=f"{folder.parent.name}/{folder.name}",
-        environment=environment,
-    )  # fmt: skip
+        level=level,
+        values=np.array([_value(experiment, run) for run in runs] or [math.nan] * len(protocols)),
+        scale=_scale(experiment, results[0]) if results else None,
+        train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in runs])) if runs else math.nan,
+        benches=tuple(f"{folder.parent.name}/{folder.name}" for folder in folders),
+        environment=dict(results[0].environment) if results else {},
+    )
 
 
 def _value(experiment: Experiment, run: RunResult) -> float:

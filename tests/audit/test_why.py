@@ -51,6 +51,9 @@ def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: 
     for line in causes_table(read_failures(folder)).rows:
         shares = [float(str(cell)) for cell in line[3:]]
         assert abs(sum(shares) - 100.0) < 0.2
+        mine = [row["cause"] for row in rows if row["episodes"] == line[1] and row["cause"]]
+        assert line[2] == f"{len(mine)} of {2 * 12}"
+        assert shares == [round(100 * mine.count(name) / len(mine), 1) for name in CAUSES]
     assert "| table |" in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
     assert not any(each.complaint for each in verify(folder)), "the report with its causes follows from the runs"
 

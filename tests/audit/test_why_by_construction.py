@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -13,30 +15,37 @@ from small_runs import Inline
 from imagine_bench import registry
 from imagine_bench.audit import why
 from imagine_bench.bench.bench import bench
+from imagine_bench.capabilities import FrameReader
+from imagine_bench.cli import observers
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Rules, State
+from imagine_bench.interfaces import AgentContext, Rules, State
 from imagine_bench.protocols.control import protocol
 from imagine_bench.rules import states_of
-from imagine_bench.seeding import episode_seed
+from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.bench_folder import load_bench
-from imagine_bench.store.results import Checkpoint
+from imagine_bench.store.results import Checkpoint, RunResult
 from imagine_bench.store.trained import load_trained
 
 
-def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint, why.Tested]:
-    """A bench of one agent, and the causes of its last test's failures."""
+def finished(root: Path, agent: str, task: str, **changes: Any) -> RunResult:
+    """The run of a bench of one agent."""
     few: dict[str, Any] = {
         "agents": (agent,), "seeds": (0,), "budgets": (150,), "evaluation_episodes": 40, "execution": "kinematic",
         "open_loop_starts": 0, "recorded_episodes": 0, "sampled_futures": 0,
     }  # fmt: skip
     Sound.task = task
     folder = bench(protocol(task, "smoke", **{**few, **changes}), {}, root=root, launcher=Inline()).folder
-    run = load_bench(folder).runs[0]
-    analysis = why.WhyAnalysis(registry.task(task), appearance="clean")
-    (found,) = analysis.measure(load_trained(run.folder))
-    failed = [test for test, each in enumerate(run.checkpoints[0].solved or "") if each == "0"]
-    assert list(found.causes) == failed, "every failure has a cause, and nothing else has"
-    return run.checkpoints[0], found
+    return load_bench(folder).runs[0]
+
+
+def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint, why.Tested]:
+    """A bench of one agent, and the causes of its first test's failures."""
+    run = finished(root, agent, task, **changes)
+    found = why.WhyAnalysis(registry.task(task), appearance="clean").measure(load_trained(run.folder))
+    for row, each in zip(run.checkpoints, found, strict=True):
+        failed = [test for test, solved in enumerate(row.solved or "") if solved == "0"]
+        assert list(each.causes) == failed, "every failure has a cause, and nothing else has"
+    return run.checkpoints[0], found[0]
 
 
 @pytest.mark.parametrize(
@@ -59,7 +68,50 @@ def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None
     """In contact physics, where the planner takes cubes to be elsewhere."""
     changes: dict[str, Any] = {"execution": "physics", "physics": (("plan_error_mm", 30.0),), "budgets": (1,)}
     row, found = asked(tmp_path, "sound", "arrows:cubes=2", evaluation_episodes=6, **changes)
-    assert set(found.causes.values()) == {"fault"} and row.faults > 0
+    assert set(found.causes.values()) == {"fault"} and row.faults > 0 and row.kept is not None
+    with closing(gymnasium.make(registry.task("arrows:cubes=2").env_id, physics={"plan_error_mm": 30.0})) as env:
+        lived = why._Courses(
+            env, Sound(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0))), 0
+        )
+        assert [sum(lived.of(row.kept, test).faults) for test in range(6)] == row.kept.faults.tolist()
+
+
+def test_what_came_later_was_not_known_before(tmp_path: Path) -> None:
+    _, found = asked(tmp_path, "bad", "arrows:cubes=2", budgets=(2, 150))
+    assert "unexperienced" in found.causes.values()
+
+
+def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
+    run = finished(tmp_path, "half_blind", "arrows:cubes=2", budgets=(20,))
+    (row,), agent, spec = run.checkpoints, load_trained(run.folder).agent, registry.task("arrows:cubes=2")
+    assert isinstance(agent, FrameReader) and row.kept is not None
+    seen = set[tuple[bool, ...]]()
+    with closing(gymnasium.make(spec.env_id, execution="kinematic")) as env:
+        for test in range(row.test_episodes):
+            course = why._Courses(env, agent, 0).of(row.kept, test)
+            frame, info = env.reset(seed=episode_seed("evaluation", 0, test))
+            assert course.actions == row.kept.actions_of(test)
+            for action, state, misread in zip(course.actions, course.states, course.misread, strict=False):
+                assert state == tuple(info["macrostate"].tolist())
+                assert misread == (tuple(agent.read_frames(frame[None])[0].tolist()) != state)
+                frame, _, terminated, _, info = env.step(action)
+            assert course.states[-1] == tuple(info["macrostate"].tolist()) and course.terminated == terminated
+            seen.add(tuple(course.misread))
+    assert {(True,), (False,)} <= {each[:1] for each in seen} and any(len(set(each)) == 2 for each in seen)
+
+
+def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    analysis = why.WhyAnalysis(registry.task("arrows:cubes=2"), appearance="clean")
+    for known in ({"dataset": "some", "after": ()}, {"dataset": "", "after": ("arrow_puzzle",)}):
+        trained: Any = SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**known)))
+        with pytest.raises(InvalidValueError, match="in a dataset or an earlier task"):
+            analysis.measure(trained)
+    seeing: Any = {"dataset": "", "after": (), "shows_frames_alone": False}
+    with pytest.raises(InvalidValueError, match="saw more than frames"):
+        analysis.measure(SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**seeing))))  # type: ignore[arg-type]
+    monkeypatch.setattr(observers, "MOST_STATES", 31)
+    with pytest.raises(InvalidValueError, match="too many macrostates"):
+        asked(tmp_path, "bad", "arrows:cubes=2", evaluation_episodes=2, budgets=(1,))
 
 
 def best_sets(rules: Rules, horizon: int) -> list[dict[State, set[int]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 
+import numpy as np
 import pytest
 from small_runs import Inline, small
 
@@ -40,6 +41,7 @@ def test_the_certificate_is_that_of_the_tests_starts(result):
     assert result.certificate == certificate(spec) != certificate(registry.task("arrow_puzzle"))
     assert min(length for length, _ in result.certificate.plan_lengths) == 3
     facts = collect(result).facts
+    assert facts.mean_plan_length == np.average([3, 4, 5], weights=[12, 12, 6])
     assert (facts.chance_level, facts.optimum) == (result.certificate.chance_level, 1.0)
     assert facts.chance_level < registry.task("arrow_puzzle").facts().chance_level
 

@@ -131,9 +131,18 @@ class Blind(Sound):
         return model_of(self.rules)
 
 
+class HalfBlind(Blind):
+    """Misreads the gesture where the first arrow points one of two ways."""
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        read, n_gestures = super().read_frames(frames), self.states[:, -1].max() + 1
+        read[:, -1] = np.where(read[:, 0] % 2, read[:, -1], (read[:, -1] - 1) % n_gestures)
+        return read
+
+
 FLAWED = {
     "sound": Sound, "bad": Bad, "not_greedy": NotGreedy, "wrong_model": WrongModel, "timid": Timid,
-    "timid_modeller": TimidModeller, "blind": Blind,
+    "timid_modeller": TimidModeller, "blind": Blind, "half_blind": HalfBlind,
 }  # fmt: skip
 for name, kind in FLAWED.items():
     AGENTS[name] = AgentEntry(make=f"flawed_agents:{kind.__name__}", needs_encoder=False, privileged=True)

@@ -79,13 +79,35 @@ def shift_length(arrays: Arrays, rng: np.random.Generator) -> None:
         lengths.flat[other] += 1
 
 
-def metrics(bench: Path, rng: np.random.Generator) -> None:
-    run = one_run(bench, rng)
-    rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
-    row, name = rows[rng.integers(len(rows))], str(rng.choice(["successes", "mean_return", "mean_length", "faults"]))
-    row[name] += 1
-    (run / "metrics.csv").write_text(table_text(rows))
-    mend(run)
+def metric(name: str) -> Forge:
+    """One more of a figure of a test."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        run = one_run(bench, rng)
+        rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
+        rows[rng.integers(len(rows))][name] += 1
+        (run / "metrics.csv").write_text(table_text(rows))
+        mend(run)
+
+    return forge
+
+
+def surplus(lengthen: bool) -> Forge:
+    """An action behind those of the last episode of the last test; it says so itself, or belongs to none."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        run = one_run(bench, rng)
+        arrays = read_arrays(run / "episodes.npz")
+        arrays["actions"] = np.append(arrays["actions"], arrays["actions"][-1:])
+        if lengthen:
+            arrays["lengths"][-1, -1] += 1
+            rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
+            rows[-1]["mean_length"] = float(arrays["lengths"][:, -1].sum() / len(arrays["lengths"]))
+            (run / "metrics.csv").write_text(table_text(rows))
+        write_arrays(run / "episodes.npz", arrays)
+        mend(run)
+
+    return forge
 
 
 def training_start(bench: Path, rng: np.random.Generator) -> None:
@@ -96,7 +118,7 @@ def training_start(bench: Path, rng: np.random.Generator) -> None:
         write_arrays(run / "training.npz", arrays)
         mend(run)
     else:
-        metrics(bench, rng)
+        metric("successes")(bench, rng)
 
 
 def seed(bench: Path, rng: np.random.Generator) -> None:
@@ -144,6 +166,8 @@ FORGERIES: dict[str, Forge] = {
     "action": another("actions", 6), "start": another("starts", 4), "return": another("returns", 50),
     "success": another("success", 2), "faults": another("faults", 9), "fingerprint": another("fingerprints", 2**31),
     "exchanged starts": exchange("starts"), "exchanged outcomes": exchange("returns"),
-    "length": in_episodes("lengths", shift_length), "metrics": metrics, "training start": training_start, "seed": seed,
-    "table": table, "damage": damage,
+    "length": in_episodes("lengths", shift_length), "training start": training_start, "seed": seed, "table": table,
+    "damage": damage, "surplus": surplus(lengthen=False),
+    "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
+    "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
 }  # fmt: skip

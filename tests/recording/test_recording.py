@@ -309,11 +309,6 @@ def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
     frame: Frame = spec.render_macrostates(start[None], "clean", rng)[0]
     rollout = FakeImaginer().imagine(frame, actions=None, depth=8, rng=rng)
 
-    def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
-        frames = np.zeros((len(states), 64, 64, 3), np.uint8)
-        frames[:, 0, : states.shape[1], 0] = states
-        return frames
-
     showing = dataclasses.replace(spec, render_macrostates=labelled)
     compared = compare_rollout(showing, frame=frame, macrostate=start, rollout=rollout, appearance="clean", rng=rng)
     state, over = tuple(int(value) for value in start), False
@@ -327,3 +322,72 @@ def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
         assert (compared.real_rewards[depth], compared.real_terminated[depth]) == (reward, over)
     assert over, "the case never met an end: choose another seed"
     assert compared.real_frames.shape == (8, 64, 64, 3)
+
+
+def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Frames that say their macrostates in numbers; 255 for what is hidden."""
+    frames = np.zeros((len(states), 64, 64, 3), np.uint8)
+    frames[:, 0, : states.shape[1], 0] = states % 256
+    return frames
+
+
+@pytest.mark.parametrize("before", [0, 1, 4])
+def test_real_frames_are_as_late_as_the_agent_s_and_hide_as_much(before: int) -> None:
+    """With a lag of 2 and a human who points once: a frame shows two macro-actions ago, and the hand at the start."""
+    spec = dataclasses.replace(registry.task("arrows:gesture=first,lag=2"), render_macrostates=labelled)
+    rng, episode = np.random.default_rng(0), [spec.rules.start_states[0]]
+    for _ in range(before):
+        moves = [each[0] for each in (spec.rules.outcomes(episode[-1], action) for action in range(spec.n_actions))]
+        episode.append(next(each.macrostate for each in moves if not each.terminated))
+    rollout = FakeImaginer().imagine(np.zeros((64, 64, 3), np.uint8), actions=None, depth=6, rng=rng)
+    compared = compare_rollout(
+        spec, frame=np.zeros((64, 64, 3), np.uint8), macrostate=np.array(episode[-1]), rollout=rollout,
+        appearance="clean", rng=rng, before=episode[:-1],
+    )  # fmt: skip
+    states, over = list(episode), False
+    for action in rollout.actions:
+        (outcome,) = spec.rules.outcomes(states[-1], int(action))
+        states, over = [*states, states[-1] if over else outcome.macrostate], over or outcome.terminated
+    for depth in range(6):
+        source = max(0, before + depth + 1 - 2)
+        *directions, pointed = states[source]
+        in_frame, read = (pointed, pointed) if source == 0 else (255, 3)
+        assert compared.real_frames[depth, 0, :4, 0].tolist() == [*directions, in_frame]
+        assert compared.real_macrostates[depth].tolist() == [*directions, read]
+
+
+def of_steps(path: Path, entity: str, column: str) -> list[object]:
+    """What was logged for an entity, by real step."""
+    rows = [
+        (batch.column("env_step").to_pylist()[row], batch.column(column).to_pylist()[row])
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == entity and "env_step" in chunk.timeline_names
+        for batch in [chunk.to_record_batch()]
+        if column in batch.schema.names
+        for row in range(batch.num_rows)
+    ]
+    return [value for _, value in sorted(rows, key=lambda each: each[0])]
+
+
+def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: Path) -> None:
+    """Frames are those of another environment, played the same way, which delivers them two macro-actions late."""
+    task, options = "arrows:gesture=first,lag=2", {"gesture": "first", "lag": 2, "execution": "kinematic"}
+    path = tmp_path / "late.rrd"
+    with closing(gymnasium.make("imagine_bench/Arrows-v0", **options)) as env:
+        record_run(task, FakeAgent(), name="random", env=env, path=path, seed=3, appearance="clean", episodes=1)
+    with closing(gymnasium.make("imagine_bench/Arrows-v0", **options)) as env:
+        frame, info = env.reset(seed=episodes.episode_seed("recording", 3, 1))
+        agent, frames, infos, over = FakeAgent(), [frame], [info], False
+        while not over:
+            action = agent.act(Observation(frame=frame, macrostate=None), explore=False)
+            frame, _, terminated, truncated, info = env.step(action)
+            frames, infos, over = [*frames, frame], [*infos, info], terminated or truncated
+    shown = [np.array(each[0], np.uint8).reshape(64, 64, 3) for each in of_steps(path, "/real/frame", "Image:buffer")]
+    np.testing.assert_array_equal(shown, frames)
+    texts = [str(each[0]) for each in of_steps(path, "/real/text", "TextDocument:text")]
+    spec = registry.task(task)
+    for text, info in zip(texts, infos, strict=True):
+        truth, seen = (spec.value_names(info[each]) for each in ("macrostate", "shown"))
+        for name, now, late in zip(spec.macrostate_names, truth, seen, strict=True):
+            assert f"- {name}: {now}{'' if now == late else f' (frame: {late})'}\n" in text
+    assert "(frame: " in "".join(texts) and "(frame: " not in texts[0]

@@ -76,21 +76,34 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
 
 @pytest.mark.parametrize("id_", IDS)
 @pytest.mark.parametrize(
-    "dials", [{"gesture": "first", "distractors": 2}, {"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}]
+    ("dials", "execution", "steps"),
+    [
+        ({"gesture": "first", "distractors": 2}, "kinematic", 25),
+        ({"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}, "kinematic", 25),
+        ({"gesture": 0.5, "lag": 1, "slip": 0.5, "fickle": 0.5, "distractors": 3, "appearance": "mild"}, "physics", 6),
+    ],
 )
-def test_lanes_and_singles_are_equal(id_, dials):
-    vector = gymnasium.make_vec(f"{id_}-vector-v0", num_envs=4, threads=1, **KINEMATIC, **dials)
+def test_lanes_and_singles_are_equal(id_, dials, execution, steps):
+    """What is seen, told and paid, and in physics where all stands and how it moves, to the bit."""
+    options = {"num_envs": 4 if execution == "kinematic" else 2, "execution": execution, **dials}
+    vector = gymnasium.make_vec(f"{id_}-vector-v0", threads=2, **options)
     sync = gymnasium.make_vec(
-        f"{id_}-v0", num_envs=4, vectorization_mode="sync", **KINEMATIC, **dials,
+        f"{id_}-v0", vectorization_mode="sync", **options,
         vector_kwargs={"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP},
     )  # fmt: skip
     draw = np.random.default_rng(1)
     pairs = [(vector.reset(seed=5)[0], sync.reset(seed=5)[0])]
-    for _ in range(25):
-        actions = draw.integers(vector.single_action_space.n, size=4)
+    for _ in range(steps):
+        actions = draw.integers(vector.single_action_space.n, size=options["num_envs"])
         mine, theirs = vector.step(actions), sync.step(actions)
         pairs += [(mine[index], theirs[index]) for index in range(4)]
-        np.testing.assert_array_equal(mine[4]["macrostate"], theirs[4]["macrostate"])
+        pairs += [(mine[4][name], theirs[4][name]) for name in ("macrostate", "shown", "fault", "sim_time_s")]
+        assert not mine[4]["fault"].any()
+        pairs += [
+            (getattr(one.data, name).copy(), getattr(other.unwrapped.data, name).copy())
+            for one, other in zip(vector.unwrapped.envs, sync.unwrapped.envs, strict=True)
+            for name in ("qpos", "qvel", "mocap_pos")
+        ]
     for one, other in pairs:
         np.testing.assert_array_equal(one, other)
     vector.close()

@@ -1,0 +1,98 @@
+"""What agents with memory share: they read states, and replay sequences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from ..dqn import DQN
+from ..encoders.perception import Perception
+from .perception import Remembering
+from .recurrence import START, Recurrence
+from .sequences import SequenceMemory
+from .settings import RecurrentDQNSettings, RecurrentSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What an episode showed so far, and the macro-action after each frame, the last of which may be still to come."""
+
+    frames: list[Frame] = field(default_factory=list)
+    actions: list[int] = field(default_factory=list)
+
+
+class RememberingAgent(DQN):
+    """A DQN whose states are the latents of a frame and what :attr:`recurrence` remembers of the episode after it.
+
+    Snapshots are taken between two episodes, so what an agent sees of one is no part of them.
+    """
+
+    perception: Remembering
+    real: SequenceMemory
+    settings: RecurrentDQNSettings | RecurrentSettings
+
+    def __init__(
+        self, perception: Perception, n_actions: int, settings: Any, seeds: SeedTree, device: torch.device, **more: Any
+    ) -> None:
+        remembering = Remembering(perception, settings.recurrence.units, lambda: self.recurrence)
+        super().__init__(remembering, n_actions, settings, seeds, device, **more)
+        self.begin_episode()
+
+    def begin_episode(self) -> None:
+        """Forget what was seen; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
+        self._seen, self._lived = Past(), Past()
+
+    def new_memory(self, device: torch.device) -> SequenceMemory:
+        """One that is empty, of sequences."""
+        settings, size = self.settings.recurrence, self.perception.plain.latent_size
+        return SequenceMemory(
+            self.settings.memory.real, size, device,
+            units=settings.units, burn_in=settings.burn_in, recurrence=lambda: self.recurrence,
+        )  # fmt: skip
+
+    @property
+    def recurrence(self) -> Recurrence:
+        """What remembers."""
+        raise NotImplementedError
+
+    def perceive(self, frame: Frame) -> Tensor:
+        """The mean latents of a frame and what is remembered after it. Shape (Z + H,).
+
+        A frame that was not acted on is taken for the next one of the episode, or for the first of another.
+        """
+        seen = self._seen
+        frames = seen.frames if seen.frames and seen.frames[-1] is frame else [*seen.frames, frame]
+        return self.perception.recall(frames, seen.actions[: len(frames) - 1])[0]
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act as the DQN, and remember what was seen and done until the episode ends."""
+        self._seen.frames.append(observation.frame)
+        action = super().act(observation, explore=explore)
+        self._seen.actions.append(action)
+        return action
+
+    def store(self, transition: Transition) -> Tensor:
+        """Add a real transition to the memory, with what was remembered before; the state it began in (Z + H,)."""
+        lived, frame, plain = self._lived, transition.observation.frame, self.perception.plain
+        state, before = self.perception.recall([*lived.frames, frame], lived.actions)
+        then = plain.posterior(transition.next_observation.frame)
+        self.real.add_step(
+            plain.posterior(frame), transition.action, transition.reward, then, transition.terminated,
+            step=len(lived.frames), before=lived.actions[-1] if lived.actions else START, stored=before,
+        )  # fmt: skip
+        lived.frames.append(frame)
+        lived.actions.append(transition.action)
+        if transition.terminated or transition.truncated:
+            self._lived = Past()
+        return state
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot between two episodes; ArtefactError if it does not fit this agent."""
+        super().restore(state)
+        self.begin_episode()

@@ -1,0 +1,86 @@
+"""Imagination that remembers: a mixture density network on a recurrent state (MDN-RNN, Ha and Schmidhuber 2018).
+
+What the recurrence remembers is learned from what the world model predicts: the next latents, reward and end. The
+controller reads the latents and what is remembered, as in that paper, and learns nothing of the recurrence. Imagined
+rollouts begin in real states and remember what they imagine; filter and members are those of :mod:`..imagination`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from ..imagination.agent import ImaginingAgent, build
+from ..imagination.rollouts import Imagination
+from ..imagination.settings import Settings, WorldModelSettings
+from ..imagination.world_model import WorldModel
+from ..replay import Batch
+from .agent import RememberingAgent
+from .recurrence import Recurrence
+from .settings import IMAGINATION_MEMORY, RecurrentSettings
+
+
+class RecurrentWorldModel(WorldModel):
+    """A world model of states (Z + H): what it remembers (H) decides with the latents (Z) what it predicts."""
+
+    def __init__(
+        self, state_size: int, n_actions: int, settings: WorldModelSettings, units: int, generator: torch.Generator
+    ) -> None:
+        super().__init__(state_size, n_actions, settings, generator, predicted=state_size - units)
+        self.recurrence = Recurrence(self.predicted, n_actions, units, generator)
+        self.clipped = (*self.networks, self.recurrence)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+
+    def keep_dynamics_of(self, other: WorldModel) -> None:
+        """Take over what another model of the same shape knows of where actions lead, and how it remembers."""
+        super().keep_dynamics_of(other)
+        self.recurrence.load_state_dict(cast(RecurrentWorldModel, other).recurrence.state_dict())
+
+
+class RecurrentImagination(Imagination):
+    """Imagination whose rollouts carry what is remembered."""
+
+    model: RecurrentWorldModel
+
+    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> RecurrentWorldModel:
+        """A world model that has learned nothing, of states of so many numbers."""
+        units = cast(RecurrentSettings, settings).recurrence.units
+        return RecurrentWorldModel(state_size, n_actions, settings.model, units, self.generators["weights"])
+
+    @torch.no_grad()
+    def state_after(self, z: Tensor, action: Tensor, predicted: Tensor) -> Tensor:
+        """States (N, Z + H) after others ``z`` and actions (N,), given the predicted latents (N, Z)."""
+        memory = z[:, self.model.predicted :]
+        after = self.model.recurrence(predicted.unsqueeze(1), action.unsqueeze(1), memory)[:, 0]
+        return torch.cat([predicted, after], dim=-1)
+
+
+class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
+    """Algorithm 1 on states: a DQN on what the world model remembers, fed by recurrent imagination."""
+
+    settings: RecurrentSettings
+    imagination: RecurrentImagination
+    imagination_kind = RecurrentImagination
+
+    @property
+    def recurrence(self) -> Recurrence:
+        """That of the world model."""
+        return self.imagination.model.recurrence
+
+    def draw_model_batches(self, generator: torch.Generator) -> Iterator[Batch]:
+        """Replayed sequences as transitions between states, through which losses reach what remembers."""
+        settings, length = self.settings.model, self.settings.recurrence.sequence
+        for _ in range(settings.updates_per_step):
+            sequences = self.real.draw(
+                settings.batch_size, length, generator, spread=settings.spread, balance=settings.balance
+            )
+            states = sequences.states(self.recurrence)
+            yield sequences.transitions(states, states)
+
+
+make = partial(build, ImaginingMemoryAgent, filtered=True, hyperparameters=IMAGINATION_MEMORY)
+"""The ``imagination_memory`` agent."""

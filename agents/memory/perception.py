@@ -1,0 +1,74 @@
+"""States for a controller that has no memory of its own: the latents of a frame and what is remembered after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imagine_bench.interfaces import Frame
+
+from ..encoders.encoder import Encoder
+from ..encoders.perception import Perception
+from .recurrence import START, Recurrence
+
+
+class StateEncoder(Encoder):
+    """An encoder whose latents (N, Z + H) are followed by what is remembered after a first frame."""
+
+    def __init__(self, encoder: Encoder, units: int, recurrence: Callable[[], Recurrence]) -> None:
+        # everything is done by the encoder that is given
+        self.card, self.device, self.latent_size = encoder.card, encoder.device, encoder.latent_size + units
+        self._encoder, self._recurrence = encoder, recurrence
+
+    @torch.no_grad()
+    def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
+        """Means and standard deviations of the states that lone frames are taken for; what is remembered is certain."""
+        return self.remembering(*self._encoder.encode(frames))
+
+    @torch.no_grad()
+    def remembering(self, mu: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+        """The same from their posteriors (N, Z)."""
+        recurrence = self._recurrence()
+        blank, first = recurrence.blank(len(mu)), torch.full((len(mu), 1), START, device=mu.device)
+        memory = recurrence(mu.unsqueeze(1), first, blank)[:, 0]
+        return torch.cat([mu, memory], dim=-1), torch.cat([sigma, torch.zeros_like(memory)], dim=-1)
+
+    def decode(self, latents: Tensor) -> NDArray[np.float32]:
+        """Images of states (N, Z + H), as the encoder's."""
+        return self._encoder.decode(latents[:, : self._encoder.latent_size])
+
+    def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
+        """What the probe reads from the latents of states (N, Z + H). Shape (N, M)."""
+        return self._encoder.read_macrostate(latents[:, : self._encoder.latent_size])
+
+
+class Remembering(Perception):
+    """States of single frames, and of the last of an episode so far."""
+
+    encoder: StateEncoder
+
+    def __init__(self, plain: Perception, units: int, recurrence: Callable[[], Recurrence]) -> None:
+        super().__init__(StateEncoder(plain.encoder, units, recurrence))
+        self.plain, self._recurrence = plain, recurrence
+
+    def posterior(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the state of a lone frame, each of shape (Z + H,)."""
+        mu, sigma = self.plain.posterior(frame)
+        states = self.encoder.remembering(mu.unsqueeze(0), sigma.unsqueeze(0))
+        return states[0][0], states[1][0]
+
+    @torch.no_grad()
+    def recall(self, frames: Sequence[Frame], actions: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """The mean state after the frames of an episode so far (Z + H,), and what was remembered before the last (H,).
+
+        ``actions`` are the macro-actions between them.
+        """
+        z = torch.stack([self.plain.posterior(frame)[0] for frame in frames]).unsqueeze(0)  # [1, T, Z]
+        recurrence, previous = self._recurrence(), torch.tensor([[START, *actions]], device=z.device)
+        blank = recurrence.blank(1)
+        memory = recurrence(z, previous, blank)[0]  # [T, H]
+        return torch.cat([z[0, -1], memory[-1]]), memory[-2] if len(memory) > 1 else blank[0]

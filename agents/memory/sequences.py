@@ -1,0 +1,126 @@
+"""Replay of sequences with stored memory and burn-in (Kapturowski et al. 2019, R2D2).
+
+A state is the latents of a frame and what is remembered after it. Of each real transition is kept what was remembered
+before its frame, by the network of that time. What is replayed begins some macro-actions earlier, within the episode,
+so that the network of today remembers them anew; no gradient goes there. Where these reach back to the start of the
+episode, nothing stored is used. Shapes: ``B`` sequences of ``L`` transitions, ``K`` before them, ``Z``, ``H``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..replay import Batch, Posterior, RealMemory
+from .recurrence import START, Recurrence
+
+
+@dataclass(frozen=True, slots=True)
+class Sequences:
+    """Replayed sequences; rows of ``valid`` that are false are of no episode, and what is there means nothing."""
+
+    stored: Tensor  #: what was remembered before the burn-in. Shape (B, H).
+    burned: Tensor  #: observations of the burn-in, which come first in the next two. Shape (B,), at most K.
+    burn_z: Tensor  #: shape (B, K, Z)
+    burn_previous: Tensor  #: macro-action before each. Shape (B, K).
+    z: Tensor  #: latents of the sequence's observations. Shape (B, L + 1, Z).
+    previous: Tensor  #: macro-action before each. Shape (B, L + 1).
+    action: Tensor  #: shape (B, L)
+    reward: Tensor  #: shape (B, L)
+    terminated: Tensor  #: shape (B, L)
+    valid: Tensor  #: whether the episode got so far. Shape (B, L), bool.
+
+    def states(self, recurrence: Recurrence) -> Tensor:
+        """Latents and what is remembered after each observation of the sequences. Shape (B, L + 1, Z + H)."""
+        start = self.stored
+        if self.burn_z.shape[1]:
+            with torch.no_grad():
+                burnt = recurrence(self.burn_z, self.burn_previous, start)
+            last = burnt[torch.arange(len(burnt), device=burnt.device), (self.burned - 1).clamp_min(0)]
+            start = torch.where((self.burned > 0).unsqueeze(1), last, start)
+        return torch.cat([self.z, recurrence(self.z, self.previous, start)], dim=-1)
+
+    def transitions(self, now: Tensor, then: Tensor) -> Batch:
+        """The valid transitions between states, each (B, L + 1, Z + H): from those of ``now`` to those of ``then``."""
+        valid = self.valid
+        outcome = (column[valid] for column in (self.action, self.reward, self.terminated))
+        action, reward, terminated = outcome
+        return Batch(now[:, :-1][valid], action, reward, then[:, 1:][valid], terminated)
+
+
+class SequenceMemory(RealMemory):
+    """Transitions that happened, which can be replayed with what came before and after them.
+
+    ``recurrence`` gives the network that remembers now, ``burn_in`` is K.
+    """
+
+    def __init__(
+        self, capacity: int, latent_size: int, device: torch.device, *, units: int, burn_in: int,
+        recurrence: Callable[[], Recurrence],
+    ) -> None:  # fmt: skip
+        super().__init__(capacity, latent_size, device)
+        self._recurrence, self._burn_in = recurrence, burn_in
+        self._columns |= {name: torch.zeros(capacity, dtype=torch.int64, device=device) for name in ("step", "before")}
+        self._columns["stored"] = torch.zeros(capacity, units, device=device)
+
+    def add_step(
+        self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool, *,
+        step: int, before: int, stored: Tensor,
+    ) -> None:  # fmt: skip
+        """Store transition ``step`` of an episode, which goes on from the one stored last unless that is 0.
+
+        ``before`` is the macro-action before it, or :data:`START`; ``stored`` what was remembered then, shape (H,).
+        """
+        row, columns = self.added % self.capacity, self._columns
+        columns["step"][row], columns["before"][row], columns["stored"][row] = step, before, stored
+        self.add(posterior, action, reward, next_posterior, terminated)
+
+    def draw(
+        self, count: int, length: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0
+    ) -> Sequences:
+        """Sequences of at most ``length`` transitions that begin with drawn ones; see :meth:`RealMemory.sample`."""
+        drawn = self._draw(count, generator, self._weights(balance) if balance else None)
+        columns, step = self._columns, drawn["step"]
+        oldest = self.added - len(self)
+        number = oldest + (drawn["rows"] - oldest) % self.capacity  # how many were stored before it
+        burned = torch.minimum(step.clamp_max(self._burn_in), number - oldest)
+        first = number - burned
+
+        def rows(begin: Tensor, many: int) -> tuple[Tensor, Tensor]:
+            numbers = begin.unsqueeze(1) + torch.arange(many, device=begin.device)
+            return numbers.clamp_max(self.added - 1) % self.capacity, numbers < self.added
+
+        early, _ = rows(first, int(burned.max()))
+        late, there = rows(number, length)
+        valid = there & (columns["step"][late] - torch.arange(length, device=step.device) == step.unsqueeze(1))
+        longest = int(valid.sum(dim=1).max())
+        late, valid = late[:, :longest], valid[:, :longest]
+        mu = torch.cat([columns["mu"][early], drawn["mu"].unsqueeze(1), columns["next_mu"][late]], dim=1)
+        sigma = torch.cat([columns["sigma"][early], drawn["sigma"].unsqueeze(1), columns["next_sigma"][late]], dim=1)
+        noise = torch.empty(mu.shape, device=generator.device).normal_(generator=generator)
+        z, many = torch.addcmul(mu, sigma, noise * spread), early.shape[1]
+        return Sequences(
+            stored=columns["stored"][first % self.capacity],
+            burned=burned,
+            burn_z=z[:, :many],
+            burn_previous=columns["before"][early],
+            z=z[:, many:],
+            previous=torch.cat([drawn["before"].unsqueeze(1), columns["action"][late]], dim=1),
+            action=columns["action"][late],
+            reward=columns["reward"][late],
+            terminated=columns["terminated"][late],
+            valid=valid,
+        )
+
+    @torch.no_grad()
+    def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
+        """Draw transitions between states, with what is remembered in them now; see :meth:`RealMemory.sample`."""
+        sequences = self.draw(count, 1, generator, spread=spread, balance=balance)
+        states = sequences.states(self._recurrence())
+        return sequences.transitions(states, states)
+
+
+__all__ = ["START", "SequenceMemory", "Sequences"]
