@@ -339,7 +339,7 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
 
 
-def judged(model: str, transitions: str, score: str, folder: str) -> str:
+def judged(folder: str, model: str, transitions: str, score: str) -> str:
     """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
     with (RESULTS / folder / "scores.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if (row["model"], row["transitions"]) == (model, transitions)]
