@@ -173,13 +173,20 @@ def compare_rollout(
             outcome = _choose(spec.rules.outcomes(state, int(action)), tuple(imagined.tolist()), rng)
             state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
         real.append((state, reward, over))
-    seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)
-    frames = spec.render_macrostates(np.array(seen[-len(real) :]), appearance, rng) if real else ()
-    return beside_reality(rollout, frame, macrostate, frames, real)
+    seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)[len(before) + 1 :]
+    frames = spec.render_macrostates(np.array(seen), appearance, rng) if real else ()
+    read = [(as_read(spec, shown), reward, over) for shown, (_, reward, over) in zip(seen, real, strict=True)]
+    return beside_reality(rollout, frame, macrostate, frames, read)
+
+
+def as_read(spec: TaskSpec, shown: Sequence[int]) -> State:
+    """What an encoder reads in a frame that shows this: one more than the last value of a coordinate that is hidden."""
+    pairs = zip(spec.macrostate_values, shown, strict=True)
+    return tuple(len(values) if value < 0 else int(value) for values, value in pairs)
 
 
 def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
-    """What the frame shows that is seen in each macrostate of an episode; -1 for what it hides."""
+    """What the frame shows that the agent sees in each macrostate of an episode; -1 for what it hides."""
     if sight is None:
         return states
     shown = []
@@ -193,9 +200,9 @@ def beside_reality(
     rollout: ImaginedRollout, frame: Frame, macrostate: Sequence[int] | Macrostate, frames: Sequence[Frame] | Frame,
     real: Sequence[tuple[State, float, bool]],
 ) -> ComparedRollout:  # fmt: skip
-    """An imagined rollout from a ``frame`` that shows ``macrostate``, and what really came of it.
+    """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and what really came of it.
 
-    ``frames`` and ``real`` (macrostate, reward, whether the episode has ended) have an entry for each macro-action
+    ``frames`` and ``real`` (what they show, reward, whether the episode has ended) have an entry for each macro-action
     that was carried out.
     """
     done = len(real)

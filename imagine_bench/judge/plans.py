@@ -20,7 +20,7 @@ from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
-from imagine_bench.judge.imagination_quality import beside_reality
+from imagine_bench.judge.imagination_quality import as_read, beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
@@ -117,7 +117,8 @@ def carry_out(
     for step, action in enumerate([] if refused else rollout.actions, start=1):
         seen, reward, terminated, truncated, info = env.step(int(action))
         frames.append(seen)
-        real.append((_state(info), float(reward), bool(terminated)))
+        shown = as_read(trained.task, info.get("shown", info["macrostate"]))
+        real.append((shown, float(reward), bool(terminated)))
         faults, solved = faults + bool(info["fault"]), bool(info["is_success"])
         if on_step is not None:
             on_step(step)

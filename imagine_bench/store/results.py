@@ -67,10 +67,12 @@ class ComparedRollout:
     """An imagined rollout beside what the real environment shows for the same start and actions."""
 
     start_frame: NDArray[np.uint8]  #: The real frame it starts from. Shape (64, 64, 3), uint8.
-    start_macrostate: NDArray[np.int64]  #: What that frame shows. Shape (M,).
+    start_macrostate: NDArray[np.int64]  #: Where it is seen. Shape (M,).
     rollout: ImaginedRollout  #: What the agent imagined
     real_frames: NDArray[np.uint8]  #: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
-    real_macrostates: NDArray[np.int64]  #: What the rules say. Shape (D, M).
+    #: What they show: what the rules say, or where the task's frames are late or hide a coordinate, that, with one more
+    #: than its last value for what is hidden. Shape (D, M).
+    real_macrostates: NDArray[np.int64]
     real_rewards: NDArray[np.float64]  #: What the rules say. Shape (D,).
     real_terminated: NDArray[np.bool_]  #: Shape (D,)
 

@@ -21,7 +21,8 @@ import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, SetupError, require_known
+from imagine_bench.appearance import appearance_name
+from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, PerformanceTargets, SceneReader, TaskSpec
 from imagine_bench.machine import describe_environment, gl_renderer
 from imagine_bench.seeding import SeedTree
@@ -115,7 +116,7 @@ def measure_worlds(worlds: Sequence[str], appearances: Sequence[str], turns: int
     for spec in specs:
         if spec.targets is None:
             raise InvalidValueError(f"{spec.id} has no targets, for another task measures its scene; leave it out.")
-    for appearance in (require_known("appearance", each, APPEARANCES) for each in appearances):
+    for appearance in map(appearance_name, appearances):
         for spec in specs:
             assert spec.targets is not None
             yield from _fidelity(spec, spec.targets, turns, appearance)[1]

@@ -339,7 +339,7 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
 
 
-def judged(model: str, transitions: str, score: str, folder: str) -> str:
+def judged(folder: str, model: str, transitions: str, score: str) -> str:
     """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
     with (RESULTS / folder / "scores.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if (row["model"], row["transitions"]) == (model, transitions)]
@@ -391,6 +391,15 @@ def speed(machine: str, what: str) -> str:
     return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
 
 
+def fidelity(world: str, what: str) -> str:
+    """A figure of ``speed --worlds`` at clean and at strong, by how its name begins; an en dash where there is none."""
+    figures = {each["what"]: each for each in _json("speed/worlds.json")["figures"]}
+    starts = [f"{world}{level}: {what}" for level in ("", " at strong")]
+    found = [each["measured"] for start in starts for name, each in figures.items() if name.startswith(start)]
+    assert all(each["met"] for each in figures.values()) and len(found) in (0, 2)
+    return " / ".join(found) or "–"
+
+
 def margin(task: str, setting: str, value: str) -> str:
     """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
     points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
@@ -428,7 +437,7 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
-        thesis_error, claim, decomposed, speed, margin, walked, goals_and_starts, chance_exact, shortest, price,
-        price_to, coverage,
+        thesis_error, claim, decomposed, speed, fidelity, margin, walked, goals_and_starts, chance_exact, shortest,
+        price, price_to, coverage,
     )
 }  # fmt: skip

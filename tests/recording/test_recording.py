@@ -344,11 +344,16 @@ def test_real_frames_are_as_late_as_the_agent_s_and_hide_as_much(before: int) ->
         spec, frame=np.zeros((64, 64, 3), np.uint8), macrostate=np.array(episode[-1]), rollout=rollout,
         appearance="clean", rng=rng, before=episode[:-1],
     )  # fmt: skip
-    states = [*episode, *map(tuple, compared.real_macrostates.tolist())]
+    states, over = list(episode), False
+    for action in rollout.actions:
+        (outcome,) = spec.rules.outcomes(states[-1], int(action))
+        states, over = [*states, states[-1] if over else outcome.macrostate], over or outcome.terminated
     for depth in range(6):
         source = max(0, before + depth + 1 - 2)
-        expected = states[source] if source == 0 else (*states[source][:-1], 255)
-        assert tuple(compared.real_frames[depth, 0, : len(expected), 0]) == expected
+        *directions, pointed = states[source]
+        in_frame, read = (pointed, pointed) if source == 0 else (255, 3)
+        assert compared.real_frames[depth, 0, :4, 0].tolist() == [*directions, in_frame]
+        assert compared.real_macrostates[depth].tolist() == [*directions, read]
 
 
 def of_steps(path: Path, entity: str, column: str) -> list[object]:
