@@ -346,14 +346,12 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    digits = 2 if score.startswith(("auroc", "total", "counter")) or "skill" in score else 1
-    value, *ends = (f"{number:.{digits}f}" for number in (statistics.iqm(values), *_ends(values, digits == 2)))
+    share = score.startswith(("auroc", "total", "counter", "best"))
+    digits = 2 if share or "skill" in score else 1
+    numbers = (statistics.iqm(values), *statistics.interval(values, share=share))
+    value, *ends = (f"{number:.{digits}f}".replace("-", "−") for number in numbers)
     few = f" ({len(values)} of {len(rows)})" if len(values) < len(rows) else ""
     return (value if "nan" in ends or len({value, *ends}) == 1 else f"{value} [{', '.join(ends)}]") + few
-
-
-def _ends(values: list[float], share: bool) -> tuple[float, float]:
-    return statistics.interval(values, share=share)
 
 
 # Regression, speed, rules ----------------------------------------------------------------------------------------
