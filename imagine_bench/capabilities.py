@@ -6,7 +6,7 @@ depth, ``A`` actions, ``M`` coordinates of a macrostate. A probe that reads macr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -53,6 +53,18 @@ def begin_episode(agent: object) -> None:
     """Tell an agent, if it remembers, that its next observation is the first of an episode."""
     if isinstance(agent, EpisodeRememberer):
         agent.begin_episode()
+
+
+@runtime_checkable
+class MemoryReader(Protocol):
+    """An agent of which can be said what it remembers of an episode; it changes nothing in the agent."""
+
+    def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
+        """What a linear read-out finds in the memory after the frame that was acted on last, or the next. Shape (M,).
+
+        It is fitted on frames that the agent learned from: what a probe saw last of each coordinate of the macrostate,
+        of so many values; -1 of one never seen. No agent acts on it.
+        """
 
 
 @runtime_checkable

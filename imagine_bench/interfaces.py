@@ -243,7 +243,7 @@ class TaskSpec:
 
     def execution(self, asked: str | None) -> str:
         """How macro-actions are to happen: as asked for, or the usual way. UnknownNameError: not in this world."""
-        return self.executions[0] if asked is None else require_known(f"execution of {self.id}", asked, self.executions)
+        return self.executions[0] if asked is None else require_known("execution", asked, self.executions)
 
     @property
     def n_actions(self) -> int:

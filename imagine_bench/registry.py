@@ -223,6 +223,11 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
+    "mdn_rnn": WorldModelEntry(
+        make=f"{_WORLD_MODELS}.recurrent:make", title="VAE + MDN-RNN", encoder_kind="latents",
+        description="The ensemble on what a recurrent network remembers of all frames of the history.",
+        by_default=False,
+    ),
     "mdn_thesis": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_thesis", title="VAE + MDN, thesis' settings", encoder_kind="latents",
         description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",

@@ -37,7 +37,7 @@ def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def shapes_of(model: mujoco.MjModel) -> tuple[Shape3D, ...]:
-    """Every geom that some view draws; a plane becomes a thin box under its surface."""
+    """Every geom that some view draws, also people who are hidden now; a plane becomes a thin box under its surface."""
     return tuple(_shape(model, index) for index in range(model.ngeom) if model.geom_group[index] in DRAWN_GROUPS)
 
 
@@ -61,7 +61,7 @@ def _shape(model: mujoco.MjModel, index: int) -> Shape3D:
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[index]
     return Shape3D(
         name=geom.name, body=model.body(int(model.geom_bodyid[index])).name, kind=kind, size=size,
-        pose_in_body=pose, rgba=rgba.astype(np.float64), vertices=vertices, faces=faces,
+        pose_in_body=pose, rgba=np.array([*rgba[:3], 1.0]), vertices=vertices, faces=faces,
     )  # fmt: skip
 
 

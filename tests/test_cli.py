@@ -54,7 +54,10 @@ def bench_words(out: Path, *more: str) -> list[str]:
             ["--appearance", "strng"],
             "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, ",
         ),
-        (["--execution", "physic"], "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
+        (
+            ["--execution", "physic"],
+            "No execution of arrow_puzzle 'physic'. Did you mean 'physics'? Known: physics, kinematic.",
+        ),
         (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
         (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
         (["--encoder", "./none.safetensors"], "No encoder './none.safetensors'."),

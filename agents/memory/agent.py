@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
@@ -14,6 +17,7 @@ from imagine_bench.seeding import SeedTree
 from ..dqn import DQN
 from ..encoders.perception import Perception
 from .perception import Remembering
+from .readout import ReadOut, fit
 from .recurrence import START, Recurrence
 from .sequences import SequenceMemory
 from .settings import RecurrentDQNSettings, RecurrentSettings
@@ -42,6 +46,7 @@ class RememberingAgent(DQN):
     ) -> None:
         remembering = Remembering(perception, settings.recurrence.units, lambda: self.recurrence)
         super().__init__(remembering, n_actions, settings, seeds, device, **more)
+        self._read_out: tuple[int, ReadOut] | None = None  # of how many real steps
         self.begin_episode()
 
     def begin_episode(self) -> None:
@@ -91,6 +96,12 @@ class RememberingAgent(DQN):
         if transition.terminated or transition.truncated:
             self._lived = Past()
         return state
+
+    def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
+        """What a linear read-out finds in the memory; see :class:`imagine_bench.capabilities.MemoryReader`."""
+        if self._read_out is None or self._read_out[0] != self.steps:
+            self._read_out = self.steps, fit(self.real, self.recurrence, self.perception.plain.encoder, sizes)
+        return self._read_out[1](self.perceive(frame)[self.perception.plain.latent_size :])
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot between two episodes; ArtefactError if it does not fit this agent."""

@@ -7,13 +7,14 @@ settings of ``quick``, or those printed in the thesis; how long they train is fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
@@ -24,7 +25,7 @@ from ..encoders.perception import load_perception, prepare_torch
 from ..imagination.rollouts import Imagination
 from ..imagination.settings import HYPERPARAMETERS, Settings
 from ..imagination.uncertainty import decompose
-from ..replay import RealMemory
+from ..replay import Batch, RealMemory
 
 UPDATES = 1_500
 _MOST = 0.5  # share of its futures that the filter keeps of a step that counts as kept
@@ -36,32 +37,48 @@ class LatentModel:
     """Encoder, environment model and decoder as a world model."""
 
     def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
-        self.encoder, self.settings, device = encoder, settings, encoder.device
-        size, seeds = encoder.latent_size, context.seeds
-        self.imagination = Imagination(size, context.n_actions, settings, filtered=True, seeds=seeds, device=device)
+        self.encoder, self.settings = encoder, settings
+        self.imagination = self.new_imagination(context)
+
+    def new_imagination(self, context: AgentContext) -> Imagination:
+        """What imagines, of which nothing is learned yet."""
+        size, seeds, device = self.encoder.latent_size, context.seeds, self.encoder.device
+        return Imagination(size, context.n_actions, self.settings, filtered=True, seeds=seeds, device=device)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Encode every frame once and make :data:`UPDATES` updates."""
         generator = self._generator(rng)
         before = torch.from_numpy(dataset.rows[0])
         mu, sigma = (each.cpu() for each in self.encoder.encode(dataset.frames))
-        memory = RealMemory(len(before), self.encoder.latent_size, self.encoder.device)
         columns = {
             "mu": mu[before], "sigma": sigma[before], "next_mu": mu[before + 1], "next_sigma": sigma[before + 1],
             "action": dataset.actions, "reward": dataset.rewards.astype(np.float32),
             "terminated": dataset.terminated.astype(np.float32),
         }  # fmt: skip
-        memory.load({name: np.asarray(column) for name, column in columns.items()}, len(before))
-        model = self.settings.model
-        for _ in range(UPDATES):
-            batch = memory.sample(model.batch_size, generator, spread=model.spread, balance=model.balance)
+        for batch in self.batches({name: np.asarray(column) for name, column in columns.items()}, dataset, generator):
             self.imagination.model.update(batch, generator)
+
+    def batches(
+        self, columns: dict[str, NDArray[Any]], dataset: Episodes, generator: torch.Generator
+    ) -> Iterator[Batch]:
+        """What is learned from: :data:`UPDATES` batches of transitions, whose columns are given."""
+        del dataset
+        model, rows = self.settings.model, len(columns["action"])
+        memory = RealMemory(rows, self.encoder.latent_size, self.encoder.device)
+        memory.load(columns, rows)
+        for _ in range(UPDATES):
+            yield memory.sample(model.batch_size, generator, spread=model.spread, balance=model.balance)
+
+    def states(self, frames: Frame, actions: NDArray[np.int64]) -> Tensor:
+        """What is imagined from: here the latents (N, Z) of the latest of frames (N, K, 64, 64, 3)."""
+        del actions
+        return self.encoder.encode(frames[:, -1])[0]
 
     @torch.no_grad()
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
         """Futures in closed loop through latents; see :class:`imagine_bench.world_models.WorldModel`."""
         generator, rows = self._generator(rng), len(frames)
-        z = self.encoder.encode(frames[:, -1])[0].repeat_interleave(samples, dim=0)  # [N S, Z]
+        z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
         steps: dict[str, list[Any]] = {
@@ -70,7 +87,9 @@ class LatentModel:
         for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
             step = self.imagination.step(z, action.repeat_interleave(samples), weights, generator)
             z, spread = step.next_z, decompose(step.samples)
-            steps["pictures"].append((self.encoder.decode(z) * 255.0).round().astype(np.uint8))
+            steps["pictures"].append(
+                (self.encoder.decode(z[:, : self.encoder.latent_size]) * 255.0).round().astype(np.uint8)
+            )
             steps["rewards"].append((alive * step.reward).numpy())
             alive = alive * (1.0 - step.p_terminated)
             steps["p_ended"].append((1.0 - alive).numpy())

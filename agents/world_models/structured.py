@@ -57,8 +57,9 @@ class StructuredModel:
             alive = alive * (1.0 - ends)
             for array, values in ((ended, 1.0 - alive), (unknown, untested), (other, p_other)):
                 array[:, :, step] = values.reshape(rows, samples)
+        pictures = self._pictures(np.stack(drawn, axis=1))
         return Imagined(
-            pictures=self._pictures(np.stack(drawn, axis=1)).reshape(*shape, 64, 64), rewards=rewards, p_ended=ended,
+            pictures=pictures.reshape(*shape, *pictures.shape[1:]), rewards=rewards, p_ended=ended,
             epistemic=unknown.mean(axis=1), modal=other.mean(axis=1),
         )  # fmt: skip
 
@@ -86,7 +87,7 @@ class StructuredModel:
         return torch.stack([part.argmax(dim=1) for part in parts], dim=1).numpy()
 
     def _pictures(self, codes: Codes) -> NDArray[np.uint8]:
-        """Pictures of codes (..., P), each different code drawn once. Shape (rows, 64, 64)."""
+        """Pictures of codes (..., P), each different code drawn once. Shape (rows, H, W) or (rows, H, W, 3)."""
         different, which = np.unique(codes.reshape(-1, codes.shape[-1]), axis=0, return_inverse=True)
         hot = [functional.one_hot(torch.from_numpy(v.copy()), n) for v, n in zip(different.T, self.sizes, strict=True)]
         drawn = self.encoder.decode(torch.cat(hot, dim=1).float())

@@ -71,6 +71,8 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
         protocol, found = trained.spec.protocol, []
         if protocol.dataset or protocol.after:
             raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
+        if not protocol.shows_frames_alone:
+            raise InvalidValueError("These agents saw more than frames; give a bench of --observation frame.")
         if not run_folder.is_done(trained.folder):
             raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
         run = run_folder.load_run(trained.folder)

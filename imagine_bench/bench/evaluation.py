@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -65,14 +65,21 @@ def play(
         before, over = after, terminated or truncated
 
 
-def _require_sound(env: Env, frame: Any, reward: Any) -> None:
+def _require_sound(env: Env, seen: Any, reward: Any) -> None:
     """Raise InvalidValueError for what no agent should be shown: a package's environment can give anything."""
     space = env.observation_space
-    if isinstance(space, gymnasium.spaces.Box) and (frame.shape, frame.dtype) != (space.shape, space.dtype):
-        raise InvalidValueError(
-            f"{env} gave a frame of {frame.dtype} and shape {frame.shape}; it declares {space.dtype} of shape "
-            f"{space.shape}. 'imagine-bench check --task' finds such faults."
-        )
+    named = isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, Mapping)
+    for name, wanted in space.spaces.items() if named else [("frame", space)]:  # type: ignore[attr-defined]
+        part, more = seen.get(name) if named else seen, "'imagine-bench check --task' finds such faults."
+        if isinstance(wanted, gymnasium.spaces.Box):
+            given = (getattr(part, "shape", None), getattr(part, "dtype", type(part)))
+            if given != (wanted.shape, wanted.dtype):
+                raise InvalidValueError(
+                    f"{env} gave a {name} of {given[1]} and shape {given[0]}; it declares {wanted.dtype} of shape "
+                    f"{wanted.shape}. {more}"
+                )
+            if part.dtype.kind == "f" and not np.isfinite(part).all():
+                raise InvalidValueError(f"{env} gave a {name} with NaN or infinity. {more}")
     if not math.isfinite(reward):
         raise InvalidValueError(f"{env} gave the reward {reward}; rewards are finite.")
 

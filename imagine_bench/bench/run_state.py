@@ -32,12 +32,11 @@ _REPORT_EVERY_S = 0.25
 
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
-    """The environment of a task as a protocol has it, for training or for tests; ``options`` are more of its own."""
+    """The environment of a task as a protocol has it, for training or for tests; ``options`` replace what it has."""
     env = gymnasium.make(
         registry.task_entry(task).env_id,
-        **protocol.world,
+        **{**protocol.world, **options},
         appearance=protocol.appearance_in_tests if testing else protocol.appearance,
-        **options,
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
     if protocol.observation in OBSERVATIONS[1:]:

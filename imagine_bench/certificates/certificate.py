@@ -11,7 +11,7 @@ import numpy as np
 
 from imagine_bench.certificates.beliefs import BeliefRules, TooManyBeliefsError
 from imagine_bench.certificates.factors import FactorGraph, Scope, factor_graph
-from imagine_bench.certificates.floor import learn
+from imagine_bench.certificates.floor import Lesson, learn
 from imagine_bench.certificates.machine import Machine, machine
 from imagine_bench.certificates.memoryless import best_without_memory
 from imagine_bench.interfaces import Floats, Rules, TaskSpec
@@ -52,7 +52,7 @@ class Certificate:
     outcomes: tuple[tuple[str, str], ...]  #: (reward and end, coordinates of the conditions that force it), in order
     width: int  #: the most coordinates that decide one factor or condition
     facts: int  #: local entries and conditions that there are to know
-    floor: InformationFloor | None  #: None where no start can be solved
+    floor: InformationFloor | None  #: None where no start can be solved, or a learner is not done after floor.MOST
 
 
 def certificate(spec: TaskSpec) -> Certificate:
@@ -175,9 +175,11 @@ def _class(full: Machine, index: int) -> str:
 
 def _floor(full: Machine, graph: FactorGraph, horizon: int) -> InformationFloor | None:
     learners = min(_LEARNERS, max(_FEWEST, _PAIRS // (full.n_play * full.n_actions)))
-    lessons = [learn(full, graph, horizon, np.random.default_rng(seed)) for seed in range(learners)]
-    if not all(lesson.done for lesson in lessons):
-        return None
+    lessons = list[Lesson]()
+    for seed in range(learners):
+        lessons.append(learn(full, graph, horizon, np.random.default_rng(seed)))
+        if not lessons[-1].done:
+            return None
     needed = np.array([lesson.transitions for lesson in lessons], dtype=np.float64)
     return InformationFloor(
         transitions=float(needed.mean()),

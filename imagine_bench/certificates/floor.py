@@ -25,7 +25,7 @@ _SUCCESS = 10_000.0  # of return: success comes first
 _EPS = 1e-6
 _CELLS = 2_000_000  # combinations of values up to which all are looked at
 _SWEEPS = 4  # times the horizon
-MOST = 50_000
+MOST = 3_000
 """Transitions after which a learner gives up."""
 
 

@@ -76,7 +76,8 @@ class BeliefsObserver(RunObserver):
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``beliefs`` of an agent that learns, in a task of not too many macrostates, each of which frames show."""
         task, entry = run.task, run.entry
-        if not entry.learns or task.sight is not None or len(states_of(task.rules)) > MOST_STATES:
+        frames_tell_all = run.protocol.shows_frames_alone and task.sight is None
+        if not entry.learns or not frames_tell_all or len(states_of(task.rules)) > MOST_STATES:
             return {}
         if self._frames is None:  # the same at every budget
             appearance, purpose = run.protocol.appearance_in_tests, evaluation_split(run.spec.seed)

@@ -16,7 +16,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, ValueReader, begin_episode
+from imagine_bench.capabilities import Imaginer, MemoryReader, ValueReader, begin_episode
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
@@ -110,7 +110,7 @@ class _EpisodeRecorder:
         while not done:
             macrostate = np.asarray(info["macrostate"])
             action = int(self._agent.act(observation, explore=False))
-            self._describe(heading, info, f"Next: {self._spec.action_names[action]}.")
+            self._describe(heading, info, f"Next: {self._spec.action_names[action]}.", observation.frame)
             self._log_values(observation, action)
             self._recording.stream.disable_timeline("imagined_depth")
             self._log_imagination(observation.frame, macrostate, episode, step)
@@ -123,7 +123,7 @@ class _EpisodeRecorder:
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
             outcome = f"Done: {self._spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
-        self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.")
+        self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.", observation.frame)
         self._clear_predictions()
         self._clock_s += _STILL_S
 
@@ -148,12 +148,20 @@ class _EpisodeRecorder:
             return np.asarray(scene.agent_view())
         return self._spec.render_macrostates(shown[None], self._appearance, np.random.default_rng(self._env_step))[0]
 
-    def _describe(self, heading: str, info: Mapping[str, Any], last: str) -> None:
-        """What has happened, what is true, and what the frame shows where that is something else; what comes next."""
+    def _describe(self, heading: str, info: Mapping[str, Any], last: str, frame: Frame) -> None:
+        """What has happened, what is true, and what the frame shows where that is something else; what comes next.
+
+        Of an agent with memory also what a read-out finds in it.
+        """
         spec, truth = self._spec, info["macrostate"]
-        names = [spec.value_names(each) for each in (truth, info.get("shown", truth))]
-        rows = zip(spec.macrostate_names, *names, strict=True)
-        seen = "\n".join(f"- {name}: {now}" + f" (frame: {shown})" * (now != shown) for name, now, shown in rows)
+        remembered = truth
+        if isinstance(self._agent, MemoryReader):
+            remembered = self._agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
+        names = [spec.value_names(each) for each in (truth, info.get("shown", truth), remembered)]
+        seen = ""
+        for name, now, shown, recalled in zip(spec.macrostate_names, *names, strict=True):
+            recall = f"; memory: {recalled}" if isinstance(self._agent, MemoryReader) else ""
+            seen += f"- {name}: {now}" + f" (frame: {shown}{recall})" * (now != shown) + "\n"
         self._recording.text("/real/text", f"*{self._spec.description}*\n\n{heading}\n\n{seen}\n\n**{last}**")
 
     def _log_values(self, observation: Observation, action: int) -> None:

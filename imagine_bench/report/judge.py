@@ -19,10 +19,12 @@ from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
+from imagine_bench.judge.futures import sampling_noise_floor
 from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.models.scores import COVERAGES
-from imagine_bench.judge.models.study import Judgement, kept, shown
+from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
 from imagine_bench.judge.models.trained import is_run, model_entry
+from imagine_bench.judge.models.truth import shares
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
 from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
@@ -173,7 +175,7 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
         Section(title="In short", words=[_reader_words(folder)], tables=[short]),
         Section(title="One future, and the errors of the surest answers", images=images),
         Section(title="How much data does it need?", images=[_curve_image(judgement, cells)]),
-        replace(outcomes, images=[_depth_image(judgement, cells, largest)]),
+        replace(outcomes, images=[_depth_image(folder, judgement, cells, largest)]),
         rewards,
         replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
         _where_section(spec, judgement, cells, largest, pictures),
@@ -350,14 +352,21 @@ def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> 
     return next((size for size in judgement.sizes if _risks(cells, models, size)), judgement.sizes[0])
 
 
-def _depth_image(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
-    last = judgement.sizes[-1]
+def _depth_image(folder: Path, judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
+    last, truth = judgement.sizes[-1], prepare(judgement, folder).rollouts.truth
+    floor = [[sampling_noise_floor(shares(course), judgement.samples) for course in steps] for steps in truth]
     series = {model: np.mean([cell["tv_by_depth"] for cell in cells[model, last]], axis=0).tolist() for model in models}
     steps = range(1, 1 + len(next(iter(series.values()), [])))
+
+    def draw() -> Figure:
+        figure = _lines(list(steps), series, "imagined macro-actions", "total variation")
+        figure.axes[0].plot(range(1, 1 + len(floor[0])), np.mean(floor, axis=0), ":", color=_COLORS[0], linewidth=1.2)
+        return figure
+
     return image(
-        "depth", lambda: _lines(list(steps), series, "imagined macro-actions", "total variation"), svg=True,
-        alt="Total variation to the exact distribution by imagined depth",
-        caption=f"Total variation to the exact distribution by depth, after {last:,} transitions.",
+        "depth", draw, svg=True, alt="Total variation to the exact distribution by imagined depth",
+        caption=f"Total variation to the exact distribution by depth, after {last:,} transitions; dotted: what "
+        f"{judgement.samples} samples of the exact distribution itself would show.",
     )  # fmt: skip
 
 

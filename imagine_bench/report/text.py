@@ -161,8 +161,8 @@ def _paired_answer(agent: str, budget: int, versus: Comparison) -> str:
     return (
         f"From the same starts, after {budget:,} real episodes, “{agent_words(agent).title}” alone solves {alone:,} "
         f"tests and DQN alone {dqn_alone:,} ({chance_words(versus.paired_p)}, McNemar's exact test, corrected): "
-        f"{verdict}; {percent(versus.paired_detectable)} points and more would have been shown. A run of it is "
-        f"ahead of one of DQN in {percent(versus.improvement)} % of pairs."
+        f"{verdict}; a difference of {percent(versus.paired_detectable)} points would have been shown with probability "
+        f"80 %. A run of it is ahead of one of DQN in {percent(versus.improvement)} % of pairs."
     )
 
 

@@ -16,6 +16,8 @@ _LOW_M, _HIGH_M = (0.695, -0.12), (0.795, 0.12)
 """Corners of the screen in the plane of the table, behind whatever stands there and in every frame."""
 _THICKNESS_M = 0.002
 _RADIUS_M = 0.012
+_ON_SCREEN_M = np.array(_LOW_M) + _RADIUS_M, np.array(_HIGH_M) - _RADIUS_M
+"""Where a ball's middle may be."""
 _ROLL_M = 0.03
 """The most that a ball rolls along each axis between two frames; at the screen's edge it turns back."""
 _RGBA = ((0.95, 0.80, 0.15, 1.0), (0.15, 0.75, 0.80, 1.0), (0.70, 0.25, 0.75, 1.0))
@@ -61,12 +63,13 @@ class Distraction:
         self._balls = [int(model.body(f"distractor_{ball}").mocapid[0]) for ball in range(1, count)]
 
     def place(self, data: mujoco.MjData, rng: np.random.Generator) -> None:
-        """Put every ball anywhere."""
-        data.mocap_pos[self._balls, :2] = rng.uniform(_LOW_M, _HIGH_M, (len(self._balls), 2))
+        """Put every ball anywhere on the screen."""
+        data.mocap_pos[self._balls, :2] = rng.uniform(*_ON_SCREEN_M, (len(self._balls), 2))
 
     def vary(self, data: mujoco.MjData, rng: np.random.Generator) -> None:
         """Draw the screen anew and roll every ball a little; one that was anywhere is anywhere, equally likely."""
         self._model.mat_rgba[self._tiles, :3] = rng.random((len(self._tiles), 3))
         there_m = data.mocap_pos[self._balls, :2] + rng.uniform(-_ROLL_M, _ROLL_M, (len(self._balls), 2))
-        there_m = np.abs(there_m - _LOW_M) + _LOW_M
-        data.mocap_pos[self._balls, :2] = _HIGH_M - np.abs(_HIGH_M - there_m)
+        low_m, high_m = _ON_SCREEN_M
+        there_m = np.abs(there_m - low_m) + low_m
+        data.mocap_pos[self._balls, :2] = high_m - np.abs(high_m - there_m)

@@ -15,6 +15,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.rules import facts
 
 KINEMATIC = {"execution": "kinematic"}
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # of the library's own
 
 
 def entry(task):

@@ -6,6 +6,7 @@ import dataclasses
 import shutil
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import bench_fakes
 import gymnasium
@@ -19,6 +20,7 @@ from imagine_bench.bench.bench import bench
 from imagine_bench.bench.evaluation import play_test_episode, replay
 from imagine_bench.bench.run_state import environments
 from imagine_bench.errors import ArtefactError
+from imagine_bench.protocols.control import protocol
 from imagine_bench.report.page import report_page, texts
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.bench_folder import load_bench
@@ -74,8 +76,31 @@ def test_two_hundred_forgeries_are_found(finished: Path, tmp_path: Path) -> None
     assert not missed and set(tried) == set(FORGERIES)
 
 
-@pytest.mark.parametrize("appearance", ["clean", "mild"])
-def test_a_policy_cannot_shift_the_starts_of_tests(appearance: str) -> None:
+@pytest.mark.parametrize(
+    ("task", "changes"),
+    [
+        ("arrow_puzzle", {"observation": "state"}),
+        ("arrow_puzzle", {"observation": "frame,proprio", "observation_size": 96}),
+        ("arrow_puzzle", {"test_appearance": "mild"}),
+        ("arrows:cubes=2,gesture=0.5,lag=1,slip=0.2,horizon=3", {}),
+        ("arrows:cubes=1,slip=0.3", {"execution": "physics"}),
+    ],
+)
+def test_benches_of_every_kind_hold(task: str, changes: dict[str, Any], tmp_path: Path) -> None:
+    few = {"agents": ("random",), "evaluation_episodes": 4, "execution": "kinematic", "recorded_episodes": 0, **changes}
+    folder = bench(protocol(task, "smoke", **few), {}, root=tmp_path, launcher=Inline()).folder
+    assert [str(each) for each in verify(folder)] == ["random seed 0: holds; 8 test episodes played again"]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "execution", "appearance"),
+    [
+        ("imagine_bench/ArrowPuzzle-v0", "kinematic", "clean"),
+        ("imagine_bench/ArrowPuzzle-v0", "kinematic", "mild"),
+        ("imagine_bench/PickPlace-v0", "physics", "mild"),
+    ],
+)
+def test_a_policy_cannot_shift_the_starts_of_tests(env_id: str, execution: str, appearance: str) -> None:
     """Whatever was played before, and however long it took: test k starts the same, in every pixel."""
 
     class Constant(bench_fakes.TableAgent):
@@ -84,21 +109,21 @@ def test_a_policy_cannot_shift_the_starts_of_tests(appearance: str) -> None:
         def act(self, observation: bench_fakes.Observation, *, explore: bool) -> int:
             return self.chosen
 
-    starts, lengths = [], []
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance=appearance)
+    starts, played = [], []
+    env = gymnasium.make(env_id, execution=execution, appearance=appearance)
     for chosen in range(3):
         agent, counts = Constant(context()), EvaluationCounts()
         agent.chosen = chosen
         for _ in range(6):
             play_test_episode(counts, env, agent, privileged=False, purpose="evaluation")
         starts.append(counts.starts)
-        lengths.append(counts.lengths)
+        played.append(counts.fingerprints)
         seed = episode_seed("evaluation", 0, 5)
         assert replay(env, seed, counts.kept().actions_of(5))[0].fingerprint == counts.fingerprints[5]
     frames = {env.reset(seed=episode_seed("evaluation", 0, 3))[0].tobytes() for _ in range(3)}
     env.close()
     assert len(frames) == 1 and starts[0] == starts[1] == starts[2]
-    assert len({tuple(each) for each in lengths}) == 3
+    assert len({tuple(each) for each in played}) == 3
 
 
 def test_kept_episodes_are_small_and_come_back(tmp_path: Path) -> None:
@@ -122,6 +147,49 @@ def test_a_run_that_keeps_no_test_episodes_says_so(finished: Path) -> None:
         pytest.raises(ArtefactError, match="keeps no test"),
     ):
         _verify_test(row, 8, "evaluation", Replays(*envs))
+
+
+def test_an_episode_cut_off_before_its_end_is_found(finished: Path) -> None:
+    """Everything that is claimed of it is true of what was played, which is not all of it."""
+    row, counts = load_bench(finished).runs[0].checkpoints[0], EvaluationCounts()
+    assert row.kept is not None
+    cut_off = int(np.flatnonzero(row.kept.lengths > 1)[0])
+    with environments(small(), observation="state") as (env, test_env):
+        replays = Replays(env, test_env)
+        for test in range(8):
+            actions = row.kept.actions_of(test)
+            counts.add(
+                replays.test(episode_seed("evaluation", 0, test), actions[: len(actions) - (test == cut_off)])[0]
+            )
+        cut = dataclasses.replace(row, kept=counts.kept(), **counts.figures())
+        with pytest.raises(ArtefactError, match=f"test {cut_off}: its actions do not end an episode"):
+            _verify_test(cut, 8, "evaluation", replays)
+
+
+@pytest.mark.parametrize("name", ["starts", "returns", "success", "faults", "fingerprints"])
+def test_every_claim_of_an_episode_is_compared(finished: Path, name: str) -> None:
+    row = load_bench(finished).runs[0].checkpoints[0]
+    assert row.kept is not None
+    claimed = getattr(row.kept, name).copy()
+    claimed[3] = ~claimed[3] if name == "success" else claimed[3] + 1
+    forged = dataclasses.replace(row, kept=dataclasses.replace(row.kept, **{name: claimed}))
+    with environments(small(), observation="state") as envs, pytest.raises(ArtefactError, match="test 3: the"):
+        _verify_test(forged, 8, "evaluation", Replays(*envs))
+
+
+@pytest.mark.parametrize("name", ["successes", "mean_return", "mean_length", "faults", "test_episodes"])
+def test_every_figure_of_a_test_is_compared(finished: Path, name: str) -> None:
+    row = load_bench(finished).runs[0].checkpoints[0]
+    changes: dict[str, Any] = {name: getattr(row, name) + 1}
+    with environments(small(), observation="state") as envs, pytest.raises(ArtefactError, match=f"{name} is"):
+        _verify_test(dataclasses.replace(row, **changes), 8, "evaluation", Replays(*envs))
+
+
+def test_another_budget_is_said_of_its_run(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / finished.name
+    shutil.copytree(finished, folder)
+    FORGERIES["budget"](folder, np.random.default_rng(0))
+    assert [str(each) for each in verify(folder) if "was not tested after (4, 9) episodes" in each.complaint]
 
 
 def test_what_is_not_there_is_said_in_a_line_a_run(finished: Path, tmp_path: Path) -> None:

@@ -106,6 +106,9 @@ def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.
         trained: Any = SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**known)))
         with pytest.raises(InvalidValueError, match="in a dataset or an earlier task"):
             analysis.measure(trained)
+    seeing: Any = {"dataset": "", "after": (), "shows_frames_alone": False}
+    with pytest.raises(InvalidValueError, match="saw more than frames"):
+        analysis.measure(SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**seeing))))  # type: ignore[arg-type]
     monkeypatch.setattr(observers, "MOST_STATES", 31)
     with pytest.raises(InvalidValueError, match="too many macrostates"):
         asked(tmp_path, "bad", "arrows:cubes=2", evaluation_episodes=2, budgets=(1,))

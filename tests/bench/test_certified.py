@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -62,3 +63,11 @@ def test_a_damaged_certificate_is_named(result, tmp_path):
     path.write_text(path.read_text().replace('"optimum": 1.0', '"optimum": 0.5'))
     with pytest.raises(ArtefactError, match=r"certificate\.json is damaged"):
         load_bench(folder)
+
+
+def test_a_learner_that_is_never_done_costs_seconds():
+    """One of the clockwise puzzle's goes round for ever; its world has a certificate without a floor."""
+    started_s = time.process_time()
+    found = certificate(registry.task("arrow_puzzle_clockwise"))
+    assert found.floor is None and found.optimum == 1.0
+    assert time.process_time() - started_s < 30.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from fake_agents import FakeAgent
@@ -13,6 +14,7 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
+from imagine_bench.bench.evaluation import play
 from imagine_bench.bench.run_state import environments
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -122,6 +124,36 @@ def test_a_part_alone_comes_by_its_name() -> None:
     with environments(wanted) as (env, _):
         seen, _ = env.reset(seed=1)
         assert set(seen) == {"proprio"} and env.observation_space.contains(seen)
+
+
+class _Broken(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Its third observation has a part that no agent should be shown."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], part: Any) -> None:
+        super().__init__(env)
+        self.part, self.steps = part, 0
+
+    def step(self, action: Any) -> Any:
+        seen, *rest = super().step(action)
+        self.steps += 1
+        return (seen if self.steps < 2 else {**seen, "proprio": self.part}, *rest)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (np.full(16, np.nan, dtype=np.float32), "gave a proprio with NaN or infinity"),
+        (np.zeros(7, dtype=np.float32), "gave a proprio of float32 and shape (7,); it declares float32 of shape (16,)"),
+        (np.zeros(16), "gave a proprio of float64"),
+        (None, "gave a proprio of <class 'NoneType'> and shape None"),
+    ],
+)
+def test_a_part_that_goes_wrong_ends_the_run(part: Any, words: str) -> None:
+    wanted = Protocol(task="arrow_puzzle", preset="quick", observation="state,proprio", execution="kinematic")
+    with environments(wanted) as (env, _), pytest.raises(InvalidValueError) as caught:
+        for seed in range(9):
+            list(play(_Broken(env, part), FakeAgent(), seed=seed, explore=True, privileged=False))
+    assert words in str(caught.value)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")

@@ -134,6 +134,6 @@ def test_settings_of_the_physics_are_refused_where_there_is_none(
     assert main(["bench", "--task", "lamps", "--agents", "random", "--physics", "pad_friction=0.5"]) == 2
     assert "Physics settings change nothing in kinematic execution; leave" in capsys.readouterr().err
     assert main(["bench", "--task", "lamps", "--agents", "random", "--execution", "physics"]) == 2
-    assert "No execution of lamps 'physics'. Known: kinematic." in capsys.readouterr().err
+    assert "No execution 'physics'. Known: kinematic." in capsys.readouterr().err
     assert main(["bench", "--task", "lamps", "--agents", "random", "--observation", "state"]) == 2
     assert "Task lamps cannot be run: " in (said := capsys.readouterr().err) and "argument 'observation'" in said

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
+from imagine_bench.certificates.certificate import Certificate, certificate
 from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
@@ -339,21 +340,19 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
 
 
-def judged(model: str, transitions: str, score: str, folder: str) -> str:
+def judged(folder: str, model: str, transitions: str, score: str) -> str:
     """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
     with (RESULTS / folder / "scores.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if (row["model"], row["transitions"]) == (model, transitions)]
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    digits = 2 if score.startswith(("auroc", "total", "counter")) or "skill" in score else 1
-    value, *ends = (f"{number:.{digits}f}" for number in (statistics.iqm(values), *_ends(values, digits == 2)))
+    share = score.startswith(("auroc", "total", "counter", "best"))
+    digits = 2 if share or "skill" in score else 1
+    numbers = (statistics.iqm(values), *statistics.interval(values, share=share))
+    value, *ends = (f"{number:.{digits}f}".replace("-", "−") for number in numbers)
     few = f" ({len(values)} of {len(rows)})" if len(values) < len(rows) else ""
     return (value if "nan" in ends or len({value, *ends}) == 1 else f"{value} [{', '.join(ends)}]") + few
-
-
-def _ends(values: list[float], share: bool) -> tuple[float, float]:
-    return statistics.interval(values, share=share)
 
 
 # Regression, speed, rules ----------------------------------------------------------------------------------------
@@ -431,6 +430,16 @@ def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 
 
+@functools.cache
+def _certificate(world: str) -> Certificate:
+    return certificate(registry.task(world))
+
+
+def certified(world: str, field: str) -> str:
+    """A success probability of a world's certificate, %."""
+    return percent(getattr(_certificate(world), field))
+
+
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     function.__name__: function
     for function in (
@@ -438,6 +447,6 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
         thesis_error, claim, decomposed, speed, fidelity, margin, walked, goals_and_starts, chance_exact, shortest,
-        price, price_to, coverage,
+        price, price_to, coverage, certified,
     )
 }  # fmt: skip

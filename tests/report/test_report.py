@@ -16,6 +16,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fake_results import bench_result, compared_rollout
+from scipy import stats
+from scipy.optimize import brentq
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import ArtefactError, SetupError
@@ -360,6 +362,10 @@ def test_the_same_starts_are_compared_in_plain_words(seeds: tuple[int, ...], tmp
         p = corrected[agent, budget]
         assert (f"(p = {p:.3f}, McNemar" if p >= 0.001 else "(p < 0.001, McNemar") in line
         assert ("is not shown" in line) == (p >= 0.05) and ("are better" in line) == (p < 0.05 and alone > dqn_alone)
+        z = stats.norm.isf(0.025 / len(found)) + stats.norm.ppf(0.8)
+        pairs, apart = 60 * len(seeds), (alone + dqn_alone) / (60 * len(seeds))
+        size = brentq(lambda d: pairs * d**2 - z**2 * (max(apart, d) - d**2), 1e-6, 1.0)  # noqa: B023 - called at once
+        assert f"a difference of {percent(size)} points" in line
         scores = [[sum(told[name, budget, seed]) for seed in seeds] for name in (agent, "dqn")]
         wins = [0.5 * (a == b) + (a > b) for a in scores[0] for b in scores[1]]
         assert f"in {percent(np.mean(wins))} % of pairs" in line

@@ -11,6 +11,7 @@ import torch
 from fake_latents import ACTIONS, CODES, LATENTS, SMALL, FakeEncoder, context, frame, transition
 from imagine_bench.agents.memory import drqn, imagination
 from imagine_bench.agents.memory.agent import RememberingAgent
+from imagine_bench.agents.memory.readout import last_seen
 from imagine_bench.agents.memory.recurrence import START, Recurrence
 from imagine_bench.agents.memory.sequences import SequenceMemory
 
@@ -234,3 +235,31 @@ def test_lone_frames_begin_without_a_past(monkeypatch: pytest.MonkeyPatch) -> No
     mu, sigma = agent.perception.encoder.encode(np.stack([frame(3), frame(1)]))
     assert torch.allclose(mu[0], lone, atol=1e-6) and not sigma[:, LATENTS:].any()
     assert agent.read_frames(np.stack([frame(4)])).tolist() == FakeEncoder().read_macrostate(CODES[4:5]).tolist()
+
+
+def test_last_seen_is_the_newest_value_of_each_coordinate() -> None:
+    read = np.array([[1, 2], [0, 0], [1, 1], [1, 2]])  # of coordinates of 2 and 2 values: 2 is "not seen"
+    assert last_seen(read, (2, 2)).tolist() == [[1, -1], [0, 0], [1, 1], [1, 1]]
+
+
+NOT_SEEN = 99
+
+
+def read_cue(_: Any, z: torch.Tensor) -> np.ndarray:
+    """The cue that a frame shows, if it shows one."""
+    state = torch.cdist(z, CODES).argmin(dim=1, keepdim=True).numpy()
+    return np.where(state == 0, NOT_SEEN, state - 1)
+
+
+def test_a_read_out_finds_what_the_first_frame_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = make(monkeypatch, "drqn", **{"recurrence.units": 32, "controller.updates_per_step": 0})
+    monkeypatch.setattr(FakeEncoder, "read_macrostate", read_cue)
+    recall(agent, range(60), np.random.default_rng(4))
+    before, blank = agent.state(), frame(0)
+    for cue in range(ACTIONS):
+        agent.begin_episode()
+        for shown in (frame(1 + cue), blank):
+            agent.act(Observation(frame=shown), explore=False)
+        assert agent.read_memory(blank, (ACTIONS,)).tolist() == [cue], "and the blank frame shows no cue"
+    after = agent.state()
+    assert all(np.array_equal(before.arrays[key], after.arrays[key]) for key in before.arrays)

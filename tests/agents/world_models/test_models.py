@@ -23,14 +23,14 @@ LEARNED = [name for name, entry in registry.WORLD_MODELS.items() if not entry.pr
 
 
 @functools.cache
-def data() -> Episodes:
-    spec = registry.task("arrow_puzzle")
+def data(task: str = "arrow_puzzle", episodes: int = 80) -> Episodes:
+    spec = registry.task(task)
     policy = policy_of("uniform", spec, 1000)
-    return collect(spec, policy, episodes=80, seed=1000, execution="kinematic", appearance="clean")[0]
+    return collect(spec, policy, episodes=episodes, seed=1000, execution="kinematic", appearance="clean")[0]
 
 
-def made(name: str) -> WorldModel:
-    entry, spec = registry.WORLD_MODELS[name], registry.task("arrow_puzzle")
+def made(name: str, task: str = "arrow_puzzle") -> WorldModel:
+    entry, spec = registry.WORLD_MODELS[name], registry.task(task)
     path = None if entry.encoder_kind is None else encoders.own(spec, "clean", entry.encoder_kind)
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models")
@@ -53,9 +53,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], WorldModel]:
     return fitted
 
 
-def imagined(model: WorldModel, history: int = 1, depth: int = 3) -> Imagined:
+def imagined(model: WorldModel, history: int = 1, depth: int = 3, n_actions: int = 6) -> Imagined:
     frames = np.stack([data().frames[row : row + history] for row in (0, 2, 4, 6, 8)])
-    actions = np.random.default_rng(2).integers(6, size=(5, history - 1 + depth))
+    actions = np.random.default_rng(2).integers(n_actions, size=(5, history - 1 + depth))
     found = model.imagine(frames, actions, 4, np.random.default_rng(3))
     return require_imagined(found, name="it", rows=5, depth=depth, samples=4)
 
@@ -91,6 +91,15 @@ def test_the_filter_discards_what_its_threshold_says_and_all_that_follows(quick:
     assert kept is not None and kept.dtype == bool
     assert np.array_equal(kept[:, 0], first[:, 0] <= model.imagination.filter.threshold)
     assert not (kept[:, 1:] & ~kept[:, :-1]).any()
+
+
+@pytest.mark.parametrize("name", ["structured", "mdn_ensemble"])
+def test_pictures_are_as_the_decoder_of_the_task_draws_them(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(latent, "UPDATES", 1)
+    model = made(name, "pick_place")
+    model.fit(data("pick_place", 5), np.random.default_rng(1))
+    found = imagined(model, depth=2, n_actions=4)  # in color, of 32 pixels
+    assert found.pictures.shape == (5, 4, 2, 32, 32, 3)
 
 
 def test_the_structured_model_knows_what_it_never_tried() -> None:

@@ -9,6 +9,9 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.dials import distractors
+from imagine_bench.tasks.scenes import constants as c
+from imagine_bench.tasks.scenes.appearance import LEVELS
+from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench import registry
 
@@ -119,11 +122,11 @@ def test_balls_are_anywhere_at_first_and_later_and_screens_show_every_shade():
     """Their places are uniform: within 4 standard deviations, in eight cells, at the start and after rolling."""
     env, rng = make(ARROWS, distractors=4), np.random.default_rng(0)
     distraction, data = env.world._distraction, env.data
-    low, high = np.array(distractors._LOW_M), np.array(distractors._HIGH_M)
+    low, high = distractors._ON_SCREEN_M
     for rolls in (0, 25):
         found, shades = [], []
         for _ in range(300):
-            distraction.place(data, rng)
+            env.world.place((0, 1, 2, 0), rng)
             for _ in range(rolls):
                 before = data.mocap_pos[distraction._balls].copy()
                 distraction.vary(data, rng)
@@ -135,6 +138,15 @@ def test_balls_are_anywhere_at_first_and_later_and_screens_show_every_shade():
         counts = np.histogramdd(places, bins=(2, 4), range=((0, 1), (0, 1)))[0]
         assert (np.abs(counts - len(places) / 8) <= 4 * np.sqrt(len(places) * 7 / 64)).all()
     assert abs(np.mean(shades) - 0.5) < 0.01 and np.ptp(shades) > 0.99
+
+
+def test_nothing_stands_where_distractors_are():
+    """However it is placed at the strong level."""
+    strong = LEVELS["strong"]
+    corner_m = c.CUBE_EDGE_M / 2 * (np.cos(strong.object_yaw_rad) + np.sin(strong.object_yaw_rad))
+    for cubes in range(1, 7):
+        furthest_m = max(x_m for x_m, _ in layout(cubes).slots_xy_m)
+        assert furthest_m + corner_m + strong.object_offset_m < distractors._LOW_M[0]
 
 
 def test_encoders_of_distracted_worlds_are_others():

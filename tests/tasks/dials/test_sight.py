@@ -46,6 +46,15 @@ def test_frames_tell_nothing_of_a_hidden_gesture(appearance):
     assert (shown != hidden).any(axis=-1).sum() > 50
 
 
+def test_people_see_a_hidden_hand_in_the_scene():
+    """A recording's shapes are those of the first frame, for all times."""
+    shapes = {hidden: make(IDS[0], gesture=0.0 if hidden else "always") for hidden in (True, False)}
+    for env in shapes.values():
+        env.reset(seed=0)
+    for one, other in zip(*(env.shapes() for env in shapes.values()), strict=True):
+        assert one.name == other.name and one.rgba.tolist() == other.rgba.tolist() and one.rgba[3] == 1.0
+
+
 @pytest.mark.parametrize("id_", IDS)
 def test_a_gesture_is_seen_as_often_as_said(id_):
     """By the one-hot gesture: always, at first only, or within 3.5 standard deviations of a probability."""
