@@ -56,7 +56,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
         ),
         (
             ["--execution", "physic"],
-            "No execution of arrow_puzzle 'physic'. Did you mean 'physics'? Known: physics, kinematic.",
+            "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic.",
         ),
         (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
         (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import sys
 import tempfile
@@ -69,6 +70,28 @@ def walk_both(one, other, steps, n_actions, *, mask):
             for each in zip(*(env.reset(options={"reset_mask": over.copy()}) for env in (one, other)), strict=True):
                 assert_same(*each, f"reset after step {step}")
     return ended
+
+
+@pytest.mark.parametrize(
+    ("execution", "steps", "world"),
+    [
+        ("kinematic", 16, {"cubes": 1}),
+        ("kinematic", 16, {"cubes": 5, "slip": 0.3, "fickle": 0.3}),
+        ("physics", 3, {"cubes": 1}),
+        ("physics", 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3}),
+    ],
+)
+def test_lanes_of_any_world_step_as_sync(execution, steps, world):
+    options = {"execution": execution, "appearance": "strong", "max_episode_steps": 3, **world}
+    make_vec = functools.partial(gymnasium.make_vec, num_envs=2, **options)
+    mode = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    sync = make_vec("imagine_bench/Arrows-v0", vectorization_mode="sync", vector_kwargs=mode)
+    vector = make_vec("imagine_bench/Arrows-vector-v0", **mode)
+    assert sync.single_action_space.n == 2 * world["cubes"]
+    ended = walk_both(sync, vector, steps, sync.single_action_space.n, mask=False)
+    assert ended.sum() > 0
+    sync.close()
+    vector.close()
 
 
 @pytest.mark.parametrize(

@@ -399,6 +399,15 @@ def fidelity(world: str, what: str) -> str:
     return " / ".join(found) or "–"
 
 
+def probe(cubes: str, kind: str) -> str:
+    """Held-out frames read right from an encoder of so many cubes, % by seed, and CPU seconds of the last seed."""
+    paths = sorted(RESULTS.glob(f"arrows-encoders/arrows_{cubes}-clean{kind}-seed_*.json"))
+    cards = [json.loads(path.read_text()) for path in paths]
+    return (
+        f"{', '.join(format(100 * card['probe']['mlp'], '.2f') for card in cards)}; {cards[-1]['cpu_s']['total']:.0f}"
+    )
+
+
 def margin(task: str, setting: str, value: str) -> str:
     """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
     points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
@@ -446,7 +455,7 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
-        thesis_error, claim, decomposed, speed, fidelity, margin, walked, goals_and_starts, chance_exact, shortest,
-        price, price_to, coverage, certified,
+        thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
+        shortest, price, price_to, coverage, certified,
     )
 }  # fmt: skip

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,3 +69,20 @@ def test_depths_count_by_what_could_be_wrong_there():
     assert auroc(_open_loop([0.9, 0.6, math.nan], [30.0, 10.0, 5.0])) == pytest.approx((0.9 * 30 + 0.6 * 10) / 40)
     assert math.isnan(auroc(_open_loop([math.nan], [9.0])))
     assert auroc(None) == 0.5
+
+
+def test_the_kept_scores_follow_from_the_kept_levels():
+    folder = Path(__file__).parents[2] / "docs" / "results" / "suite"
+    levels, scores = (
+        list(csv.DictReader((folder / name).read_text().splitlines())) for name in ("levels.csv", "scores.csv")
+    )
+    trials = json.loads((folder / "suite.json").read_text())["suite"]["evaluation_episodes"]
+    for kept in scores:
+        rows = [row for row in levels if (row["experiment"], row["agent"]) == (kept["experiment"], kept["agent"])]
+        names = list(dict.fromkeys(row["level"] for row in rows))
+        values = np.array([[float(row["value"] or "nan") for row in rows if row["level"] == name] for name in names]).T
+        ends = {row["level"]: Scale(chance=float(row["chance"]), optimum=float(row["optimum"])) for row in rows}
+        found = score(values, list(ends.values()), trials=None if kept["experiment"] == "uncertainty" else trials)
+        assert found[:3] == pytest.approx(
+            [float(kept[name] or "nan") for name in ("score", "low_95", "high_95")], nan_ok=True
+        )

@@ -1,0 +1,51 @@
+"""Encoders of worlds that none is bundled for: trained once for what the worlds look like, whatever their rules."""
+
+from __future__ import annotations
+
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.store import encoders
+
+LOOK_ALIKE = ("arrows:cubes=2", "arrows:cubes=2,slip=0.2", "arrows:cubes=2,goal=01,coupling=neighbour,shuffle=3")
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    """What was trained, in order, by something that only leaves a file."""
+    made = []
+
+    def retrain(spec, *, recipe, appearance, seed, out):
+        made.append((spec.id, recipe, appearance))
+        (out / f"{spec.encoder}-{appearance}{'-codes' if recipe == 'codes' else ''}.safetensors").touch()
+
+    load = registry.load
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path))
+    monkeypatch.setattr(registry, "load", lambda name: retrain if name == encoders._TRAIN else load(name))
+    return made
+
+
+def test_worlds_that_look_alike_share_one_training(trained, tmp_path, capsys):
+    places = {encoders.own(registry.task(name), "clean", "codes") for name in (*LOOK_ALIKE, *LOOK_ALIKE)}
+    assert trained == [(LOOK_ALIKE[0], "codes", "clean")]
+    (place,) = places
+    assert place.is_file() and place.is_relative_to(tmp_path)
+    assert capsys.readouterr().out.count("one is trained") == 1
+
+
+def test_what_looks_otherwise_is_trained_for_itself(trained):
+    wanted = [
+        ("arrows:cubes=2", "clean", "codes"),
+        ("arrows:cubes=2", "clean", "latents"),
+        ("arrows:cubes=2", "mild", "codes"),
+        ("arrows:cubes=4", "clean", "codes"),
+        ("arrows:cubes=2,gesture=first", "clean", "codes"),
+    ]
+    places = {encoders.own(registry.task(name), appearance, kind) for name, appearance, kind in wanted}
+    assert len(places) == len(wanted) == len(trained)
+
+
+@pytest.mark.parametrize("name", ["arrows", "arrows:slip=0.2", "arrows:goal=012,forbid=none"])
+def test_three_cubes_have_the_bundled_one(trained, name):
+    place = encoders.own(registry.task(name), "clean", "latents")
+    assert place == encoders.bundled()["arrow_puzzle-clean"] and not trained
