@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
-from imagine_bench.store.results import BenchResult, Futures, OpenLoop, RunResult
+from imagine_bench.store.results import BenchResult, Checkpoint, Futures, OpenLoop, RunResult
 
+Value = TypeVar("Value")
 BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 
 _SUMMARY_COLUMNS = (
@@ -199,13 +201,11 @@ def open_loop_csv(result: BenchResult) -> str:
     """One row an imagining agent, seed, budget and imagined depth, with and without the filter."""
     names = list(OpenLoop.__dataclass_fields__)
     rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *names]]
-    for agent in result.protocol.agents:
-        for run in result.of(agent):
-            for checkpoint in run.checkpoints:
-                loop = checkpoint.open_loop
-                for index in range(0 if loop is None else len(loop.count)):
-                    values = [getattr(loop, name)[index] for name in names]
-                    rows.append([agent, run.seed, checkpoint.episodes, index + 1, *values])
+    for run, checkpoint in result.rows:
+        loop = checkpoint.open_loop
+        for index in range(0 if loop is None else len(loop.count)):
+            values = [getattr(loop, name)[index] for name in names]
+            rows.append([run.agent, run.seed, checkpoint.episodes, index + 1, *values])
     return csv_text(rows)
 
 
@@ -232,12 +232,10 @@ def futures_csv(data: ReportData) -> str:
     outcomes = ("total_variation", "sampling_noise_floor", "missed", "hallucinated")
     measures = ("samples", *outcomes, *errors, "survival_probability")
     rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
-    for agent in data.futures:
-        for run in data.result.of(agent):
-            for checkpoint in run.checkpoints:
-                if checkpoint.futures is not None:
-                    head = [agent, run.seed, checkpoint.episodes]
-                    rows += [[*head, *row] for row in _futures_rows(checkpoint.futures, spec, measures)]
+    for run, checkpoint in data.result.rows:
+        if checkpoint.futures is not None and run.agent in data.futures:
+            head = [run.agent, run.seed, checkpoint.episodes]
+            rows += [[*head, *row] for row in _futures_rows(checkpoint.futures, spec, measures)]
     return csv_text(rows)
 
 
@@ -306,26 +304,27 @@ def _paired(treated: tuple[RunResult, ...], base: tuple[RunResult, ...], index: 
 
 def _excess(runs: tuple[RunResult, ...], spec: TaskSpec) -> dict[int, float]:
     fewest = functools.cache(lambda start: fewest_actions(spec.rules, start))
-    beyond: dict[int, list[int]] = {}
-    for run in runs:
-        for row in run.checkpoints:
-            each = beyond.setdefault(row.episodes, [])
-            if row.kept is not None:
-                solved = row.kept.success
-                lengths, starts = row.kept.lengths[solved].tolist(), map(tuple, row.kept.starts[solved].tolist())
-                each += [length - fewest(start) for length, start in zip(lengths, starts, strict=True)]
-    return {budget: float(np.mean(each)) if each else math.nan for budget, each in beyond.items()}
+
+    def beyond(row: Checkpoint) -> list[int]:
+        if row.kept is None:
+            return []
+        lengths, starts = row.kept.lengths[row.kept.success], row.kept.starts[row.kept.success]
+        return [int(length) - fewest(tuple(start)) for length, start in zip(lengths, starts.tolist(), strict=True)]
+
+    return {budget: float(np.mean(each)) if each else math.nan for budget, each in _by_budget(runs, beyond).items()}
+
+
+def _by_budget(runs: Sequence[RunResult], values: Callable[[Checkpoint], Sequence[Value]]) -> dict[int, list[Value]]:
+    """What the rows of the runs have, by budget."""
+    tests = zip(*(run.checkpoints for run in runs), strict=True)
+    return {rows[0].episodes: [value for row in rows for value in values(row)] for rows in tests}
 
 
 def _acceptance(runs: tuple[RunResult, ...]) -> dict[int, float]:
     """Mean share of imagined transitions kept while training to each budget from the one before."""
-    rates: dict[int, list[float]] = {}
-    for run in runs:
-        for checkpoint in run.checkpoints:
-            rate = checkpoint.diagnostics.get("imagination/acceptance_rate", float("nan"))
-            if np.isfinite(rate):
-                rates.setdefault(checkpoint.episodes, []).append(rate)
-    return {budget: float(np.mean(values)) for budget, values in rates.items()}
+    rates = _by_budget(runs, lambda row: [row.diagnostics.get("imagination/acceptance_rate", math.nan)])
+    known = {budget: [rate for rate in each if np.isfinite(rate)] for budget, each in rates.items()}
+    return {budget: float(np.mean(each)) for budget, each in known.items() if each}
 
 
 def _open_loop(runs: tuple[RunResult, ...]) -> OpenLoop | None:
@@ -356,12 +355,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
     distance = np.stack([each.total_variation for each in found])
     # No sample of a certain outcome can deviate from it.
     uncertain = np.stack([each.sampling_noise_floor for each in found]) > 0.0
-    by_budget: dict[int, list[tuple[float, float]]] = {}
-    for run in runs:
-        for checkpoint in run.checkpoints:
-            if checkpoint.futures is not None:
-                first, deepest = checkpoint.futures.total_variation[[0, -1]].mean(axis=1)
-                by_budget.setdefault(checkpoint.episodes, []).append((float(first), float(deepest)))
+    by_budget = _by_budget(runs, lambda row: [row.futures.total_variation[[0, -1]].mean(axis=1)] if row.futures else [])
     return FuturesSummary(
         pairs=len(found[0].actions),
         samples=int(found[0].samples),
@@ -373,7 +367,7 @@ def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
         hallucinated=total("hallucinated"),
         reward_error=mean("reward_error"),
         termination_error=mean("termination_error"),
-        by_budget={budget: tuple(np.mean(pairs, axis=0).tolist()) for budget, pairs in by_budget.items()},
+        by_budget={budget: tuple(np.mean(pairs, axis=0).tolist()) for budget, pairs in by_budget.items() if pairs},
     )
 
 

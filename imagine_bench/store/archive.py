@@ -53,16 +53,14 @@ def archive_files(result: BenchResult) -> dict[str, str]:
 
 def results_csv(result: BenchResult) -> str:
     """One row an agent, seed and budget; every diagnostic the agents report has its column."""
-    names = sorted({name for run in result.runs for checkpoint in run.checkpoints for name in checkpoint.diagnostics})
+    names = sorted({name for _, checkpoint in result.rows for name in checkpoint.diagnostics})
     rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, "solved", *names]]
-    for agent in result.protocol.agents:
-        for run in result.of(agent):
-            for checkpoint in run.checkpoints:
-                low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
-                row = [agent, run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
-                row += [checkpoint.success_rate, low, high]
-                row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)] + [checkpoint.solved or ""]
-                rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
+    for run, checkpoint in result.rows:
+        low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
+        row = [run.agent, run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
+        row += [checkpoint.success_rate, low, high]
+        row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)] + [checkpoint.solved or ""]
+        rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
     return csv_text(rows)
 
 

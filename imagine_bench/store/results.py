@@ -218,6 +218,11 @@ class BenchResult:
         by_seed = {run.seed: run for run in self.runs if run.agent == agent}
         return tuple(by_seed[seed] for seed in self.protocol.seeds)
 
+    @property
+    def rows(self) -> list[tuple[RunResult, Checkpoint]]:
+        """Every tested budget of every run, in the order of the protocol's agents and seeds."""
+        return [(run, row) for agent in self.protocol.agents for run in self.of(agent) for row in run.checkpoints]
+
     def success_rates(self, agent: str) -> NDArray[np.float64]:
         """Success rates of one agent. Shape (seeds, budgets)."""
         return np.array([[checkpoint.success_rate for checkpoint in run.checkpoints] for run in self.of(agent)])

@@ -77,6 +77,18 @@ def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) 
     assert cause(agent, ALL, seeing) == ("planning" if modelled else "values"), "it was not the frame that was misread"
 
 
+@pytest.mark.parametrize("start", FAR[::8])
+def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: State) -> None:
+    """What its model says there, from frames that it misreads, is not held against the model."""
+    readable = np.array([state != start for state in STATES])
+    there = model_of(SPEC, lambda state, action: state == start)
+    failed = course(start, [ILLEGAL[start]])
+    blind = dataclasses.replace(failed, misread=[True])
+    plays_well, plays_badly = (Attribution(SPEC, does(each, there), ALL, readable) for each in (OPTIMAL, ILLEGAL))
+    assert plays_well.cause(blind) == "misread" and plays_well.cause(failed) == "planning", "it read this frame right"
+    assert plays_badly.cause(blind) == plays_badly.cause(failed) == "planning"
+
+
 @pytest.mark.parametrize("start", FAR[::4])
 def test_what_was_never_experienced_is_charged_to_experience(start: State) -> None:
     """It knows every transition but those that solve a puzzle, and would do all others right."""
@@ -179,3 +191,8 @@ def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
             assert _at(outcomes, before + probability * rng.random()) is outcome
         drawn = np.random.default_rng(9).choice(4, p=shares)
         assert _at(outcomes, np.random.default_rng(9).random()) is outcomes[drawn], "as an environment draws"
+
+
+def test_a_scene_that_was_no_macrostate_is_no_experience() -> None:
+    odd = Attribution(SPEC, does(OPTIMAL, None), np.array([[9, 9, 9, 9, 0]]), EVERY)
+    assert odd.cause(course(FAR[0], [ILLEGAL[FAR[0]]])) == "unexperienced"
