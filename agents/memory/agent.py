@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,7 +32,7 @@ class Past:
     actions: list[int] = field(default_factory=list)
 
 
-class RememberingAgent(DQN):
+class RememberingAgent(DQN, ABC):
     """A DQN whose states are the latents of a frame and what :attr:`recurrence` remembers of the episode after it.
 
     Snapshots are taken between two episodes, so what an agent sees of one is no part of them.
@@ -62,9 +63,9 @@ class RememberingAgent(DQN):
         )  # fmt: skip
 
     @property
+    @abstractmethod
     def recurrence(self) -> Recurrence:
         """What remembers."""
-        raise NotImplementedError
 
     def perceive(self, frame: Frame) -> Tensor:
         """The mean latents of a frame and what is remembered after it. Shape (Z + H,).

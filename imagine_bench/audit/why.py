@@ -15,7 +15,7 @@ from imagine_bench.bench.evaluation import Env
 from imagine_bench.bench.run_state import make_env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
-from imagine_bench.judge.causes import Attribution, Course, frames_to_ask_with, misread
+from imagine_bench.judge.causes import Attribution, FailedEpisode, frames_to_ask_with, misread
 from imagine_bench.report.analysis import Analysis, Measured, analyse, chosen, markdown
 from imagine_bench.report.page import write_report
 from imagine_bench.report.sections.causes import HEAD, causes_table, failures
@@ -77,7 +77,7 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
             raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
         run = run_folder.load_run(trained.folder)
         with closing(make_env(protocol, protocol.task, testing=True)) as env:
-            courses, agent = _Courses(env, trained.agent, trained.spec.seed), trained.agent
+            episodes, agent = _FailedEpisodes(env, trained.agent, trained.spec.seed), trained.agent
             frames = frames_to_ask_with(agent, self.spec, appearance=self._appearance, purpose=self._purpose)
             readable = ~misread(agent, frames, self._states)
             for row in run.checkpoints:
@@ -88,7 +88,7 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
                 tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
                 attribution = Attribution(self.spec, row.beliefs, tried, readable)
                 failed = np.flatnonzero(~row.kept.success).tolist()
-                causes = {test: attribution.cause(courses.of(row.kept, test)) for test in failed}
+                causes = {test: attribution.cause(episodes.of(row.kept, test)) for test in failed}
                 found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
         return tuple(found)
 
@@ -111,21 +111,21 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
         return {"failures": {str(each.episodes): Counter(each.causes.values()) for each in value}}
 
 
-class _Courses:
+class _FailedEpisodes:
     """Failed test episodes, played again with the agent's eyes open; each once."""
 
     def __init__(self, env: Env, agent: Agent, seed: int) -> None:
         self._env, self._agent, self._purpose = env, agent, evaluation_split(seed)
-        self._known: dict[tuple[int, ...], Course] = {}
+        self._known: dict[tuple[int, ...], FailedEpisode] = {}
 
-    def of(self, kept: KeptEpisodes, test: int) -> Course:
-        """The course of one of the episodes kept."""
+    def of(self, kept: KeptEpisodes, test: int) -> FailedEpisode:
+        """One of the episodes kept."""
         actions, seed = kept.actions_of(test), episode_seed(self._purpose, 0, test)
         if (seed, *actions) not in self._known:
             self._known[seed, *actions] = self._play(seed, actions)
         return self._known[seed, *actions]
 
-    def _play(self, seed: int, actions: list[int]) -> Course:
+    def _play(self, seed: int, actions: list[int]) -> FailedEpisode:
         frame, info = self._env.reset(seed=seed)
         frames, infos, terminated = [frame], [info], False
         for action in actions:
@@ -134,7 +134,7 @@ class _Courses:
             infos.append(info)
         states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
         wrong = misread(self._agent, np.array(frames[:-1]), states[:-1])
-        return Course(
+        return FailedEpisode(
             states=[tuple(state) for state in states.tolist()], actions=actions, terminated=bool(terminated),
             faults=[bool(info["fault"]) for info in infos[1:]], misread=wrong.tolist(), seed=seed,
         )  # fmt: skip

@@ -58,7 +58,7 @@ class Model(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Course:
+class FailedEpisode:
     """What happened in a failed test episode of L macro-actions."""
 
     states: Sequence[State]  # length L + 1
@@ -139,23 +139,23 @@ class Attribution:
             ("model", self._best),
         )  # and "fault": the best plan, without faults
 
-    def cause(self, course: Course) -> str:
+    def cause(self, episode: FailedEpisode) -> str:
         """One of :data:`CAUSES`."""
-        drawn = self._drawn(course)
-        if not self._solves(course, drawn, self._best, faults=False):
+        drawn = self._drawn(episode)
+        if not self._solves(episode, drawn, self._best, faults=False):
             return "unlucky"
-        for name, plan in self._stages[0 if any(course.misread) else 1 :]:
-            if self._solves(course, drawn, plan, faults=True):
+        for name, plan in self._stages[0 if any(episode.misread) else 1 :]:
+            if self._solves(episode, drawn, plan, faults=True):
                 return name
         return "fault"
 
-    def _drawn(self, course: Course) -> list[float]:
+    def _drawn(self, episode: FailedEpisode) -> list[float]:
         """The uniform number of each step until the horizon."""
-        rng = np.random.default_rng(course.seed)
+        rng = np.random.default_rng(episode.seed)
         drawn: list[float] = rng.random(self._horizon).tolist()
-        for step, (state, action) in enumerate(zip(course.states, course.actions, strict=False)):
-            if state in self._rows and not course.faults[step]:
-                before, probability = _place(self._rules.outcomes(state, action), course.states[step + 1])
+        for step, (state, action) in enumerate(zip(episode.states, episode.actions, strict=False)):
+            if state in self._rows and not episode.faults[step]:
+                before, probability = _place(self._rules.outcomes(state, action), episode.states[step + 1])
                 drawn[step] = before + probability * drawn[step]
         return drawn
 
@@ -173,23 +173,23 @@ class Attribution:
             best.append(q >= (value[:-1] - _TIE * np.maximum(1.0, np.abs(value[:-1])))[:, None])
         return np.array(best)
 
-    def _solves(self, course: Course, drawn: Sequence[float], plan: NDArray[np.bool_], *, faults: bool) -> bool:
+    def _solves(self, episode: FailedEpisode, drawn: Sequence[float], plan: NDArray[np.bool_], *, faults: bool) -> bool:
         """Whether the episode succeeds where frames are read right and a plan is followed.
 
         Among equals of the plan is what the agent does.
         """
-        state = course.states[0]
+        state = episode.states[0]
         for step in range(self._horizon):
-            row, lived = self._rows.get(state, -1), step < len(course.actions) and state == course.states[step]
+            row, lived = self._rows.get(state, -1), step < len(episode.actions) and state == episode.states[step]
             if row < 0:
                 return False
-            action = int(course.actions[step] if lived and not course.misread[step] else self._held.action[row])
+            action = int(episode.actions[step] if lived and not episode.misread[step] else self._held.action[row])
             if not plan[self._horizon - step - 1, row, action]:
                 action = int(plan[self._horizon - step - 1, row].argmax())
-            if lived and action == course.actions[step] and (faults or not course.faults[step]):
-                if course.terminated and step + 1 == len(course.actions):
+            if lived and action == episode.actions[step] and (faults or not episode.faults[step]):
+                if episode.terminated and step + 1 == len(episode.actions):
                     return False
-                state = course.states[step + 1]
+                state = episode.states[step + 1]
                 continue
             outcome = _at(self._rules.outcomes(state, action), drawn[step])
             if outcome.terminated:

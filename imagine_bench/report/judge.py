@@ -354,7 +354,7 @@ def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> 
 
 def _depth_image(folder: Path, judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
     last, truth = judgement.sizes[-1], prepare(judgement, folder).rollouts.truth
-    floor = [[sampling_noise_floor(shares(course), judgement.samples) for course in steps] for steps in truth]
+    floor = [[sampling_noise_floor(shares(outcomes), judgement.samples) for outcomes in steps] for steps in truth]
     series = {model: np.mean([cell["tv_by_depth"] for cell in cells[model, last]], axis=0).tolist() for model in models}
     steps = range(1, 1 + len(next(iter(series.values()), [])))
 

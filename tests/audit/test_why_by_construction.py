@@ -70,7 +70,7 @@ def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None
     row, found = asked(tmp_path, "sound", "arrows:cubes=2", evaluation_episodes=6, **changes)
     assert set(found.causes.values()) == {"fault"} and row.faults > 0 and row.kept is not None
     with closing(gymnasium.make(registry.task("arrows:cubes=2").env_id, physics={"plan_error_mm": 30.0})) as env:
-        lived = why._Courses(
+        lived = why._FailedEpisodes(
             env, Sound(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0))), 0
         )
         assert [sum(lived.of(row.kept, test).faults) for test in range(6)] == row.kept.faults.tolist()
@@ -88,15 +88,15 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
     seen = set[tuple[bool, ...]]()
     with closing(gymnasium.make(spec.env_id, execution="kinematic")) as env:
         for test in range(row.test_episodes):
-            course = why._Courses(env, agent, 0).of(row.kept, test)
+            episode = why._FailedEpisodes(env, agent, 0).of(row.kept, test)
             frame, info = env.reset(seed=episode_seed("evaluation", 0, test))
-            assert course.actions == row.kept.actions_of(test)
-            for action, state, misread in zip(course.actions, course.states, course.misread, strict=False):
+            assert episode.actions == row.kept.actions_of(test)
+            for action, state, misread in zip(episode.actions, episode.states, episode.misread, strict=False):
                 assert state == tuple(info["macrostate"].tolist())
                 assert misread == (tuple(agent.read_frames(frame[None])[0].tolist()) != state)
                 frame, _, terminated, _, info = env.step(action)
-            assert course.states[-1] == tuple(info["macrostate"].tolist()) and course.terminated == terminated
-            seen.add(tuple(course.misread))
+            assert episode.states[-1] == tuple(info["macrostate"].tolist()) and episode.terminated == terminated
+            seen.add(tuple(episode.misread))
     assert {(True,), (False,)} <= {each[:1] for each in seen} and any(len(set(each)) == 2 for each in seen)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.capabilities import ExpectedOutcomes
 from imagine_bench.interfaces import Outcome, State, TaskSpec
-from imagine_bench.judge.causes import CAUSES, Attribution, Course, _at, _place
+from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, _at, _place
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import Beliefs
 
@@ -49,7 +49,7 @@ def does(choice: dict[State, int], model: ExpectedOutcomes | None, states: tuple
     return Beliefs(action=np.array([choice[state] for state in states], dtype=np.int16), model=model)
 
 
-def course(start: State, actions: list[int], **changes: Any) -> Course:
+def episode(start: State, actions: list[int], **changes: Any) -> FailedEpisode:
     """What comes of macro-actions by the rules, which leave nothing to chance here."""
     states, terminated = [start], False
     for action in actions:
@@ -58,10 +58,10 @@ def course(start: State, actions: list[int], **changes: Any) -> Course:
         terminated = outcome.terminated
     quiet = [False] * len(actions)
     known = {"states": states, "actions": actions, "terminated": terminated, "faults": quiet, "misread": quiet}
-    return Course(**{**known, "seed": 5, **changes})
+    return FailedEpisode(**{**known, "seed": 5, **changes})
 
 
-def cause(agent: Beliefs, tried: NDArray[np.int64], happened: Course, spec: TaskSpec = SPEC) -> str:
+def cause(agent: Beliefs, tried: NDArray[np.int64], happened: FailedEpisode, spec: TaskSpec = SPEC) -> str:
     return Attribution(spec, agent, tried, np.ones(len(agent.action), dtype=np.bool_)).cause(happened)
 
 
@@ -71,7 +71,7 @@ def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) 
     agent = does(OPTIMAL, model_of(SPEC) if modelled else None)
     first = OPTIMAL[start]
     second = ILLEGAL[RULES.outcomes(start, first)[0].macrostate]
-    blind = course(start, [first, second], misread=[False, True])
+    blind = episode(start, [first, second], misread=[False, True])
     assert cause(agent, ALL, blind) == "misread"
     seeing = dataclasses.replace(blind, misread=[True, False])
     assert cause(agent, ALL, seeing) == ("planning" if modelled else "values"), "it was not the frame that was misread"
@@ -82,7 +82,7 @@ def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: St
     """What its model says there, from frames that it misreads, is not held against the model."""
     readable = np.array([state != start for state in STATES])
     there = model_of(SPEC, lambda state, action: state == start)
-    failed = course(start, [ILLEGAL[start]])
+    failed = episode(start, [ILLEGAL[start]])
     blind = dataclasses.replace(failed, misread=[True])
     plays_well, plays_badly = (Attribution(SPEC, does(each, there), ALL, readable) for each in (OPTIMAL, ILLEGAL))
     assert plays_well.cause(blind) == "misread" and plays_well.cause(failed) == "planning", "it read this frame right"
@@ -97,7 +97,7 @@ def test_what_was_never_experienced_is_charged_to_experience(start: State) -> No
         return any(outcome.success for outcome in RULES.outcomes(state, action))
 
     tried = np.array([row for row in ALL.tolist() if not solving(tuple(row[:-1]), row[-1])])
-    failed = course(start, [ILLEGAL[start]])
+    failed = episode(start, [ILLEGAL[start]])
     for model in (model_of(SPEC, solving), None):
         agent = does(dict.fromkeys(STATES, 0), model)
         assert cause(agent, tried, failed) == "unexperienced"
@@ -109,7 +109,7 @@ def test_what_was_never_experienced_is_charged_to_experience(start: State) -> No
 
 @pytest.mark.parametrize("start", FAR[::4])
 def test_a_policy_not_greedy_in_its_right_model_is_planning(start: State) -> None:
-    failed = course(start, [ILLEGAL[start]])
+    failed = episode(start, [ILLEGAL[start]])
     assert cause(does(ILLEGAL, model_of(SPEC)), ALL, failed) == "planning"
     assert cause(does(ILLEGAL, None), ALL, failed) == "values"
 
@@ -117,7 +117,7 @@ def test_a_policy_not_greedy_in_its_right_model_is_planning(start: State) -> Non
 @pytest.mark.parametrize("start", FAR[::4])
 def test_a_slip_of_physics_is_charged_to_physics(start: State) -> None:
     bad = RULES.outcomes(start, ILLEGAL[start])[0].macrostate
-    slipped = course(start, [OPTIMAL[start]], states=[start, bad], terminated=True, faults=[True])
+    slipped = episode(start, [OPTIMAL[start]], states=[start, bad], terminated=True, faults=[True])
     assert cause(does(OPTIMAL, model_of(SPEC)), ALL, slipped) == "fault"
     assert cause(does(OPTIMAL, None), ALL, slipped) == "fault"
 
@@ -142,8 +142,8 @@ def test_bad_luck_is_nobodys_fault() -> None:
     quiet = {"states": [(0,), (2,)], "terminated": True, "faults": [False], "misread": [False]}
     for model in (model_of(spec), None):
         agent = does({(0,): 0, (1,): 0, (2,): 0}, model, Coin.states)
-        assert cause(agent, tried, Course(actions=[0], seed=1, **quiet), spec) == "unlucky"
-        found = [cause(agent, tried, Course(actions=[1], seed=seed, **quiet), spec) for seed in range(400)]
+        assert cause(agent, tried, FailedEpisode(actions=[0], seed=1, **quiet), spec) == "unlucky"
+        found = [cause(agent, tried, FailedEpisode(actions=[1], seed=seed, **quiet), spec) for seed in range(400)]
         wrong = "planning" if model else "values"
         assert set(found) == {wrong, "unlucky"}, "another action would have met the same chance"
         assert abs(found.count(wrong) / 400 - 0.6) < 0.08
@@ -153,7 +153,7 @@ def test_a_start_from_which_no_plan_fits_is_unlucky() -> None:
     start = max(RULES.start_states, key=lambda state: fewest_actions(RULES, state))
     short = dataclasses.replace(SPEC, horizon=fewest_actions(RULES, start) - 1)
     actions = [0, 1] * 5
-    failed = course(start, actions[: short.horizon])
+    failed = episode(start, actions[: short.horizon])
     assert cause(does(OPTIMAL, model_of(SPEC)), ALL, failed, short) == "unlucky"
 
 
@@ -173,7 +173,7 @@ def test_every_failure_has_exactly_one_cause() -> None:
                 state = RULES.outcomes(state, actions[-1])[0].macrostate
             if not RULES.judge(start, 0, state).success:
                 misread = (rng.random(len(actions)) < 0.2).tolist()
-                happened = course(start, actions, misread=misread)
+                happened = episode(start, actions, misread=misread)
                 counted[found.cause(happened)] += 1
                 seeing = dataclasses.replace(happened, misread=[False] * len(actions))
                 assert found.cause(seeing) != "misread"
@@ -195,4 +195,4 @@ def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
 
 def test_a_scene_that_was_no_macrostate_is_no_experience() -> None:
     odd = Attribution(SPEC, does(OPTIMAL, None), np.array([[9, 9, 9, 9, 0]]), EVERY)
-    assert odd.cause(course(FAR[0], [ILLEGAL[FAR[0]]])) == "unexperienced"
+    assert odd.cause(episode(FAR[0], [ILLEGAL[FAR[0]]])) == "unexperienced"

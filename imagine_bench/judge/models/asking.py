@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.models.ends import Gallery, key_of
-from imagine_bench.judge.models.truth import Questions, courses, lasting_actions, transitions
+from imagine_bench.judge.models.truth import Questions, lasting_actions, outcomes_by_depth, transitions
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.world_models import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
@@ -122,7 +122,7 @@ def counterfactuals(spec: TaskSpec, gallery: Gallery) -> tuple[Questions, ...]:
         replace(
             first,
             actions=np.full_like(first.actions, action),
-            truth=tuple(courses(spec.rules, state, [action]) for state in chosen),
+            truth=tuple(outcomes_by_depth(spec.rules, state, [action]) for state in chosen),
         )
         for action in range(spec.n_actions)
     )
@@ -137,7 +137,7 @@ def _questions(
     """Questions of (states shown, macro-actions between and after them)."""
     shown = len(asked[0][0])
     frames = gallery.render([state for states, _ in asked for state in states], rng)
-    truth = [courses(spec.rules, states[-1], actions[shown - 1 :]) for states, actions in asked]
+    truth = [outcomes_by_depth(spec.rules, states[-1], actions[shown - 1 :]) for states, actions in asked]
     return Questions(
         states=tuple(states[-1] for states, _ in asked),
         frames=frames.reshape(len(asked), shown, *frames.shape[1:]),

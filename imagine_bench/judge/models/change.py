@@ -173,8 +173,8 @@ def counterfactual_error(asked: Sequence[Questions], answers: Sequence[Answers])
     wrong = []
     for one, other in itertools.combinations(range(len(asked)), 2):
         for row in range(len(asked[one].states)):
-            courses = [asked[index].truth[row][0] for index in (one, other)]
-            possible = _together(*([(state, share) for (state, _), (share, _) in each.items()] for each in courses))
+            both = [asked[index].truth[row][0] for index in (one, other)]
+            possible = _together(*([(state, share) for (state, _), (share, _) in each.items()] for each in both))
             imagined = _together(*(_futures(answers[index], row) for index in (one, other)))
             wrong.append(sum(share for pair, share in imagined.items() if pair not in possible))
     return float(np.mean(wrong)) if wrong else math.nan

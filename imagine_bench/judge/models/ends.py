@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
-from imagine_bench.judge.models.truth import Course, courses
+from imagine_bench.judge.models.truth import Outcomes, outcomes_by_depth
 from imagine_bench.seeding import SeedTree
 from imagine_bench.world_models import Imagined
 
@@ -81,24 +81,24 @@ class Exact:
         del samples, rng
         depth = actions.shape[1] - frames.shape[1] + 1
         found = [self._outcomes(history[-1], row[-depth:]) for history, row in zip(frames, actions, strict=True)]
-        futures = max(len(course) for steps in found for course in steps)
+        futures = max(len(outcomes) for steps in found for outcomes in steps)
         shape = (len(frames), futures, depth)
         pictures = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8)
         weights, rewards, ended = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         for row, steps in enumerate(found):
-            for step, course in enumerate(steps):
-                for slot, ((state, over), (share, reward)) in enumerate(course.items()):
+            for step, outcomes in enumerate(steps):
+                for slot, ((state, over), (share, reward)) in enumerate(outcomes.items()):
                     pictures[row, slot, step] = self.gallery.frame(state)
                     weights[row, slot, step], ended[row, slot, step] = share, over
                     rewards[row, slot, step] = reward
         unknown = np.zeros((len(frames), depth))
         return Imagined(pictures=pictures, probabilities=weights, rewards=rewards, p_ended=ended, epistemic=unknown)
 
-    def _outcomes(self, frame: Frame, actions: NDArray[np.int64]) -> tuple[Course, ...]:
+    def _outcomes(self, frame: Frame, actions: NDArray[np.int64]) -> tuple[Outcomes, ...]:
         state = self.gallery.shows(frame)
         if state is None:
             raise InvalidValueError("The exact model was given a frame that the judge did not render.")
-        return courses(self._rules, state, actions.tolist())
+        return outcomes_by_depth(self._rules, state, actions.tolist())
 
     def parameters(self) -> int:
         """None."""

@@ -37,9 +37,9 @@ def by_depth(questions: Questions, answers: Answers) -> dict[str, list[float]]:
     rows, depth = len(questions.truth), questions.depth
     away, nothing = np.zeros((rows, depth)), np.zeros((rows, depth))
     for row, steps in enumerate(questions.truth):
-        for step, course in enumerate(steps):
+        for step, outcomes in enumerate(steps):
             imagined = answers.distribution(row, step)
-            away[row, step] = total_variation(shares(course), imagined)
+            away[row, step] = total_variation(shares(outcomes), imagined)
             nothing[row, step] = no_picture(imagined)
     return {"tv_by_depth": away.mean(axis=0).tolist(), "nothing_by_depth": nothing.mean(axis=0).tolist()}
 

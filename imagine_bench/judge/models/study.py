@@ -207,7 +207,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
         **noticing(world.streams, answers["one_step"]),
         "counterfactual": counterfactual_error(world.counterfactuals, again),
         "futures": {
-            "real": [_named(world.spec, shares(course)) for course in world.rollouts.truth[0]],
+            "real": [_named(world.spec, shares(outcomes)) for outcomes in world.rollouts.truth[0]],
             "imagined": [_named(world.spec, answers["rollouts"].distribution(0, step)) for step in range(asking.DEPTH)],
         },
         "fit_s": fit_s, "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps,
@@ -342,7 +342,7 @@ def _pictures(model: WorldModel, world: _World, worst: list[int], seeds: SeedTre
         pictures = imagined.pictures[:, 0]
         if pictures.dtype != np.uint8:
             pictures = (np.asarray(pictures) * 255.0).round().astype(np.uint8)
-        truth = [[shares(course) for course in questions.truth[row]] for row in rows]
+        truth = [[shares(outcomes) for outcomes in questions.truth[row]] for row in rows]
         real = [[world.gallery.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
         right = [
             [tuple(state) in each for state, each in zip(states, steps, strict=True)]

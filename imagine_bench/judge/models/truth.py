@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Rules, State
 from imagine_bench.rules import states_of
 
-Course = dict[tuple[State, bool], tuple[float, float]]
+Outcomes = dict[tuple[State, bool], tuple[float, float]]
 """By macrostate and whether the episode is over: probability, and the reward expected of the action that led there."""
 
 
@@ -27,7 +27,7 @@ class Questions:
     states: tuple[State, ...]  #: What the last frame shows. Length N.
     frames: Frame  #: Shape (N, K, 64, 64, 3).
     actions: NDArray[np.int64]  #: Those between the frames, then those asked about. Shape (N, K - 1 + D).
-    truth: tuple[tuple[Course, ...], ...]  #: By question and depth. N of length D.
+    truth: tuple[tuple[Outcomes, ...], ...]  #: By question and depth. N of length D.
 
     @property
     def depth(self) -> int:
@@ -40,38 +40,38 @@ class Questions:
         return self.actions[:, self.frames.shape[1] - 1 :]
 
 
-def courses(rules: Rules, state: State, actions: Sequence[int]) -> tuple[Course, ...]:
+def outcomes_by_depth(rules: Rules, state: State, actions: Sequence[int]) -> tuple[Outcomes, ...]:
     """What may come of macro-actions from a macrostate, after each of them."""
-    course: Course = {(state, False): (1.0, 0.0)}
+    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
     found = []
     for action in actions:
         after: dict[tuple[State, bool], list[float]] = {}
-        for (before, over), (weight, _) in course.items():
+        for (before, over), (weight, _) in outcomes.items():
             for outcome in rules.outcomes(before, int(action)):
                 sums = after.setdefault((outcome.macrostate, over or outcome.terminated), [0.0, 0.0])
                 sums[0] += weight * outcome.probability
                 sums[1] += weight * outcome.probability * (0.0 if over else outcome.reward)
-        course = {key: (share, earned / share if share else 0.0) for key, (share, earned) in after.items()}
-        found.append(course)
+        outcomes = {key: (share, earned / share if share else 0.0) for key, (share, earned) in after.items()}
+        found.append(outcomes)
     return tuple(found)
 
 
-def shares(course: Course) -> dict[State, float]:
+def shares(outcomes: Outcomes) -> dict[State, float]:
     """Probability of each macrostate, whether or not the episode is over."""
     found: dict[State, float] = {}
-    for (state, _), (share, _) in course.items():
+    for (state, _), (share, _) in outcomes.items():
         found[state] = found.get(state, 0.0) + share
     return found
 
 
-def p_ended(course: Course) -> float:
+def p_ended(outcomes: Outcomes) -> float:
     """Probability that the episode is over."""
-    return sum(share for (_, over), (share, _) in course.items() if over)
+    return sum(share for (_, over), (share, _) in outcomes.items() if over)
 
 
-def expected_reward(course: Course) -> float:
+def expected_reward(outcomes: Outcomes) -> float:
     """Expected reward of the latest action."""
-    return sum(share * reward for share, reward in course.values())
+    return sum(share * reward for share, reward in outcomes.values())
 
 
 def transitions(rules: Rules, rng: np.random.Generator, most: int) -> list[tuple[State, int]]:
@@ -85,16 +85,16 @@ def transitions(rules: Rules, rng: np.random.Generator, most: int) -> list[tuple
 def lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Generator) -> list[int]:
     """Random macro-actions after which the episode is least likely to be over, one after another."""
     chosen: list[int] = []
-    course: Course = {(state, False): (1.0, 0.0)}
+    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
     for _ in range(depth):
         risks = []
         for action in range(rules.n_actions):
-            after = [o for (before, over) in course if not over for o in rules.outcomes(before, action)]
+            after = [o for (before, over) in outcomes if not over for o in rules.outcomes(before, action)]
             dead_end = sum(not _goes_on(rules, outcome.macrostate) for outcome in after if not outcome.terminated)
             risks.append((sum(outcome.probability for outcome in after if outcome.terminated), dead_end))
         best = [action for action, risk in enumerate(risks) if risk == min(risks)]
         chosen.append(int(rng.choice(best)))
-        course = courses(rules, state, chosen)[-1]
+        outcomes = outcomes_by_depth(rules, state, chosen)[-1]
     return chosen
 
 

@@ -30,9 +30,9 @@ def exact_machine(questions: Questions, n_actions: int) -> Machine:
     states, pairs = _pairs(questions)
     goes_on, reward = _empty(states, n_actions)
     for (state, action), rows in pairs.items():
-        course = questions.truth[rows[0]][0]
-        reward[action, states[state]] = expected_reward(course)
-        for (after, over), (share, _) in course.items():
+        outcomes = questions.truth[rows[0]][0]
+        reward[action, states[state]] = expected_reward(outcomes)
+        for (after, over), (share, _) in outcomes.items():
             if not over and after in states:
                 goes_on[action, states[state], states[after]] += share
     return Machine(states=tuple(states), goes_on=goes_on, reward=reward)

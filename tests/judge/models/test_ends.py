@@ -66,7 +66,7 @@ def test_exact_is_without_any_error(task: str) -> None:
 
 
 def test_some_of_the_truth_is_random() -> None:
-    assert any(len(course) > 2 for steps in asked("pick_place").rollouts.truth for course in steps)
+    assert any(len(outcomes) > 2 for steps in asked("pick_place").rollouts.truth for outcomes in steps)
 
 
 def reached(rules: Rules, start: State, actions: list[int]) -> dict[State, float]:
