@@ -210,16 +210,17 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             acting = self._acting.pop(lane)
             if acting.motion is not None:
                 rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting)
-        self._over[lanes], mode = ends.any(axis=0), self.autoreset_mode
-        diverged = [lane for lane in infos if not self.envs[lane].begun]
-        self._look([lane for lane in infos if lane not in diverged])
+        self._over[lanes] = ends.any(axis=0)
+        acted = [lane for lane in infos if self.envs[lane].begun]  # not those that diverged
         collected: dict[str, Any] = {}
         again = [lane for lane in lanes if lane not in infos]
-        if mode == AutoresetMode.SAME_STEP:
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             again = [lane for lane in lanes if self._over[lane]]
+            self._look([lane for lane in acted if lane in again])
             final = {lane: {"final_obs": self._seen[lane], "final_info": infos[lane]} for lane in again}
             collected = _columns(final, self.num_envs)
-        infos.update(self._restart(again, [None] * self.num_envs, {}))
+        acted = [lane for lane in acted if lane not in again]
+        infos.update(self._restart(again, [None] * self.num_envs, {}, also=acted))
         collected.update(_columns(infos, self.num_envs))
         return self._stacked(lanes), rewards, ends[0], ends[1], collected
 
@@ -237,8 +238,9 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         return reward, terminated, self._horizon is not None and self._elapsed[lane] >= self._horizon, info
 
     def _restart(
-        self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any]
+        self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any], also: Sequence[int] = ()
     ) -> dict[int, dict[str, Any]]:
+        """Their infos; they and the lanes ``also`` are observed together, so that both processes draw until the end."""
         infos = {}
         for lane in lanes:
             infos[lane] = self.envs[lane].restart(seed=seeds[lane], options=options)
@@ -246,7 +248,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
                 self._begin_to_draw(self.envs[lane].data)
         self._elapsed[list(lanes)] = 0
         self._over[list(lanes)] = False
-        self._look(lanes)
+        self._look([*also, *lanes])
         return infos
 
     def _look(self, lanes: Sequence[int]) -> None:
