@@ -30,7 +30,7 @@ class KilledError(Exception):
 
 
 def do(folder: Path, agent: str, every_s: float) -> RunResult:
-    overrides = {"imagination.model_only_episodes": 5, "imagination.start_episode": 3}
+    overrides = {"imagination.model_only_episodes": 5, "imagination.start_episode": 3, "reuse.reset_every": 70}
     own = tuple(registry.own_settings(agent, overrides).items())
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=own)
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.AGENTS[agent].encoder_kind)
@@ -46,7 +46,10 @@ def own_values(folder: Path) -> str:
     return repr(sorted({**snapshot.agent.values, "meters": meters}.items()))
 
 
-_DO_LESS = ("imagination", "imagination_only", "dqn_more_updates", "q_learning_macrostate", "dyna_q_macrostate")
+_DO_LESS = (
+    "imagination", "imagination_only", "dqn_more_updates", "q_learning_macrostate", "dyna_q_macrostate",
+    "count_table_directed_macrostate", "posterior_sampling_macrostate", "dqn_codes", "imagination_exact_filter",
+)  # fmt: skip
 """Agents that do as much as another of the same class or less, which the fast tests kill."""
 
 
