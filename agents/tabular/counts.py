@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats
 
@@ -71,22 +72,50 @@ class CountTable:
 
         ``discount`` lies in [0, 1]. At 1 a value may grow without bound; iteration stops after 10,000 sweeps.
         """
+        return self._optimal(*self._columns(), discount, untried) if self._rows else {}
+
+    def sampled_values(self, discount: float, concentration: float, rng: np.random.Generator) -> dict[int, Floats]:
+        """The same in one model that is drawn from the posterior of what each pair of known state and action does.
+
+        The prior of a pair is a Dirichlet process (Ferguson 1973): ``concentration``, above 0, is how many counts it
+        weighs, and its mean is what any pair was seen to do, all kinds of outcome, reward and end, equally likely. What
+        was never seen of a pair is one draw from that.
+        """
         if not self._rows:
             return {}
-        rows = list(self._rows)
-        state = np.array([self._index[row[0]] for row in rows])
-        following = np.array([self._index[row[2]] for row in rows])
-        reward, going_on = np.array([row[3] for row in rows]), np.array([not row[4] for row in rows])
-        count, size = np.array(list(self._rows.values()), dtype=np.float64), len(self._index) * self._n_actions
-        pair = state * self._n_actions + np.array([row[1] for row in rows])
-        tests = np.bincount(pair, count, size)  # [S * A]
-        share = count / tests[pair]
+        pair, following, reward, going_on, count = self._columns()
+        size = len(self._index) * self._n_actions
+        outcomes = np.stack([reward, going_on], axis=1)
+        kind = np.unique(outcomes, axis=0, return_inverse=True)[1].ravel()
+        p = count / np.bincount(kind, count)[kind]
+        prior = rng.choice(len(count), size, p=p / p.sum())  # of each pair one row
+        rows = np.concatenate([np.arange(len(count)), prior])
+        weight = rng.gamma(np.concatenate([count, np.full(size, concentration)]))
+        own = np.concatenate([pair, np.arange(size)])
+        tiny = np.finfo(np.float64).tiny  # the gamma of a small shape may be 0
+        return self._optimal(own, following[rows], reward[rows], going_on[rows], weight + tiny, discount, untried=0.0)
+
+    def _columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.bool_], Floats]:
+        """Of each of N rows: pair, index of the state that follows, reward, whether the episode goes on, counts."""
+        state, action, following, reward, ended = (np.array(column) for column in zip(*self._rows, strict=True))
+        index = np.array([[self._index[each] for each in column.tolist()] for column in (state, following)])
+        count = np.array(list(self._rows.values()), dtype=np.float64)
+        return index[0] * self._n_actions + action, index[1], reward.astype(np.float64), ~ended, count
+
+    def _optimal(
+        self, pair: NDArray[np.int64], following: NDArray[np.int64], reward: Floats, going_on: NDArray[np.bool_],
+        weight: Floats, discount: float, untried: float,
+    ) -> dict[int, Floats]:  # fmt: skip
+        """Value iteration where each of N rows follows its pair in proportion to its weight, above 0."""
+        size = len(self._index) * self._n_actions
+        total = np.bincount(pair, weight, size)  # [S * A]
+        share = weight / total[pair]
         expected = np.bincount(pair, share * reward, size)
         follows = discount * share * going_on
         values: Floats = np.zeros(len(self._index))
         for _ in range(10_000):
             q = expected + np.bincount(pair, follows * values[following], size)
-            q[tests == 0.0] = untried
+            q[total == 0.0] = untried
             table = q.reshape(-1, self._n_actions)
             before, values = values, table.max(axis=1)
             if np.abs(values - before).max() <= _ACCURACY * max(1.0, np.abs(values).max()):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..dqn_settings import FAST_3, FAST_5, GreedySettings
-from ..settings import RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
+from ..settings import POSITIVE, RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +33,21 @@ class DynaQSettings(CountTableSettings):
     table: UpdateSettings = field(default_factory=UpdateSettings)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PriorSettings:
+    """What posterior sampling believes of a pair of state and action before it is tried."""
+
+    #: How many counts the prior weighs; 0.01 to 0.3 were tried on two tuning seeds (1000, 1001), no clear winner.
+    concentration: float = setting(0.3, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorSamplingSettings(CountTableSettings):
+    """All settings of posterior sampling; the epsilons do nothing."""
+
+    prior: PriorSettings = field(default_factory=PriorSettings)
+
+
 def _hyperparameters(published: S, *unused: str) -> Hyperparameters[S]:
     def group(fast: dict[str, Override]) -> ConfigGroup[S]:
         own = {name: value for name, value in fast.items() if name == "controller.epsilon_decay"}
@@ -42,6 +57,7 @@ def _hyperparameters(published: S, *unused: str) -> Hyperparameters[S]:
 
 
 HYPERPARAMETERS = _hyperparameters(CountTableSettings())
+POSTERIOR_SAMPLING = _hyperparameters(PosteriorSamplingSettings())
 DYNA_Q = _hyperparameters(DynaQSettings())
 Q_LEARNING = _hyperparameters(DynaQSettings(table=UpdateSettings(planning_steps=0)), "table.planning_steps")
 """No override makes it plan, so that both can be compared in one bench."""

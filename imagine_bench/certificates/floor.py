@@ -193,6 +193,7 @@ class _Learner:
         knows, machine = self.knows, self.machine
         self.wanted = np.zeros(len(knows.known), dtype=np.bool_)
         self.wanted_conditions = np.zeros(len(knows.true), dtype=np.bool_)
+        self.unsure = np.empty(0, dtype=np.int64)  # the points that those decide
         met, front = np.zeros(machine.n_play, dtype=np.bool_), starts
         while len(front):
             met[front] = True
@@ -203,7 +204,9 @@ class _Learner:
             outcomes = self._outcomes_of(actions[through] * machine.n_play + front[through])
             unsure = outcomes[~self.sure[outcomes]]
             if len(unsure):
-                self.wanted_conditions[knows.open_conditions(self.graph.point[unsure])] = True
+                points = self.graph.point[unsure]
+                self.wanted_conditions[knows.open_conditions(points)] = True
+                self.unsure = np.union1d(self.unsure, knows.alike[points])
             on = outcomes[self.sure[outcomes] & self.alive[outcomes]]
             front = np.unique(machine.after[on])
             front = front[~met[front] & ~settled[front]]
@@ -214,10 +217,11 @@ class _Learner:
         return np.concatenate([np.arange(self.first[pair], self.first[pair + 1]) for pair in pairs])
 
     def is_exhausted(self) -> bool:
-        """Whether nothing that was wanted is unknown any more."""
+        """Whether nothing that was wanted is unknown any more, or nothing unsure that it would decide unseen."""
         knows = self.knows
         left = self.wanted_conditions & ~knows.true & ~knows.false
-        return not (left.any() or (self.wanted & ~knows.known).any())
+        open_ = left.any() and (knows.class_of[self.unsure] < 0).any()
+        return not (open_ or (self.wanted & ~knows.known).any())
 
     def novelty(self, row: int) -> NDArray[np.int64]:
         """How many wanted facts each action may show. Shape (A,)."""

@@ -116,6 +116,21 @@ AGENTS: dict[str, AgentEntry] = {
         settings=_COUNT_TABLE_SETTINGS, title="count table, directed",
         description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
     ),
+    "count_table_directed_macrostate": AgentEntry(
+        make="imagine_bench.agents.tabular.count_table:make_directed_macrostate", settings=_COUNT_TABLE_SETTINGS,
+        needs_encoder=False, privileged=True, encoder_kind="codes", title="count table, directed (true state)",
+        description=f"A control: the same R-max; its state is {_TRUE_STATE}.",
+    ),
+    **{
+        f"posterior_sampling{twin}": AgentEntry(
+            make=f"imagine_bench.agents.tabular.posterior_sampling:make{twin}", encoder_kind="codes",
+            settings="imagine_bench.agents.tabular.settings:POSTERIOR_SAMPLING", needs_encoder=not twin,
+            privileged=bool(twin), title="posterior sampling" + " (true state)" * bool(twin),
+            description="A control: a count table that follows, each episode, a model drawn from what it believes "
+            f"(PSRL); its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
+        )
+        for twin in ("", "_macrostate")
+    },
     **{
         f"{name}{twin}": AgentEntry(
             make=f"imagine_bench.agents.tabular.dyna_q:make_{name}{twin}", encoder_kind="codes",

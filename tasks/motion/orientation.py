@@ -35,5 +35,5 @@ class ObjectPose:
     @classmethod
     def of(cls, qpos: NDArray[np.float64]) -> ObjectPose:
         """From a free joint's coordinates (7,), whose quaternion may have lost its unit length."""
-        w, x, y, z = (qpos[3:] / np.linalg.norm(qpos[3:])).tolist()
+        w, x, y, z = (qpos[3:] / math.sqrt(qpos[3:] @ qpos[3:])).tolist()
         return cls(position_m=qpos[:3].copy(), yaw_rad=yaw_rad(w, x, y, z), tilt_rad=tilt_rad(x, y))

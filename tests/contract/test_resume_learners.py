@@ -46,7 +46,10 @@ def own_values(folder: Path) -> str:
     return repr(sorted({**snapshot.agent.values, "meters": meters}.items()))
 
 
-_DO_LESS = ("imagination", "imagination_only", "dqn_more_updates", "q_learning_macrostate", "dyna_q_macrostate")
+_DO_LESS = (
+    "imagination", "imagination_only", "dqn_more_updates", "q_learning_macrostate", "dyna_q_macrostate",
+    "count_table_directed_macrostate", "posterior_sampling_macrostate",
+)  # fmt: skip
 """Agents that do as much as another of the same class or less, which the fast tests kill."""
 
 

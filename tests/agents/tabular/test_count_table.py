@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
-from imagine_bench.agents.tabular.count_table import CountTableAgent
+from imagine_bench.agents.tabular.count_table import CodeCountTableAgent
 from imagine_bench.agents.tabular.counts import CountTable
 from imagine_bench.agents.tabular.settings import HYPERPARAMETERS
 from small_runs import small
@@ -25,13 +25,15 @@ from imagine_bench.store import encoders
 LENGTH, LEFT = 6, 0
 
 
-def agent(*, directed: bool, n_actions: int = fake_codes.ACTIONS, seed: int = 0, name: str = "fast") -> CountTableAgent:
+def agent(
+    *, directed: bool, n_actions: int = fake_codes.ACTIONS, seed: int = 0, name: str = "fast"
+) -> CodeCountTableAgent:
     perception = CodePerception(fake_codes.FakeCodes(), factored=False)  # type: ignore[arg-type]
     settings = HYPERPARAMETERS.resolve(name, {}, "chapter_5")
-    return CountTableAgent(perception, n_actions, settings, SeedTree(seed), directed=directed)
+    return CodeCountTableAgent(perception, n_actions, settings, SeedTree(seed), directed=directed)
 
 
-def live(learner: CountTableAgent, steps: int, seed: int = 1) -> None:
+def live(learner: CodeCountTableAgent, steps: int, seed: int = 1) -> None:
     """Train on the tiny world of wheels."""
     rng, code = np.random.default_rng(seed), fake_codes.starts()[0]
     for _ in range(steps):
@@ -76,7 +78,7 @@ def test_only_news_change_what_is_predicted() -> None:
     assert table.largest_reward == 0.0
 
 
-def explored_after(learner: CountTableAgent) -> int:
+def explored_after(learner: CodeCountTableAgent) -> int:
     """Steps until every pair of a chain was tried, starting each episode of 2 x LENGTH steps at its left end."""
     following = 0
     for step in range(20_000):
