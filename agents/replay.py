@@ -24,8 +24,8 @@ Posterior = tuple[Tensor, Tensor]
 class Batch:
     """B transitions between latents ``z`` and ``next_z`` (B, Z) by ``action`` (B,), int64, with ``reward`` (B,).
 
-    ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0. Of prioritised draws,
-    ``rows`` (B,), int64, are where the memory holds them and ``weight`` (B,) is what their errors count, at most 1.
+    ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0. ``weight`` (B,) is
+    what their errors count, at most 1; of prioritised draws ``rows`` (B,), int64, are where the memory holds them.
     """
 
     z: Tensor
@@ -41,8 +41,9 @@ class Batch:
         return [Batch(*parts) for parts in zip(*(column.split(size) for column in self._columns()), strict=True)]
 
     def where(self, chosen: Tensor) -> Batch:
-        """The transitions that a mask (B,) chooses."""
-        return Batch(*(column[chosen] for column in self._columns()))
+        """The transitions that a mask (B,) chooses, with their weights."""
+        weight = None if self.weight is None else self.weight[chosen]
+        return replace(Batch(*(column[chosen] for column in self._columns())), weight=weight)
 
     def _columns(self) -> tuple[Tensor, ...]:
         return self.z, self.action, self.reward, self.next_z, self.terminated
@@ -171,9 +172,14 @@ class StartMemory(_Ring):
 
 
 class ImaginedMemory(_Ring):
-    """Transitions that were imagined."""
+    """Transitions that were imagined; with ``weighted``, each with what its error counts."""
 
     _latents = ("z", "next_z")
+
+    def __init__(self, capacity: int, latent_size: int, device: torch.device, *, weighted: bool = False) -> None:
+        super().__init__(capacity, latent_size, device)
+        if weighted:
+            self._columns["weight"] = torch.zeros(capacity, device=device)
 
     def add(self, batch: Batch) -> None:
         """Store every transition of a batch."""

@@ -267,6 +267,22 @@ def bundled_name(encoder: str, appearance: str, kind: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExactWorld:
+    """What a perfect world model would know: for privileged controls."""
+
+    rules: Rules  #: the macrostate machine
+    #: frames (N, 64, 64, 3) of macrostates (N, M), as training shows them
+    render: Callable[[NDArray[np.int64], np.random.Generator], Frame]
+
+    @classmethod
+    def of(cls, spec: TaskSpec, appearance: str) -> ExactWorld | None:
+        """That of a task at an appearance; None where frames hide something, so that no frame is a state."""
+        if spec.sight is not None:
+            return None
+        return cls(rules=spec.rules, render=lambda states, rng: spec.render_macrostates(states, appearance, rng))
+
+
+@dataclass(frozen=True, kw_only=True)
 class AgentContext:
     """What an agent is built from; it learns nothing else about its task."""
 
@@ -282,6 +298,7 @@ class AgentContext:
     #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
     #: for agents registered as privileged, None for every other
     optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
+    exact_world: ExactWorld | None = None  #: only for agents registered as privileged, and where frames hide nothing
     #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`
     observation: Mapping[str, tuple[int, ...]] = field(default_factory=lambda: {"frame": (FRAME_PX, FRAME_PX, 3)})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import accumulate, repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -171,6 +172,8 @@ class ImaginingAgent(DQN):
         encoder, imagination = self.perception.encoder, self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
         parts = [decompose(step.samples) for step in imagined]
+        before = accumulate((imagination.uncertainty(step) for step in imagined), initial=torch.zeros(1))
+        gathered = before if imagination.settings.accumulates else repeat(0.0)
 
         def joined(values: Iterable[Tensor]) -> NDArray[Any]:
             return torch.cat(list(values)).cpu().numpy()
@@ -185,7 +188,7 @@ class ImaginingAgent(DQN):
             epistemic=joined(imagination.filter.score(part.epistemic) for part in parts),
             aleatoric=joined(imagination.filter.score(part.aleatoric) for part in parts),
             modal=joined(imagination.filter.score(part.modal) for part in parts),
-            accepted=np.logical_and.accumulate(joined(imagination.keeps(step) for step in imagined)),
+            accepted=np.logical_and.accumulate(joined(map(imagination.keeps, imagined, gathered))),
             macrostates=encoder.read_macrostate(latents),
         )
 

@@ -13,12 +13,10 @@ from torch import Tensor
 from imagine_bench.errors import InvalidValueError
 
 from ..replay import RealMemory
-from .mixture import Mixture
 from .settings import Settings
 from .uncertainty import decompose, reduction
 from .world_model import WorldModel
 
-_CURIOSITY = "imagination.curiosity"
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
@@ -34,15 +32,19 @@ class EpistemicFilter:
 
     def __init__(self, settings: Settings, *, active: bool) -> None:
         samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
-        if (active or settings.imagination.curiosity > 0.0) and samples * settings.model.members == 1:
-            who, without = (
-                ("The filter", "choose the agent without the filter") if active else (_CURIOSITY, "set it to 0")
-            )
-            raise InvalidValueError(
-                f"{who} compares what several networks say, and with model.members 1 and model.dropout 0, or "
-                "imagination.weight_samples 1, there is one. Set model.dropout above 0 and imagination.weight_samples "
-                f"above 1, or model.members above 1, or {without}."
-            )
+        weighed = settings.imagination.confidence_scale is not None
+        readers = {
+            "The filter": (active, "choose the agent without the filter"),
+            "imagination.curiosity": (settings.imagination.curiosity > 0.0, "set it to 0"),
+            "imagination.confidence_scale": (weighed, "set it to null"),
+        }
+        for who, (reads, without) in readers.items():
+            if reads and samples * settings.model.members == 1:
+                raise InvalidValueError(
+                    f"{who} compares what several networks say, and with model.members 1 and model.dropout 0, or "
+                    "imagination.weight_samples 1, there is one. Set model.dropout above 0 and "
+                    f"imagination.weight_samples above 1, or model.members above 1, or {without}."
+                )
         self.reads_reward = active and settings.imagination.reward_threshold is not None
         if self.reads_reward and samples == 1:
             raise InvalidValueError(
@@ -62,17 +64,15 @@ class EpistemicFilter:
         """Reduce variances (..., Z) to one number each; one that overflowed is infinite. Shape (...)."""
         return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
-    def passes(self, samples: Mixture, p_terminated: Tensor, reward_std: Tensor | None) -> Tensor:
-        """Which of N transitions pass, all where the filter is not active. Shape (N,), bool.
+    def passes(self, uncertainty: Tensor, p_terminated: Tensor, reward_std: Tensor | None) -> Tensor:
+        """Which of N transitions pass where the filter is active. Shape (N,), bool.
 
         Args:
-            samples: What each weight sample predicts of the next state, with leading axes (E T, N).
+            uncertainty: Reduced epistemic variance of the next state. Shape (N,).
             p_terminated: Predicted probability of the end. Shape (N,).
             reward_std: Standard deviation of the reward over weight samples, where it is read. Shape (N,).
         """
-        if not self.active:
-            return torch.ones_like(p_terminated, dtype=torch.bool)
-        keep = self.score(decompose(samples).epistemic) <= self.threshold
+        keep = uncertainty <= self.threshold
         if self.settings.reward_threshold is not None and reward_std is not None:
             keep &= reward_std <= self.settings.reward_threshold
         if self.settings.termination_threshold is not None:

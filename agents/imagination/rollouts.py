@@ -87,7 +87,8 @@ class Imagination:
             for name in ("weights", "replay", "dropout", "rollouts")
         }
         self.model = self.new_model(latent_size, n_actions, settings)
-        self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device)
+        weighted = self.settings.confidence_scale is not None
+        self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device, weighted=weighted)
 
     def new_model(self, state_size: int, n_actions: int, settings: Settings) -> WorldModel:
         """A world model that has learned nothing, of states of so many numbers."""
@@ -149,13 +150,25 @@ class Imagination:
             samples = samples.map(lambda values: values.unflatten(0, (members, count))[:, chosen, rows])
         return mdn.average(samples, members)
 
-    def keeps(self, step: Imagined) -> Tensor:
+    def uncertainty(self, step: Imagined) -> Tensor:
+        """Epistemic variance of N imagined steps, reduced to one number each, in squared units of z. Shape (N,)."""
+        return self.filter.score(decompose(step.samples).epistemic)
+
+    def keeps(self, step: Imagined, gathered: Tensor | float = 0.0) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
 
-        A variance that is sampled in full and fed back can grow without bound, within some five imagined steps.
+        ``gathered`` is the uncertainty of each rollout before this step, where it counts, in squared units of z. A
+        variance that is sampled in full and fed back can grow without bound, within some five imagined steps.
         """
         bounded = step.next_z.abs().amax(dim=-1) < LATENT_LIMIT
-        return bounded & self.filter.passes(step.samples, step.p_terminated, step.reward_std)
+        if not self.filter.active:
+            return bounded
+        return bounded & self.filter.passes(gathered + self.uncertainty(step), step.p_terminated, step.reward_std)
+
+    def admits(self, z: Tensor, action: Tensor, step: Imagined, gathered: Tensor | float) -> Tensor:
+        """Which of N transitions a rollout keeps and goes on from: those of :meth:`keeps`. Shape (N,), bool."""
+        del z, action
+        return self.keeps(step, gathered)
 
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts and store what the filter keeps.
@@ -168,20 +181,26 @@ class Imagination:
             real: What really happened so far.
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
-        settings, generator = self.settings, self.generators["rollouts"]
-        sampled = self.filter.active or settings.predicts_with != "network"
+        settings, generator, scale = self.settings, self.generators["rollouts"], self.settings.confidence_scale
+        sampled = self.filter.active or scale is not None or settings.predicts_with != "network"
         weights = self.draw_weights(self.generators["dropout"]) if sampled else Weights(None, None)
         self.filter.move_threshold(self.model, real, weights.dynamics, self.generators["replay"])
         z, predicted, accepted = self._starts(current, real), 0, 0
+        gathered = torch.zeros(len(z), device=z.device)
         for _ in range(settings.depth):
             action = self.act(controller, z, max(epsilon, settings.exploration), generator)
             step = self.step(z, action, weights, generator)
             terminated = step.p_terminated > TERMINAL
-            keep = self.keeps(step)
+            keep = self.admits(z, action, step, gathered)
             predicted, accepted = predicted + len(z), accepted + int(keep.sum())
             if keep.any():
-                self.memory.add(Batch(z, action, step.reward, step.next_z, terminated.float()).where(keep))
-            z = step.next_z[keep & ~terminated]
+                weight = None if scale is None else 1.0 / (1.0 + (gathered + self.uncertainty(step)) / scale)
+                imagined = Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight)
+                self.memory.add(imagined.where(keep))
+            if settings.accumulates:
+                gathered = gathered + self.uncertainty(step)
+            going_on = keep & ~terminated
+            z, gathered = step.next_z[going_on], gathered[going_on]
             if len(z) == 0:
                 break
         return Counts(settings.breadth, predicted, accepted)

@@ -126,6 +126,12 @@ class ImaginationSettings:
     #: If given, the threshold moves with the model instead: it is this quantile of the reduced epistemic variance of
     #: transitions that really happened, a batch of them a real step.
     threshold_quantile: float | None = setting(None, PROBABILITY)
+    #: Whether a step counts with the uncertainty of all steps before it in its rollout (as Infoprop, Frauenknecht
+    #: et al. 2025), which so ends sooner the less the model knows. The thesis compares each step alone.
+    accumulates: bool = setting(False, SWITCH)
+    #: If given, the controller learns from all that is kept, each transition by its confidence, 1 / (1 + uncertainty /
+    #: scale), with the reduced epistemic variance and the scale in squared units of z. None: all alike (thesis).
+    confidence_scale: float | None = setting(None, POSITIVE)
     #: If given, the filter reads the reward network too: the largest standard deviation of a reward over T of its
     #: dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
     reward_threshold: float | None = setting(None, NOT_NEGATIVE)

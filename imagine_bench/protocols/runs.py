@@ -9,7 +9,7 @@ from typing import Generic, Literal, TypeVar
 
 from imagine_bench import registry
 from imagine_bench.certificates.beliefs import optimal_policy_of
-from imagine_bench.interfaces import PROPRIO_SIZE, AgentContext, TaskSpec
+from imagine_bench.interfaces import PROPRIO_SIZE, AgentContext, ExactWorld, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.seeding import SeedTree
@@ -50,6 +50,7 @@ class RunSpec(Generic[P_co]):
             overrides=registry.own_settings(self.agent, dict(protocol.overrides)),
             device=protocol.device,
             optimal_policy=optimal_policy_of(task) if entry.privileged else None,
+            exact_world=ExactWorld.of(task, protocol.appearance) if entry.privileged else None,
             observation={part: _shape(part, task, protocol) for part in protocol.observation.split(",")},
         )
 

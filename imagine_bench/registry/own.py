@@ -77,6 +77,11 @@ AGENTS: dict[str, AgentEntry] = {
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
         "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
+    "factored_own": AgentEntry(
+        make="imagine_bench.agents.factored.own:make", needs_encoder=False, title="factored, own eyes",
+        settings="imagine_bench.agents.factored.settings:OWN",
+        description="Like factored, but it begins with nothing: it learns to see, too, from its own frames as it acts.",
+    ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
         external_training_loop=True, title="SB3 DQN (pixels)", observes=OBSERVATIONS,
@@ -105,6 +110,31 @@ AGENTS: dict[str, AgentEntry] = {
         make="imagine_bench.agents.dqn:make_more_updates", settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
         title="DQN, more updates",
         description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
+    ),
+    "imagination_exact": AgentEntry(
+        make="imagine_bench.agents.controls.exact:make", privileged=True, title="imagination, exact model",
+        description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
+    ),
+    "imagination_exact_filter": AgentEntry(
+        make="imagine_bench.agents.controls.exact:make_filter", privileged=True, title="imagination, exact filter",
+        description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
+        "right by the rules.",
+    ),
+    "dqn_efficient": AgentEntry(
+        make="imagine_bench.agents.controls.efficient:make", title="DQN, data-efficient",
+        settings="imagine_bench.agents.controls.settings:EFFICIENT",
+        description="A control: the DQN with many updates, n-step targets and periodic resets, as SR-SPR and BBF.",
+    ),
+    "dqn_codes": AgentEntry(
+        make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
+        encoder_kind="codes", title="DQN (codes)",
+        description="A control: the DQN, which reads the discrete codes that factored sees in place of latents.",
+    ),
+    "dqn_swaps": AgentEntry(
+        make="imagine_bench.agents.controls.swaps:make", encoder_kind="codes", title="DQN (codes), swaps",
+        settings="imagine_bench.agents.controls.settings:SWAPPING",
+        description="A control: the same, also trained on real transitions that have untouched factors of others "
+        "(CoDA).",
     ),
     "count_table": AgentEntry(
         make="imagine_bench.agents.tabular.count_table:make", encoder_kind="codes", settings=_COUNT_TABLE_SETTINGS,

@@ -174,6 +174,33 @@ _CURIOSITY = Study(
     ),
 )  # fmt: skip
 
+_OF_DYNAMICS = {"imagination.termination_threshold": None}
+_USES = (
+    ("filter", "thesis' filter", _FILTERED, _OF_DYNAMICS),
+    ("weights", "weighed by confidence", "imagination", {"imagination.confidence_scale": 0.3}),
+    (
+        "length", "rollouts as long as known", _FILTERED,
+        {**_OF_DYNAMICS, "imagination.accumulates": True, "imagination.depth": 10},
+    ),
+    ("exploration", "curiosity 10", "imagination", {"imagination.curiosity": 10.0}),
+)  # fmt: skip
+
+
+def _uses(appearance: str) -> Iterator[Variant]:
+    """Imagination at an appearance: without a use of uncertainty, and with each."""
+    none, world = f"{appearance}, none", {"appearance": appearance}
+    yield Variant(name=none, factor=BASE, agent="imagination", world=world)
+    for factor, name, agent, settings in _USES:
+        yield Variant(
+            name=f"{appearance}, {name}", factor=factor, agent=agent, against=none, settings=settings, world=world
+        )
+
+
+_UNCERTAINTY = Study(
+    name="uncertainty", question="Which use of the model's uncertainty is worth it?", budgets=(250,),
+    seeds=(1000, 1001, 1002), evaluation_episodes=300, variants=(*_uses("clean"), *_uses("mild")),
+)  # fmt: skip
+
 _SMOKE = Study(
     name="smoke", question="Does every part of a study work?", budgets=(5,), seeds=(1000, 1001),
     evaluation_episodes=5, appearance="clean", execution="kinematic",
@@ -194,6 +221,7 @@ STUDIES: dict[str, Study] = {
         _LADDER,
         _CONTROLLER,
         _CURIOSITY,
+        _UNCERTAINTY,
         _SMOKE,
     )
 }

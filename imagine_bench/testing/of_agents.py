@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.bench.evaluation import play
 from imagine_bench.capabilities import begin_episode
 from imagine_bench.certificates.beliefs import optimal_policy_of
-from imagine_bench.interfaces import Agent, AgentContext, AgentState, Observation, TaskSpec
+from imagine_bench.interfaces import Agent, AgentContext, AgentState, ExactWorld, Observation, TaskSpec
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.testing.common import NotOffered, make_env, require
@@ -44,6 +44,7 @@ def checked_agent(name: str, task: str) -> CheckedAgent:
         hyperparameters="minimal",
         overrides=registry.own_settings(name, {}),
         optimal_policy=optimal_policy_of(spec) if entry.privileged else None,
+        exact_world=ExactWorld.of(spec, "clean") if entry.privileged else None,
     )
     return CheckedAgent(name, entry, spec, context)
 

@@ -203,7 +203,7 @@ def test_shown_rollouts_stay_rejected_after_the_first_rejection(monkeypatch: pyt
     free = imagination_agents.make(context(monkeypatch, overrides))
     assert free.imagine(frame(0), actions=actions, depth=3, rng=rng).accepted.all()
     once = iter([True, False, True])
-    monkeypatch.setattr(strict.imagination, "keeps", lambda step: torch.tensor([next(once)]))
+    monkeypatch.setattr(strict.imagination, "keeps", lambda step, gathered: torch.tensor([next(once)]))
     shown = strict.imagine(frame(0), actions=actions, depth=3, rng=rng)
     assert shown.accepted.tolist() == [True, False, False]
 
