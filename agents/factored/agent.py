@@ -1,6 +1,11 @@
-"""The agent ``factored``: sees codes, learns a structured model of them, plans in it, and explores what is unknown."""
+"""The agent ``factored``: sees codes, learns a structured model of them, plans in it, and explores what is unknown.
+
+:class:`CodeAgent` is all of it but what takes an encoder: imagining pictures, being read by a probe, asking an oracle.
+"""
 
 from __future__ import annotations
+
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +32,24 @@ _TERMINAL = 0.5
 _TIE = 1e-9
 
 
-class FactoredAgent:
+class Perception(Protocol):
+    """Frames to codes; ``sizes`` are the numbers of values of the P factors."""
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Length P."""
+
+    def code(self, frame: Frame) -> Code:
+        """The code of a frame (64, 64, 3)."""
+
+
+PerceptionT = TypeVar("PerceptionT", bound=Perception)
+
+
+class CodeAgent(Generic[PerceptionT]):
     """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
-    def __init__(self, perception: CodePerception, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
+    def __init__(self, perception: PerceptionT, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
         self.n_actions, self.settings = n_actions, settings
         self.rng = seeds.child("exploration").generator()
         self.perception = perception
@@ -98,6 +117,15 @@ class FactoredAgent:
         self.planner.clear()
         self.learned = len(self.replay) if end is None else end
 
+    def _relearn(self, tasks: list[int], learned: int) -> None:
+        """Learn from the first ``learned`` transitions once more, with tasks that began after as many as given."""
+        self._reset_model()
+        for began in tasks:
+            self.learn(began)
+            self._begin_task()
+        if learned > self.learned:
+            self.learn(learned)
+
     def reset_for_new_task(self) -> None:
         """Keep the dynamics, and earlier causes as priors; see :meth:`.outcomes.OutcomeModel.reset_for_new_task`."""
         self.learn()
@@ -108,6 +136,47 @@ class FactoredAgent:
         self.tasks.append(self.learned)
         self.model.outcomes.reset_for_new_task()
         self.planner.clear()
+
+    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+        """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
+        return self._values(self.perception.code(observation.frame)).astype(np.float32)
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
+        began = self.tasks[-1] if self.tasks else 0
+        real, labels = self.replay.count_real(began), self.replay.count_labels(began)
+        outcomes = len(self.model.outcomes.outcomes)
+        counters = {
+            "real_transitions": real, "gradient_updates": 0, "oracle/labels": labels, "model/outcomes": outcomes
+        }  # fmt: skip
+        return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
+
+    def state(self) -> AgentState:
+        """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
+        values = {
+            "learned": self.learned, "tasks": list(self.tasks), "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
+            "code_sizes": list(self.perception.sizes), "n_actions": self.n_actions,
+        }  # fmt: skip
+        return AgentState(arrays=snapshot.prefixed("replay", self.replay.arrays()), values=values)
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot by learning from all that is replayed once more.
+
+        ArtefactError if it does not fit this agent, and then nothing was changed.
+        """
+        snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
+        self._take_up(state)
+
+    def _take_up(self, state: AgentState) -> None:
+        self.replay.load(snapshot.below("replay", state.arrays))
+        self._relearn(state.values["tasks"], state.values["learned"])
+        self.meters.restore(state.values["meters"])
+        self.rng.bit_generator.state = state.values["exploration"]
+
+
+class FactoredAgent(CodeAgent[CodePerception]):
+    """Sees with an encoder, and so can show what it imagines, be read by a probe, and ask an oracle."""
 
     def query(self, observation: Observation) -> NDArray[np.int64] | None:
         """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.exploration`."""
@@ -123,10 +192,6 @@ class FactoredAgent:
         self.replay.add(asked._replace(has_reward=label is not None))
         with self.meters.cpu_time("time/model_s"):
             self.learn()
-
-    def q_values(self, observation: Observation) -> NDArray[np.float32]:
-        """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
-        return self._values(self.perception.code(observation.frame)).astype(np.float32)
 
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
@@ -174,41 +239,6 @@ class FactoredAgent:
         return ExpectedOutcomes(
             macrostates=read.reshape(*found.p_continues.shape, -1), p_continues=found.p_continues, reward=found.reward
         )
-
-    def diagnostics(self) -> dict[str, float]:
-        """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
-        began = self.tasks[-1] if self.tasks else 0
-        real, labels = self.replay.count_real(began), self.replay.count_labels(began)
-        outcomes = len(self.model.outcomes.outcomes)
-        counters = {
-            "real_transitions": real, "gradient_updates": 0, "oracle/labels": labels, "model/outcomes": outcomes
-        }  # fmt: skip
-        return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
-
-    def state(self) -> AgentState:
-        """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
-        values = {
-            "learned": self.learned, "tasks": list(self.tasks), "exploration": self.rng.bit_generator.state,
-            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
-            "code_sizes": list(self.perception.sizes), "n_actions": self.n_actions,
-        }  # fmt: skip
-        return AgentState(arrays=snapshot.prefixed("replay", self.replay.arrays()), values=values)
-
-    def restore(self, state: AgentState) -> None:
-        """Take up a snapshot by learning from all that is replayed once more.
-
-        ArtefactError if it does not fit this agent, and then nothing was changed.
-        """
-        snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
-        self.replay.load(snapshot.below("replay", state.arrays))
-        self._reset_model()
-        for began in state.values["tasks"]:
-            self.learn(began)
-            self._begin_task()
-        if state.values["learned"] > self.learned:
-            self.learn(state.values["learned"])
-        self.meters.restore(state.values["meters"])
-        self.rng.bit_generator.state = state.values["exploration"]
 
 
 def make(context: AgentContext) -> FactoredAgent:

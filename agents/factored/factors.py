@@ -6,6 +6,7 @@ Shapes: ``N`` codes, ``P`` factors, ``A`` macro-actions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -66,6 +67,14 @@ class CodeReplay:
         """The transitions from index ``first`` on, up to ``end``."""
         return self._rows[first:end]
 
+    def recode(self, pairs: Sequence[tuple[Code, Code]], factors: int) -> None:
+        """Give every transition other codes before and after, of so many factors."""
+        self._factors = factors
+        self._rows = [
+            row._replace(code=code, following=following)
+            for row, (code, following) in zip(self._rows, pairs, strict=True)
+        ]
+
     def count_real(self, first: int = 0) -> int:
         """How many of them, from index ``first`` on, happened."""
         return sum(row.has_dynamics for row in self.rows(first))
@@ -89,6 +98,7 @@ class CodeReplay:
 
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""
+        self._factors = arrays["code"].shape[1]
         columns = (arrays[name].tolist() for name in CodeTransition._fields)
         self._rows = [
             CodeTransition(tuple(code), action, tuple(following), *rest)

@@ -1,4 +1,4 @@
-"""Every setting of the agent ``factored``. They are the same for every task and set of hyperparameters."""
+"""Every setting of ``factored`` and ``factored_own``, the same for every task and set of hyperparameters."""
 
 from __future__ import annotations
 
@@ -66,3 +66,24 @@ class FactoredSettings:
 
 
 HYPERPARAMETERS = Hyperparameters.everywhere(FactoredSettings())
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnPerceptionSettings:
+    """How an agent learns to see; see :mod:`.own`."""
+
+    #: Most frames of its own that it remembers, 12 kB each; then perception stays as it is.
+    frames: int = setting(1000, between(4, 100_000))
+    #: Factors are found anew once so many times the frames of the last time were seen, and something had no known value
+    growth: float = setting(1.1, between(1.0, 100.0))
+    growth_if_known: float = setting(1.5, between(1.0, 100.0))  #: the same where everything had one
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnSettings(FactoredSettings):
+    """All settings of the agent ``factored_own``."""
+
+    perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
+
+
+OWN = Hyperparameters.everywhere(OwnSettings())

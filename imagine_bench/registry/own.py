@@ -77,6 +77,11 @@ AGENTS: dict[str, AgentEntry] = {
         description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
         "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
+    "factored_own": AgentEntry(
+        make="imagine_bench.agents.factored.own:make", needs_encoder=False, title="factored, own eyes",
+        settings="imagine_bench.agents.factored.settings:OWN",
+        description="Like factored, but it begins with nothing: it learns to see, too, from its own frames as it acts.",
+    ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
         external_training_loop=True, title="SB3 DQN (pixels)", observes=OBSERVATIONS,

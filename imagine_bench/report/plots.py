@@ -262,34 +262,6 @@ def open_loop_figure(data: ReportData) -> Figure:
     return figure
 
 
-def futures_figure(data: ReportData) -> Figure:
-    """Four panels: total variation by depth and by real episodes, missed and hallucinated outcomes by depth."""
-    figure, panels = _four_panels()
-    for agent, found in data.futures.items():
-        depth = np.arange(1, len(found.floor) + 1)
-        style: dict[str, Any] = {"color": color(agent), "marker": "o", "markersize": 3.5}
-        panels[0].plot(depth, found.total_variation, label=agent_words(agent).title, **style)
-        panels[0].plot(depth, found.where_random, linestyle="--", **style)
-        budgets, pairs = list(found.by_budget), np.array(list(found.by_budget.values()))  # [B, 2]
-        panels[1].plot(budgets, pairs[:, 0], **style)
-        panels[1].plot(budgets, pairs[:, 1], linestyle="--", **style)
-        panels[2].plot(depth, found.missed / found.pairs, **style)
-        panels[3].plot(depth, found.hallucinated / found.pairs, **style)
-    floor = next(iter(data.futures.values())).floor
-    _agents_legend(figure, panels[0])
-    panels[0].plot(np.arange(1, len(floor) + 1), floor, label="sampling noise", **_REFERENCE_LINE)
-    _lines_legend(panels[0], {"where several are possible": "--"})
-    _lines_legend(panels[1], {"depth 1": "-", f"depth {len(floor)}": "--"})
-    panels[0].set(title="Distance from the exact distribution", ylabel="total variation")
-    panels[1].set(title="The same while learning", ylabel="total variation")
-    panels[2].set(title="Missed: possible, not imagined", ylabel="outcomes a start")
-    panels[3].set(title="Hallucinated: imagined, impossible", ylabel="outcomes a start")
-    for index, axes in enumerate(panels):
-        _from_zero(axes)
-        axes.set_xlabel("real training episodes" if index == 1 else "imagined depth (macro-actions)")
-    return figure
-
-
 def _four_panels() -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(9.2, 7.0), layout="constrained")
     return figure, list(figure.subplots(2, 2).ravel())

@@ -1,0 +1,246 @@
+"""Factors and values found in the agent's own frames, told by interaction; no label, and no frame but its own.
+
+*Where*: pixels that change from one frame to the next, again and again, and hang together are one factor. *What*: two
+crops of a factor are alike if the brightness gradients of one, shifted by a few pixels, are those of the other; values
+are groups of crops (average linkage) below the widest gap among the heights at which groups merge. Tints, brightness
+and the jitter of a pose change neither. A crop that is like no exemplar of its factor has no known value.
+
+Sources: frame differences as motion segments (Jain & Nagel 1979); normalised cross-correlation of gradients (Lewis
+1995; Scharstein 1994); average linkage (Sokal & Michener 1958). Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a
+crop.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Floats, Frame
+
+from .factors import Codes
+
+Images = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+SHIFT_PX = 5
+"""Crops are compared at all shifts of so many pixels up, down, left and right."""
+_CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no change
+_CHANGES = (2, 0.03)  # times, and share of the frames, that a pixel must change to belong to a factor
+_LEAST_PX = 36  # pixels of a factor
+_FLAT = 0.02  # of a crop's energy, as most have it: what a crop without contours counts as
+_SAME, _OTHER = 0.15, 0.2  # distance that jitter makes; the least distance of two values
+_ROUND = 0.05  # added to heights where gaps are compared by their ratio
+_EXEMPLARS = 6  # most crops a value that are kept
+_COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
+_TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
+_EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
+_ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)
+_NEIGHBOURS = (
+    ((_ALL, _LAST), (_ALL, _NEXT)), ((_LAST, _ALL), (_NEXT, _ALL)),
+    ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
+)  # fmt: skip
+"""Pairs of neighbouring pixels: to the right, below, and both diagonals."""
+_DARK = 2.5  # of 255
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+
+
+class Part(NamedTuple):
+    """One region, and crops of which each shows a value."""
+
+    mask: Mask  #: its pixels. Shape (64, 64).
+    exemplars: Images  #: crops. Shape (E, D).
+    values: NDArray[np.int64]  #: what each shows. Shape (E,).
+    flat: float  #: energy that crops without contours count as
+    reach: float  #: distance beyond which a crop is like no exemplar
+
+    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+        """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""
+        apart = distances(crops(shapes, self.mask), self.exemplars, self.mask, self.flat)
+        return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
+
+
+class Factor(NamedTuple):
+    """One factor: regions that do not vary freely, and the joint values that were seen. Shape (K, parts)."""
+
+    parts: tuple[Part, ...]
+    joint: Codes
+
+    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+        """As of a part; of joint values that were not seen, the one that differs in the fewest parts."""
+        pairs = [part.read(shapes) for part in self.parts]
+        found, known = np.stack([value for value, _ in pairs], axis=1), np.stack([sure for _, sure in pairs], axis=1)
+        wrong = (found[:, None] != self.joint).sum(axis=2)  # [N, K]
+        return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
+
+
+def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
+    """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
+    shapes = contours(relative(frames))
+    pairs = [factor.read(shapes) for factor in factors]
+    return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
+
+
+def find(frames: Frame) -> list[Factor]:
+    """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes."""
+    images = relative(frames)
+    shapes = contours(images)
+    parts = [part for mask in regions(images) if (part := _part(shapes, mask)) is not None]
+    factors: list[tuple[tuple[Part, ...], Codes]]
+    factors = [((part,), part.read(shapes)[0][:, None]) for part in parts]
+    while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
+        one, other = pair
+        (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
+        factors[one] = ((*parts_1, *parts_2), np.concatenate([joint_1, joint_2], axis=1))
+    return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
+
+
+def _numbers(joint: Codes) -> NDArray[np.int64]:
+    """Joint values (N, parts) as numbers (N,)."""
+    return np.unique(joint, axis=0, return_inverse=True)[1].ravel()
+
+
+def _first_bound(values: list[NDArray[np.int64]]) -> tuple[int, int] | None:
+    """The first two factors, by their values (N,), that do not vary freely, or None."""
+    pairs = itertools.combinations(range(len(values)), 2)
+    return next(((one, other) for one, other in pairs if bound(values[one], values[other])), None)
+
+
+def bound(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    """Whether two factors (N,) have no more joint values than one of them could have had alone or in turns.
+
+    So have a factor and a copy of it, and things of which one excludes the other; unless chance may explain it.
+    """
+    table = np.zeros((one.max() + 1, other.max() + 1))
+    np.add.at(table, (one, other), 1.0)
+    expected = np.multiply.outer(table.sum(axis=1), table.sum(axis=0)) / len(one)
+    few = (table > 0).sum() < sum(table.shape)
+    return bool(few and expected[table == 0].sum() >= _EXPECTED)
+
+
+def relative(frames: Frame) -> Images:
+    """Frames in units of the median of each color, slightly blurred. Shape (N, 64, 64, 3)."""
+    images = frames.astype(np.float32)
+    images /= np.maximum(np.median(images.reshape(len(images), -1, 3), axis=1), _DARK)[:, None, None]
+    for axis in (1, 2):
+        images = scipy.ndimage.convolve1d(images, np.array([0.25, 0.5, 0.25], np.float32), axis, mode="nearest")
+    return images
+
+
+def contours(images: Images) -> Images:
+    """Gradients of the logarithm of brightness, down and to the right. (N, 64, 64, 3) to (N, 64, 64, 2)."""
+    log = np.log(np.maximum(images @ _LUMA, 0.1))
+    return np.stack([np.gradient(log, axis=1), np.gradient(log, axis=2)], axis=-1)
+
+
+def changed(before: Images, after: Images) -> Mask:
+    """Pixels of N pairs of images that one of a pair has and the other has not within a pixel. Shape (N, 64, 64)."""
+    return np.maximum(_beyond(before, after), _beyond(after, before)).max(axis=-1) > _CHANGE
+
+
+def _beyond(one: Images, other: Images) -> Images:
+    """How far ``other`` lies outside of what ``one`` shows there and a pixel around."""
+    around = (1, 3, 3, 1)
+    low, high = scipy.ndimage.minimum_filter(one, around), scipy.ndimage.maximum_filter(one, around)
+    return np.maximum(np.maximum(other - high, low - other), 0.0)
+
+
+def regions(images: Images) -> list[Mask]:
+    """Where successive images (N, 64, 64, 3) change: regions (64, 64), the largest first.
+
+    A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does.
+    """
+    change = changed(images[:-1], images[1:])
+    change = scipy.ndimage.binary_closing(np.pad(change, ((0, 0), (2, 2), (2, 2))), np.ones((1, 3, 3)))[:, 2:-2, 2:-2]
+    times, share = _CHANGES
+    often = change.sum(axis=0) >= max(times, share * len(change))
+    place = np.cumsum(often).reshape(often.shape) - 1
+    change = change[:, often].astype(np.float32)  # [N - 1, pixels]
+    alone, links = change.sum(axis=0), []
+    for one, other in _NEIGHBOURS:
+        near = often[one] & often[other]
+        rows, columns = place[one][near], place[other][near]
+        both = (change[:, rows] * change[:, columns]).sum(axis=0)
+        links.append(np.stack([rows, columns])[:, both >= _TOGETHER * (alone[rows] + alone[columns] - both)])
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(sum(link.shape[1] for link in links)), np.concatenate(links, axis=1)), shape=(len(alone), len(alone))
+    )
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    size = np.bincount(label) if len(label) else np.zeros(0)
+    order = [index for index in np.argsort(-size, kind="stable") if size[index] >= _LEAST_PX]
+    whole = np.full(often.shape, -1)
+    whole[often] = label
+    return [whole == index for index in order]
+
+
+def crops(shapes: Images, mask: Mask) -> Images:
+    """The part of contours (N, 64, 64, 2) at and beside ``mask``, in the window around it. Shape (N, D)."""
+    grown, (rows, columns) = scipy.ndimage.binary_dilation(mask), _window(mask)
+    own = np.moveaxis(shapes[:, rows, columns] * grown[rows, columns, None], -1, 1)
+    return own.reshape(len(shapes), -1)
+
+
+def _window(mask: Mask) -> tuple[slice, slice]:
+    """Rows and columns of a mask and the pixels beside it."""
+    (top, bottom), (left, right) = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+    return slice(max(0, top - 1), bottom + 2), slice(max(0, left - 1), right + 2)
+
+
+def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
+    """How unlike crops (N, D) and others (E, D) of one mask are: 1 - correlation at the best shift. Shape (N, E)."""
+    shape = mask[_window(mask)].shape
+    margin = (SHIFT_PX, SHIFT_PX)
+    image = np.pad(crop.reshape(len(crop), 2, *shape), ((0, 0), (0, 0), margin, margin))
+    shifted = np.lib.stride_tricks.sliding_window_view(image, shape, axis=(2, 3)).transpose(0, 2, 3, 1, 4, 5)
+    best = np.stack([(each.reshape(-1, others.shape[1]) @ others.T).max(axis=0) for each in shifted])
+    energy = np.sqrt(np.multiply.outer((crop**2).sum(axis=1) + flat, (others**2).sum(axis=1) + flat))
+    return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
+
+
+def _part(shapes: Images, mask: Mask) -> Part | None:
+    """The part at a mask, or None where all of its crops are alike."""
+    own = crops(shapes, mask)
+    flat = _FLAT * float(np.quantile((own**2).sum(axis=1), 0.9))
+    chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
+    while True:
+        apart = distances(own[chosen], own[chosen], mask, flat)
+        values, reach = groups(np.minimum(apart, apart.T))
+        rows = _exemplars(apart, values)
+        part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
+        strange = np.setdiff1d(np.flatnonzero(~part.read(shapes)[1]), chosen)
+        if not len(strange) or len(chosen) > _COMPARED:
+            return part if part.values.max() > 0 else None
+        chosen = np.union1d(chosen, strange[:_COMPARED])
+
+
+def groups(apart: Floats) -> tuple[NDArray[np.int64], float]:
+    """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them."""
+    if len(apart) < 2:
+        return np.zeros(len(apart), dtype=np.int64), _OTHER
+    tree = scipy.cluster.hierarchy.linkage(apart[np.triu_indices(len(apart), 1)], "average")
+    heights = np.concatenate([[_SAME], np.maximum(tree[:, 2], _SAME)])
+    ratio = (heights[1:] + _ROUND) / (heights[:-1] + _ROUND)
+    ratio[heights[1:] < _OTHER] = 0.0
+    gap = int(ratio.argmax())
+    cut = float(np.sqrt(heights[gap] * heights[gap + 1])) if ratio[gap] > 0.0 else max(_OTHER, float(heights[-1]))
+    label = scipy.cluster.hierarchy.fcluster(tree, cut, "distance")
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse.ravel()], cut
+
+
+def _exemplars(apart: Floats, values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of crops that stand for each value: each further one is the least like those before."""
+    rows: list[int] = []
+    for value in range(int(values.max()) + 1):
+        own = np.flatnonzero(values == value)
+        nearest = apart[own[0], own]
+        rows.append(int(own[0]))
+        for _ in range(min(_EXEMPLARS, len(own)) - 1):
+            if nearest.max() < _SAME / 2.0:
+                break
+            rows.append(int(own[nearest.argmax()]))
+            nearest = np.minimum(nearest, apart[rows[-1], own])
+    return np.array(rows)

@@ -1,0 +1,167 @@
+"""The agent ``factored_own``: it begins with nothing, and learns to see from its own frames while it acts.
+
+All that it sees is remembered, up to a bound. As soon as something has no known value, or much more was seen, factors
+and values are found anew (:mod:`.looks`), remembered transitions get their codes anew, and dynamics and outcomes are
+learned from them once more: nothing that happened is lost. Once as many frames are remembered as may be, perception
+stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Transition
+
+from .. import snapshot
+from ..encoders.perception import prepare_torch
+from . import looks
+from .agent import CodeAgent
+from .factors import Code
+from .settings import OWN, OwnPerceptionSettings, OwnSettings
+
+_FIRST, _RECENT = 4, 4
+"""Frames after which it looks for factors first; frames whose codes are kept."""
+
+
+class OwnPerception:
+    """Frames seen so far, and the codes that they have by what was found in the first ``looked_at`` of them."""
+
+    def __init__(self, settings: OwnPerceptionSettings, *, factored: bool) -> None:
+        self._settings, self._factored = settings, factored
+        self.frames: list[Frame] = []
+        self.transitions: list[tuple[int, int]] = []
+        """Frames before and after of each transition, as long as all are remembered."""
+        self.found: list[looks.Factor] = []
+        self.looked_at = 0
+        self.unknown = False
+        """Whether anything seen since has no known value."""
+        self._recent: OrderedDict[bytes, tuple[Code, bool]] = OrderedDict()
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers of values of the factors; before any is found, of one factor of one value."""
+        sizes = tuple(len(factor.joint) for factor in self.found) or (1,)
+        return sizes if self._factored else (int(np.prod(sizes)),)
+
+    @property
+    def full(self) -> bool:
+        """Whether as many frames are remembered as may be, so that nothing is found anew."""
+        return len(self.frames) >= self._settings.frames
+
+    def code(self, frame: Frame) -> Code:
+        """The code of a frame (64, 64, 3)."""
+        return self._read(frame)[0]
+
+    def _read(self, frame: Frame) -> tuple[Code, bool]:
+        """The code of a frame, and whether all of its values are known; the last ones are kept."""
+        key = frame.tobytes()
+        if key not in self._recent:
+            codes, known = self.codes(frame[None])
+            self._recent[key] = (codes[0], bool(known.all()))
+            if len(self._recent) > _RECENT:
+                self._recent.popitem(last=False)
+        return self._recent[key]
+
+    def codes(self, frames: Frame) -> tuple[list[Code], NDArray[np.bool_]]:
+        """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
+        if not self.found:
+            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=np.bool_)
+        codes, known = looks.read(self.found, frames)
+        if not self._factored:
+            codes = np.ravel_multi_index(tuple(codes.T), [len(factor.joint) for factor in self.found])[:, None]
+        return [tuple(code) for code in codes.tolist()], known
+
+    def remember(self, before: Frame, after: Frame) -> None:
+        """Remember a transition's frames; one that begins where the last one ended costs one frame."""
+        new = [after] if self.frames and np.array_equal(self.frames[-1], before) else [before, after]
+        self.frames += [frame.copy() for frame in new]
+        self.unknown |= not all(self._read(frame)[1] for frame in new)
+        self.transitions.append((len(self.frames) - 2, len(self.frames) - 1))
+
+    def renew(self) -> bool:
+        """Look for factors anew if it is time; whether codes may now be others."""
+        seen, settings = len(self.frames), self._settings
+        growth = settings.growth if self.unknown else settings.growth_if_known
+        if seen < max(_FIRST, growth * self.looked_at):
+            return False
+        self.look(seen)
+        return True
+
+    def look(self, count: int) -> None:
+        """Find factors in the first ``count`` frames remembered."""
+        self.found, self.looked_at = looks.find(np.stack(self.frames[:count])) if count else [], count
+        self.unknown = False
+        self._recent.clear()
+
+
+class OwnPerceptionAgent(CodeAgent[OwnPerception]):
+    """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
+
+    settings: OwnSettings
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Remember what was seen, see anew if that is due, and learn as from any codes."""
+        eyes = self.perception
+        if not eyes.full:
+            with self.meters.cpu_time("time/perception_s"):
+                eyes.remember(transition.observation.frame, transition.next_observation.frame)
+                if eyes.renew():
+                    self._recode()
+            self.meters.count("time/perception_s")
+        super().observe(transition, episode=episode)
+
+    def _recode(self) -> None:
+        """Give every replayed transition the codes that its frames have now, and learn from all of them once more."""
+        codes, _ = self.perception.codes(np.stack(self.perception.frames))
+        pairs = [(codes[before], codes[after]) for before, after in self.perception.transitions]
+        self.replay.recode(pairs[: len(self.replay)], len(self.perception.sizes))
+        self._relearn(self.tasks, len(self.replay))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Also how many factors and values it sees, in how many frames it found them, and how many it remembers."""
+        eyes, sizes = self.perception, self.perception.sizes
+        counted = {"factors": len(sizes), "values": sum(sizes), "looked_at": eyes.looked_at, "frames": len(eyes.frames)}
+        return {**super().diagnostics(), **{f"perception/{name}": float(value) for name, value in counted.items()}}
+
+    def state(self) -> AgentState:
+        """A snapshot: also the frames that it remembers."""
+        eyes, common = self.perception, super().state()
+        seen = np.stack(eyes.frames) if eyes.frames else np.zeros((0, 64, 64, 3), dtype=np.uint8)
+        pairs: NDArray[np.int64] = np.array(eyes.transitions, dtype=np.int64).reshape(-1, 2)
+        values = {key: value for key, value in common.values.items() if key != "code_sizes"}
+        return AgentState(
+            arrays={**common.arrays, "replay/frames": seen, "replay/frame_pairs": pairs},
+            values={**values, "looked_at": eyes.looked_at, "unknown": eyes.unknown},
+        )
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot: find the same factors in the same frames, and learn from all that is replayed.
+
+        ArtefactError if it does not fit this agent, and then nothing was changed.
+        """
+        snapshot.require_fit(_flat(state), _flat(self.state()), equal=("settings", "n_actions"))
+        eyes = self.perception
+        eyes.frames = list(state.arrays["replay/frames"])
+        eyes.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
+        eyes.look(state.values["looked_at"])
+        eyes.unknown = state.values["unknown"]
+        self._take_up(state)
+
+
+def _flat(state: AgentState) -> AgentState:
+    """A snapshot whose codes are in one row: how many factors they are of changes as it learns."""
+    codes: snapshot.Arrays = {
+        name: state.arrays[name].ravel() for name in ("replay/code", "replay/following") if name in state.arrays
+    }
+    return AgentState(arrays={**state.arrays, **codes}, values=state.values)
+
+
+def make(context: AgentContext) -> OwnPerceptionAgent:
+    """The ``factored_own`` agent, of whatever frames are 64 x 64."""
+    settings = OWN.resolve(context.hyperparameters, context.overrides, context.config_group)
+    prepare_torch(context.device)
+    perception = OwnPerception(settings.perception, factored=settings.dynamics.factored)
+    return OwnPerceptionAgent(perception, context.n_actions, settings, context.seeds)

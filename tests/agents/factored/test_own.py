@@ -1,0 +1,213 @@
+"""Perception learned while acting: what is found in pictures of a tiny world, and an agent that begins with nothing."""
+
+from __future__ import annotations
+
+import fake_codes
+import numpy as np
+import pytest
+from agent_states import same
+from fake_codes import ACTIONS, starts
+from imagine_bench.agents.factored import looks
+from imagine_bench.agents.factored.own import OwnPerception, OwnPerceptionAgent
+from imagine_bench.agents.factored.settings import OWN
+from numpy.typing import NDArray
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+Code = tuple[int, ...]
+
+
+def _shape(kind: int) -> NDArray[np.float64]:
+    """One of three marks of a wheel, or the two of the lamp: bars and a ring. Shape (12, 12)."""
+    rows, columns = np.mgrid[:12, :12]
+    ring = (np.hypot(rows - 5.5, columns - 5.5) > 3.5) & (np.hypot(rows - 5.5, columns - 5.5) < 6.0)
+    return np.asarray([abs(rows - 5.5) < 2, abs(columns - 5.5) < 2, ring][kind], dtype=np.float64)
+
+
+def picture(code: Code, rng: np.random.Generator) -> Frame:
+    """Two wheels and a lamp, each moved by up to two pixels, under a tint that is drawn anew."""
+    image = np.full((64, 64, 3), 0.4)
+    for value, (top, left) in zip(code, ((6, 6), (6, 40), (42, 24)), strict=True):
+        down, right = rng.integers(-2, 3, size=2)
+        image[top + down : top + down + 12, left + right : left + right + 12] += 0.5 * _shape(value)[..., None]
+    return (255.0 * image * rng.uniform(0.6, 1.0, size=3)).astype(np.uint8)
+
+
+def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[Code], Frame]:
+    """A random walk through codes; ``stay``: probability that nothing happens, and only jitter and tint are new."""
+    code, codes = starts()[0], []
+    for _ in range(steps):
+        codes.append(code)
+        code = code if rng.random() < stay else fake_codes.step(code, int(rng.integers(ACTIONS)))[0]
+        if rng.random() < 0.2:
+            code = starts()[int(rng.integers(len(starts())))]
+    return codes, np.stack([picture(code, rng) for code in codes])
+
+
+def agent(seed: int = 0, **overrides: object) -> OwnPerceptionAgent:
+    named = {name.replace("__", "."): value for name, value in overrides.items()}
+    settings = OWN.resolve("fast", named, "chapter_5")
+    perception = OwnPerception(settings.perception, factored=settings.dynamics.factored)
+    return OwnPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
+
+
+def live(learner: OwnPerceptionAgent, episodes: range, seed: int) -> list[int]:
+    """Train on pictures of the tiny world; each episode is drawn from its own seed. The actions taken."""
+    taken = []
+    for episode in episodes:
+        rng = np.random.default_rng((seed, episode))
+        code = starts()[int(rng.integers(len(starts())))]
+        seen = Observation(frame=picture(code, rng))
+        for _ in range(6):
+            action = learner.act(seen, explore=True)
+            code, reward, ended = fake_codes.step(code, action)
+            after = Observation(frame=picture(code, rng))
+            transition = Transition(
+                observation=seen, action=action, reward=reward, next_observation=after, terminated=ended,
+                truncated=False,
+            )  # fmt: skip
+            learner.observe(transition, episode=episode)
+            taken.append(action)
+            seen = after
+            if ended:
+                break
+    return taken
+
+
+def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
+    """One value a shape, whatever the jitter and tint: codes of fresh pictures and true codes name each other."""
+    _, frames = walk(60, np.random.default_rng(0))
+    found = looks.find(frames)
+    assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
+    truth, fresh = walk(300, np.random.default_rng(1))
+    codes, known = looks.read(found, fresh)
+    pairs = {(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}
+    assert len(pairs) == len({code for code, _ in pairs}) == len({true for _, true in pairs}) == len(set(truth)) > 6
+    assert known.mean() > 0.98
+
+
+def test_where_nothing_happens_nothing_is_found() -> None:
+    rng = np.random.default_rng(0)
+    still = np.full((20, 64, 64, 3), 120, dtype=np.uint8)
+    assert looks.find(still) == [] and looks.find(still[:1]) == []
+    tinted = (still * rng.uniform(0.5, 1.0, size=(20, 1, 1, 3))).astype(np.uint8)
+    assert looks.find(tinted) == [], "light is no factor"
+
+
+def test_a_look_that_was_never_seen_is_unknown() -> None:
+    rng = np.random.default_rng(0)
+    codes, frames = walk(80, rng)
+    without = np.array([code[0] != 2 for code in codes])
+    found = looks.find(frames[without])
+    _, known = looks.read(found, frames)
+    wheel = int(np.argmin(known[~without].mean(axis=0)))
+    assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
+
+
+@pytest.mark.parametrize(("shift", "gain"), [((0, 0), 1.0), ((5, -5), 0.5), ((-3, 4), 2.0)])
+def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int, int], gain: float) -> None:
+    def contours(kind: int, at: tuple[int, int], gain: float) -> NDArray[np.float32]:
+        image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
+        image[0, 26 + at[0] : 38 + at[0], 26 + at[1] : 38 + at[1]] += _shape(kind)[..., None].astype(np.float32)
+        return looks.contours(gain * image)
+
+    mask = np.zeros((64, 64), dtype=np.bool_)
+    mask[16:48, 16:48] = True
+    one = looks.crops(contours(0, (0, 0), 1.0), mask)
+    same_mark, other = (looks.crops(contours(kind, shift, gain), mask) for kind in (0, 1))
+    assert looks.distances(one, same_mark, mask, 1e-6) == pytest.approx(np.zeros((1, 1)), abs=1e-4)
+    assert looks.distances(one, other, mask, 1e-6)[0, 0] > 0.5
+    assert looks.distances(one, looks.crops(contours(0, (9, 0), 1.0), mask), mask, 1e-6)[0, 0] > 0.2, "too far"
+    nothing = np.zeros_like(one)
+    assert looks.distances(nothing, nothing, mask, 1e-6)[0, 0] == 0.0, "two empty crops are alike"
+
+
+def test_the_widest_gap_parts_the_groups() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(3, size=30)
+    apart = np.where(truth[:, None] == truth, rng.uniform(0.05, 0.2, (30, 30)), rng.uniform(0.4, 0.5, (30, 30)))
+    apart = np.minimum(apart, apart.T) * (1.0 - np.eye(30))
+    label, cut = looks.groups(apart)
+    assert len(set(zip(label.tolist(), truth.tolist(), strict=True))) == 3 and 0.15 < cut < 0.45
+    alike, _ = looks.groups(np.where(np.eye(30) > 0, 0.0, 0.1))
+    assert not alike.any(), "jitter alone makes one group"
+    strangers, _ = looks.groups(np.where(np.eye(4) > 0, 0.0, 0.5))
+    assert len(set(strangers.tolist())) == 4, "and crops that are all unlike make as many"
+
+
+def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
+    rng = np.random.default_rng(0)
+    bits = (rng.random((120, 2)) < 0.25).cumsum(axis=0) % 2
+    images = np.ones((120, 64, 64, 3), dtype=np.float32)
+    images[:, 20:40, 10:30] += bits[:, 0, None, None, None]
+    images[:, 20:40, 30:50] += bits[:, 1, None, None, None]  # they touch
+    found = looks.regions(images)
+    assert len(found) == 2 and not (found[0] & found[1]).any()
+    images[:, 20:40, 30:50] = 1.0 + bits[:, 0, None, None, None]
+    assert len(looks.regions(images)) == 1, "what changes together is one"
+
+
+def test_what_does_not_vary_freely_is_one_factor() -> None:
+    rng = np.random.default_rng(0)
+    one, other = rng.integers(3, size=(2, 200))
+    assert not looks.bound(one, other)
+    assert looks.bound(one, (one + 1) % 3), "a copy"
+    assert looks.bound(one, (one > 0).astype(np.int64)), "a coarser copy"
+    turns = rng.integers(3, size=200)
+    assert looks.bound((turns == 1).astype(np.int64), (turns == 2).astype(np.int64)), "one excludes the other"
+    assert not looks.bound((turns == 1).astype(np.int64)[:9], (turns == 2).astype(np.int64)[:9]), "chance may be why"
+
+
+def test_it_learns_to_see_and_to_act_from_nothing() -> None:
+    """Random agents solve 14.5 % of the starts (enumerated in test_factored)."""
+    learner, solved = agent(), 0
+    live(learner, range(40), seed=0)
+    for index, start in enumerate(starts()):
+        code, rng = start, np.random.default_rng((1, index))
+        for _ in range(6):
+            frame = Observation(frame=picture(code, rng))
+            code, reward, ended = fake_codes.step(code, learner.act(frame, explore=False))
+            if ended:
+                solved += reward > 0
+                break
+    found = learner.diagnostics()
+    assert solved >= 0.9 * len(starts())
+    assert (found["perception/factors"], found["perception/values"]) == (3, 8)
+
+
+def test_remembered_transitions_get_the_codes_that_their_frames_have_now() -> None:
+    learner = agent()
+    live(learner, range(25), seed=0)
+    eyes = learner.perception
+    codes, _ = eyes.codes(np.stack(eyes.frames))
+    looked = [row for row in zip(learner.replay.rows(), eyes.transitions, strict=True) if row[1][1] < eyes.looked_at]
+    assert looked and len(learner.replay) == len(eyes.transitions)
+    assert all(row.code == codes[before] and row.following == codes[after] for row, (before, after) in looked)
+
+
+@pytest.mark.parametrize("frames", [20, 1000])
+def test_resumed_it_continues_to_the_bit(frames: int) -> None:
+    """Also once it remembers as many frames as it may, and sees as it did then."""
+    whole, first = agent(perception__frames=frames), agent(perception__frames=frames)
+    assert live(whole, range(12), seed=0) == live(first, range(12), seed=0)
+    resumed = agent(seed=5, perception__frames=frames)
+    resumed.restore(first.state())
+    assert live(whole, range(12, 24), seed=0) == live(resumed, range(12, 24), seed=0)
+    assert same(whole.state(), resumed.state())
+    assert whole.perception.full is (frames == 20) and len(whole.perception.frames) <= max(frames + 1, 200)
+    before = first.state()
+    with pytest.raises(ArtefactError, match="settings"):
+        first.restore(agent(perception__frames=frames + 1).state())
+    assert same(before, first.state())
+
+
+def test_tests_change_nothing() -> None:
+    learner = agent()
+    live(learner, range(6), seed=0)
+    before = learner.state()
+    learner.act(
+        Observation(frame=np.random.default_rng(0).integers(255, size=(64, 64, 3)).astype(np.uint8)), explore=False
+    )
+    assert same(before, learner.state())
