@@ -186,36 +186,3 @@ def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: in
     if planned is not None and not all(0 <= action < n_actions for action in planned):
         raise InvalidValueError(f"Actions {planned} must lie in [0, {n_actions}).")
     return planned
-
-
-Follow = Callable[[NDArray[np.int64]], NDArray[np.int64]]
-"""Macrostates (N, M), as a probe reads them from imagined latents, to actions (N,); a negative one ends there."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampledFutures:
-    """What may happen, as sampled by a model in closed loop. Once a future has ended, its last macrostate is held."""
-
-    macrostates: NDArray[np.int64]  #: what a probe reads. Shape (D, R, S, M).
-    rewards: NDArray[np.float32]  #: predicted rewards, 0 once a future has ended. Shape (D, R, S).
-    ended: NDArray[np.bool_]  #: whether the model has said, here or before, that the episode is over. Shape (D, R, S).
-
-
-@runtime_checkable
-class FutureSampler(Protocol):
-    """An agent that can sample many futures of the same start; it changes nothing in the agent."""
-
-    def sample_futures(
-        self,
-        frames: Frame,
-        actions: NDArray[np.int64],
-        *,
-        follow: Follow,
-        samples: int,
-        depth: int,
-        rng: np.random.Generator,
-    ) -> SampledFutures:
-        """Imagine S = ``samples`` futures of D = ``depth`` macro-actions from each of R real frames (R, 64, 64, 3).
-
-        ``actions`` (R,) come first, ``follow`` chooses the later ones; ``rng`` draws components, noise, dropout masks.
-        """

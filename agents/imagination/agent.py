@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.capabilities import ExpectedOutcomes, Follow, ImaginedRollout, SampledFutures, planned_actions
+from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
 from imagine_bench.interfaces import AgentContext, AgentState, Frame
 from imagine_bench.seeding import SeedTree
 
@@ -24,11 +24,11 @@ from ..meters import Meters
 from ..networks.precision import settle
 from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
-from .futures import predict, sample_futures
-from .rollouts import TERMINAL, Imagination, Imagined
+from .rollouts import TERMINAL, Imagination, Imagined, Weights
 from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
 
+_PREDICTIONS = 20_000  # mixtures predicted at once, over weight samples and rows, to bound memory
 _BRANCHES = 8  # samples that stand for what the model expects of a step
 _Kind = TypeVar("_Kind", bound="ImaginingAgent")
 
@@ -138,20 +138,13 @@ class ImaginingAgent(DQN):
         start = self.perceive(frame).unsqueeze(0)  # [1, Z]
         return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
-    def sample_futures(
-        self, frames: Frame, actions: NDArray[np.int64], *, follow: Follow, samples: int, depth: int,
-        rng: np.random.Generator,
-    ) -> SampledFutures:  # fmt: skip
-        """Imagine many futures of the same beginnings; see :class:`imagine_bench.capabilities.FutureSampler`."""
-        return sample_futures(self.imagination, self.perception.encoder, frames, actions, follow, samples, depth, rng)
-
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
         """As many samples as :data:`_BRANCHES`; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
         z, shape = self.perception.encoder.encode(frames)[0], (len(frames), self.n_actions, _BRANCHES)
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         action = np.tile(np.repeat(np.arange(self.n_actions), _BRANCHES), len(frames))
         z, weights = z.repeat_interleave(self.n_actions * _BRANCHES, dim=0), self.imagination.draw_weights(generator)
-        next_z, reward, p_terminated = predict(self.imagination, z, action, weights, generator)
+        next_z, reward, p_terminated = _predict(self.imagination, z, action, weights, generator)
         read = self.perception.encoder.read_macrostate(next_z)
         return ExpectedOutcomes(
             macrostates=read.reshape(*shape, -1),
@@ -216,3 +209,16 @@ make = partial(build, ImaginingAgent, filtered=False)
 """The ``imagination`` agent: algorithm 1 without the filter."""
 make_uncertainty = partial(build, ImaginingAgent, filtered=True)
 """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
+
+
+def _predict(
+    imagination: Imagination, z: Tensor, action: NDArray[np.int64], weights: Weights, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""
+    model, settings = imagination.model, imagination.settings
+    samples = model.members * (1 if weights.dynamics is None else settings.weight_samples)
+    size = max(1, _PREDICTIONS // samples)
+    parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)
+    steps = [imagination.step(*part, weights, generator) for part in parts]
+    next_z, rewards, ends = zip(*((step.next_z, step.reward, step.p_terminated) for step in steps), strict=True)
+    return torch.cat(next_z), torch.cat(rewards), torch.cat(ends)

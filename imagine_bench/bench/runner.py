@@ -20,14 +20,13 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder
-from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, Futures, OpenLoop, RunResult
+from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, OpenLoop, RunResult
 
 
 class AtBudget(TypedDict, total=False):
     """What observers measure at a budget: fields of :class:`.Checkpoint`."""
 
     open_loop: OpenLoop
-    futures: Futures
     beliefs: Beliefs
 
 
@@ -117,6 +116,5 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
         eval_cpu_s=test.cpu_s + time.process_time() - start_s,
         diagnostics=test.diagnostics,
         open_loop=measured.get("open_loop"),
-        futures=measured.get("futures"),
         beliefs=measured.get("beliefs"),
     )

@@ -6,10 +6,9 @@ from contextlib import closing
 
 from imagine_bench.bench.run_state import Run, make_env
 from imagine_bench.bench.runner import AtBudget, AtEnd, RunObserver
-from imagine_bench.capabilities import FutureSampler, Imaginer
+from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import Frame
 from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
-from imagine_bench.judge.futures import imagined_futures
 from imagine_bench.judge.imagination_quality import (
     OPEN_LOOP_DEPTH,
     OpenLoopStart,
@@ -45,26 +44,6 @@ class OpenLoopObserver(RunObserver):
             return {}
         run.tell("imagining", at_once=True)
         return {"open_loop": open_loop(run.agent, self._starts, SeedTree(run.spec.seed).child("open_loop", budget))}
-
-
-class FuturesObserver(RunObserver):
-    """Compares sampled futures with those that the rules allow at every budget."""
-
-    def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """``futures`` of an agent that can sample them."""
-        protocol = run.protocol
-        if not isinstance(run.agent, FutureSampler) or protocol.sampled_futures == 0:
-            return {}
-        run.tell("imagining", at_once=True)
-        found = imagined_futures(
-            run.agent,
-            run.task,
-            samples=protocol.sampled_futures,
-            appearance=protocol.appearance_in_tests,
-            seeds=SeedTree(run.spec.seed).child("futures", budget),
-            purpose=evaluation_split(run.spec.seed),
-        )
-        return {"futures": found}
 
 
 class BeliefsObserver(RunObserver):

@@ -19,6 +19,7 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
+from imagine_bench.judge.models.outcomes import total_variation
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import Beliefs
@@ -228,6 +230,32 @@ def true_model(rules: Rules) -> Model:
                 p_continues[row, action, branch] = outcome.probability * (not outcome.terminated)
                 reward[row, action] += outcome.probability * outcome.reward
     return Model(following, p_continues, reward)
+
+
+def expected_rightly(rules: Rules, held: Beliefs) -> float:
+    """How much of what the rules have come of a macro-action a model expects too, in [0, 1]; NaN without a model.
+
+    One less the total variation of where the episode goes on, or that it ends: the mean over every macro-action in
+    every macrostate that is not terminal.
+    """
+    if held.model is None:
+        return math.nan
+    states = states_of(rules)
+    own, shares = np.moveaxis(held.model.macrostates, 2, 0), np.moveaxis(held.model.p_continues, 2, 0)
+    found = []
+    for row, state in enumerate(states):
+        for action in range(0 if rules.is_terminal(state) else rules.n_actions):
+            exact: dict[State, float] = {}
+            for outcome in rules.outcomes(state, action):
+                after = () if outcome.terminated else outcome.macrostate
+                exact[after] = exact.get(after, 0.0) + outcome.probability
+            expected: dict[State, float] = {(): 1.0 - float(shares[:, row, action].sum())}
+            for after, share in zip(
+                map(tuple, own[:, row, action].tolist()), shares[:, row, action].tolist(), strict=True
+            ):
+                expected[after] = expected.get(after, 0.0) + share
+            found.append(1.0 - total_variation(exact, expected))
+    return float(np.mean(found))
 
 
 def _mixed(where: NDArray[np.bool_], one: Model, other: Model) -> Model:

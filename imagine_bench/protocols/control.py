@@ -53,9 +53,9 @@ class Protocol(ProtocolData):
     appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
-    #: Futures imagined from each macrostate of play and macro-action, and compared with the rules' distribution at each
-    #: budget; 0 asks for none.
-    sampled_futures: int = 16
+    sampled_futures: int = (
+        0  #: What benches of before 2026-11-25 asked models for, of which "judge" asks now; no longer read
+    )
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
     #: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
     encoder: str | None = None
@@ -203,7 +203,7 @@ def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
         "hyperparameters": "minimal", "seeds": (0,), "budgets": (10, 20), "evaluation_episodes": 20,
-        "open_loop_starts": 20, "sampled_futures": 4, "recorded_episodes": 2,
+        "open_loop_starts": 20, "recorded_episodes": 2,
     },
     "quick": {"agents": (*_ALL_AGENTS, "factored")},
     "thesis": {
@@ -221,7 +221,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "queries": {
         "agents": ("factored",), "seeds": tuple(range(5)), "budgets": (10, 20, 30, 40, 60, 80, 100),
         "evaluation_episodes": 100, "execution": "kinematic",
-        "open_loop_starts": 0, "sampled_futures": 0, "recorded_episodes": 0,
+        "open_loop_starts": 0, "recorded_episodes": 0,
     },
 }  # fmt: skip
 """What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the

@@ -75,7 +75,7 @@ TASK_TYPES = {
 
 OBSERVERS = tuple(
     f"imagine_bench.cli.observers:{name}"
-    for name in ("OpenLoopObserver", "FuturesObserver", "BeliefsObserver", "ExamplesObserver", "RecordingObserver")
+    for name in ("OpenLoopObserver", "BeliefsObserver", "ExamplesObserver", "RecordingObserver")
 )
 """What looks at every control run, in this order, each the ``"module:attr"`` of a
 :class:`.bench.runner.RunObserver` without arguments."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
-from imagine_bench.store.results import BenchResult, Checkpoint, Futures, OpenLoop, RunResult
+from imagine_bench.store.results import BenchResult, Checkpoint, OpenLoop, RunResult
 
 Value = TypeVar("Value")
 BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
@@ -87,28 +87,6 @@ class Price:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuturesSummary:
-    """Sampled futures against the rules, means over all pairs of macrostate and macro-action and over seeds.
-
-    Arrays have shape (D,), index d for macro-action d + 1, at the last budget.
-    """
-
-    pairs: int  # macrostates of play times macro-actions
-    samples: int  # futures of each pair
-    total_variation: np.ndarray  # distance of imagined and exact distributions of macrostates
-    # the same over the pairs after which several macrostates are possible; the others dilute it
-    where_random: np.ndarray
-    # the same where the episode goes on until this macro-action, weighted by how likely that is
-    while_alive: np.ndarray
-    floor: np.ndarray  # what as many samples of the exact distribution would show (sampling noise)
-    missed: np.ndarray  # possible outcomes that are not imagined, all pairs together
-    hallucinated: np.ndarray  # imagined outcomes that are impossible, all pairs together
-    reward_error: np.ndarray  # absolute error of the expected reward
-    termination_error: np.ndarray  # absolute error of the probability that the episode is over
-    by_budget: dict[int, tuple[float, float]]  # total variation at the first and at the last depth, by real episodes
-
-
-@dataclass(frozen=True, kw_only=True)
 class ReportData:
     """What the report says in numbers; dictionaries are keyed by agent, inner ones by budget (real episodes).
 
@@ -127,7 +105,6 @@ class ReportData:
     comparisons: dict[str, dict[int, Comparison]]
     acceptance: dict[str, dict[int, float]]
     open_loop: dict[str, OpenLoop]
-    futures: dict[str, FuturesSummary]
     reached: dict[str, tuple[int | None, ...]]
     areas: dict[str, dict[int, statistics.Estimate]]
     # mean macro-actions of solved tests beyond the fewest that the rules allow from their starts; NaN where not kept
@@ -183,7 +160,6 @@ def collect(result: BenchResult) -> ReportData:
         comparisons=_comparisons(result, thesis_gains),
         acceptance={agent: rates for agent in agents if (rates := _acceptance(result.of(agent)))},
         open_loop={agent: loop for agent, loop in open_loops.items() if loop is not None},
-        futures={agent: summary for agent in agents if is_here and (summary := _futures(result.of(agent)))},
         reached={agent: _reached(result, agent, spec.success_threshold) for agent in learners},
         areas={agent: _areas(result, agent, facts.chance_level) for agent in learners},
         excess={agent: _excess(result.of(agent), spec) for agent in agents} if is_here else {},
@@ -224,31 +200,6 @@ def summary_csv(data: ReportData) -> str:
             row.append("" if math.isnan(excess) else excess)
             rows.append(row + list(data.areas[agent][budget][:3] if agent in data.areas else [""] * 3))
     return csv_text(rows)
-
-
-def futures_csv(data: ReportData) -> str:
-    """One row an agent, seed, budget, depth, macrostate and macro-action of the futures that were sampled."""
-    spec, errors = data.spec, ("reward_error", "termination_error")
-    outcomes = ("total_variation", "sampling_noise_floor", "missed", "hallucinated")
-    measures = ("samples", *outcomes, *errors, "survival_probability")
-    rows: list[list[object]] = [["agent", "seed", "episodes", "depth", *spec.macrostate_names, "action", *measures]]
-    for run, checkpoint in data.result.rows:
-        if checkpoint.futures is not None and run.agent in data.futures:
-            head = [run.agent, run.seed, checkpoint.episodes]
-            rows += [[*head, *row] for row in _futures_rows(checkpoint.futures, spec, measures)]
-    return csv_text(rows)
-
-
-def _futures_rows(futures: Futures, spec: TaskSpec, measures: tuple[str, ...]) -> Iterator[list[object]]:
-    for depth, pair in np.ndindex(*futures.total_variation.shape):
-        shape = futures.total_variation.shape
-        numbers = [np.broadcast_to(getattr(futures, name), shape)[depth, pair] for name in measures]
-        yield [
-            depth + 1,
-            *spec.value_names(futures.macrostates[pair]),
-            spec.action_names[int(futures.actions[pair])],
-            *(f"{number:.6g}" for number in numbers),
-        ]
 
 
 def _scores(result: BenchResult, agent: str, thesis: dict[int, tuple[float, float]]) -> dict[int, Score]:
@@ -336,39 +287,6 @@ def _open_loop(runs: tuple[RunResult, ...]) -> OpenLoop | None:
     names = [name for name in OpenLoop.__dataclass_fields__ if name != "count"]
     means = {name: _nan_mean(np.stack([getattr(loop, name) for loop in found])) for name in names}
     return OpenLoop(count=np.sum([loop.count for loop in found], axis=0), **means)
-
-
-def _futures(runs: tuple[RunResult, ...]) -> FuturesSummary | None:
-    """Means over runs; None where no run was asked for futures."""
-    last = [run.checkpoints[-1].futures for run in runs]
-    found = [each for each in last if each is not None]
-    if not found:
-        return None
-
-    def mean(name: str) -> np.ndarray:
-        return np.mean([getattr(each, name).mean(axis=1) for each in found], axis=0)  # [D]
-
-    def total(name: str) -> np.ndarray:
-        return np.mean([getattr(each, name).sum(axis=1) for each in found], axis=0)  # [D]
-
-    weight = np.stack([each.survival_probability for each in found])  # [runs, D, P]
-    distance = np.stack([each.total_variation for each in found])
-    # No sample of a certain outcome can deviate from it.
-    uncertain = np.stack([each.sampling_noise_floor for each in found]) > 0.0
-    by_budget = _by_budget(runs, lambda row: [row.futures.total_variation[[0, -1]].mean(axis=1)] if row.futures else [])
-    return FuturesSummary(
-        pairs=len(found[0].actions),
-        samples=int(found[0].samples),
-        total_variation=mean("total_variation"),
-        where_random=_nan_mean(np.where(uncertain, distance, np.nan).swapaxes(1, 2).reshape(-1, distance.shape[1])),
-        while_alive=(weight * distance).sum(axis=(0, 2)) / np.maximum(weight.sum(axis=(0, 2)), 1e-12),
-        floor=mean("sampling_noise_floor"),
-        missed=total("missed"),
-        hallucinated=total("hallucinated"),
-        reward_error=mean("reward_error"),
-        termination_error=mean("termination_error"),
-        by_budget={budget: tuple(np.mean(pairs, axis=0).tolist()) for budget, pairs in by_budget.items() if pairs},
-    )
 
 
 def _nan_mean(table: np.ndarray) -> np.ndarray:

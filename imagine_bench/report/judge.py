@@ -19,8 +19,8 @@ from imagine_bench import registry
 from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
-from imagine_bench.judge.futures import sampling_noise_floor
 from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
+from imagine_bench.judge.models.outcomes import sampling_noise_floor
 from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
 from imagine_bench.judge.models.trained import is_run, model_entry

@@ -10,7 +10,7 @@ from typing import Any
 import jinja2
 
 from imagine_bench.report import plots, text
-from imagine_bench.report.data import ReportData, collect, futures_csv, open_loop_csv, summary_csv
+from imagine_bench.report.data import ReportData, collect, open_loop_csv, summary_csv
 from imagine_bench.report.sections import Page, Section, causes, certificate, imagination, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
@@ -35,8 +35,6 @@ def report_page(result: BenchResult) -> Page:
     files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if data.open_loop:
         files["open_loop.csv"] = open_loop_csv(result)
-    if data.futures:
-        files["futures.csv"] = futures_csv(data)
     protocol, agents = result.protocol, result.protocol.agents
     return Page(
         title=f"{data.spec.title}: does imagination save real experience?",

@@ -45,24 +45,6 @@ class OpenLoop:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Futures:
-    """Sampled futures against the exact ones, from every macrostate and macro-action: P pairs, depths 1 to D."""
-
-    macrostates: NDArray[np.int64]  #: Where each begins. Shape (P, M).
-    actions: NDArray[np.int64]  #: Its first macro-action. Shape (P,).
-    samples: NDArray[np.int64]  #: Futures of each pair. Shape ().
-    total_variation: NDArray[np.float64]  #: Distance of the distributions of macrostates, in [0, 1]. Shape (D, P).
-    #: Its expectation for that many samples of the exact distribution itself. Shape (D, P).
-    sampling_noise_floor: NDArray[np.float64]
-    missed: NDArray[np.float64]  #: Possible outcomes that are not imagined. Shape (D, P).
-    hallucinated: NDArray[np.float64]  #: Imagined outcomes that are impossible. Shape (D, P).
-    reward_error: NDArray[np.float64]  #: Absolute error of the expected reward of this macro-action. Shape (D, P).
-    termination_error: NDArray[np.float64]  #: Absolute error of the probability that the episode is over. Shape (D, P).
-    #: Exact probability that the episode went on until this macro-action. Shape (D, P).
-    survival_probability: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
 class ComparedRollout:
     """An imagined rollout beside what the real environment shows for the same start and actions."""
 
@@ -126,7 +108,6 @@ class Checkpoint:
     #: The agent's own means since the previous checkpoint.
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
-    futures: Futures | None = None  #: Sampled futures against the rules, for agents that can be asked for many
     #: What the agent does and expects everywhere, for the causes of its failures; None for agents that do not learn,
     #: for tasks of too many macrostates, and in results of before 2026-11-24.
     beliefs: Beliefs | None = field(default=None, compare=False)

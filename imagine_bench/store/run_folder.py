@@ -29,7 +29,7 @@ FORMAT = "imagine_bench run 2"
 _DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
 _MEASURED, _IMAGINED, _TRAINING, _EPISODES = "measured.npz", "imagined.npz", "training.npz", "episodes.npz"
 _DIAGNOSTIC = "diagnostics/"
-_APART = ("diagnostics", "open_loop", "futures", "beliefs", "kept")
+_APART = ("diagnostics", "open_loop", "beliefs", "kept")
 """Fields of a row that have columns or a file of their own."""
 _KEPT = tuple(field.name for field in dataclasses.fields(KeptEpisodes))
 

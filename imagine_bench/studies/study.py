@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -22,10 +23,13 @@ from imagine_bench.appearance import appearance_name
 from imagine_bench.bench.bench import bench, plan
 from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
+from imagine_bench.interfaces import Rules
+from imagine_bench.judge.causes import expected_rightly
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, require_types
 from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import has_task
+from imagine_bench.registry import task as registered
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult, RunResult
@@ -115,8 +119,8 @@ class Line:
 
     variant: Variant  #: Which
     success: NDArray[np.float64]  #: Success shares. Shape (seeds, budgets).
-    #: Share of the futures one macro-action ahead that are imagined as the rules have them, over all macrostates and
-    #: macro-actions; NaN where none were sampled. Shape (seeds, budgets).
+    #: What the model holds rightly of one macro-action, :func:`.judge.causes.expected_rightly`; NaN where it cannot be
+    #: asked. Shape (seeds, budgets).
     imagined_right: NDArray[np.float64]
     train_cpu_s: float  #: Mean CPU seconds of training a run
     #: Against the variant it is compared with, one a budget; None where it is compared with nothing.
@@ -177,7 +181,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
         Line(
             variant=variant,
             success=success[variant.name],
-            imagined_right=_imagined_right(results[variant.name].of(variant.agent)),
+            imagined_right=_imagined_right(registered(task).rules, results[variant.name].of(variant.agent)),
             train_cpu_s=float(np.mean([run.checkpoints[-1].train_cpu_s for run in results[variant.name].runs])),
             difference=None if variant.against is None else _differences(study, variant, success),
             folder=results[variant.name].folder,
@@ -187,10 +191,10 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     )
 
 
-def _imagined_right(runs: Sequence[RunResult]) -> NDArray[np.float64]:
-    futures = [[checkpoint.futures for checkpoint in run.checkpoints] for run in runs]
+def _imagined_right(rules: Rules, runs: Sequence[RunResult]) -> NDArray[np.float64]:
     return np.array([
-        [np.nan if each is None else 1.0 - each.total_variation[0].mean() for each in row] for row in futures
+        [math.nan if row.beliefs is None else expected_rightly(rules, row.beliefs) for row in run.checkpoints]
+        for run in runs
     ])  # fmt: skip
 
 

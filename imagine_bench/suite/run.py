@@ -67,7 +67,7 @@ def plan_level(suite: Suite, level: Level, agent: str) -> tuple[tuple[Protocol, 
     shared: dict[str, Any] = {
         "agents": (agent,), "seeds": suite.seeds, "budgets": (level.episodes,), "execution": suite.execution,
         "evaluation_episodes": suite.evaluation_episodes, "hyperparameters": suite.hyperparameters,
-        "open_loop_starts": 0, "sampled_futures": 0, "recorded_episodes": 0, **level.protocol,
+        "open_loop_starts": 0, "recorded_episodes": 0, **level.protocol,
     }  # fmt: skip
     try:
         whole, paths = plan(level.task, "quick", **shared)

@@ -36,7 +36,7 @@ def standard_sets(root: Path, format: str, episodes: int) -> Iterator[Path]:
 
 def _medium(task: str, root: Path) -> str:
     """The folder of a run whose DQN is half trained."""
-    few = {"evaluation_episodes": 100, "recorded_episodes": 0, "open_loop_starts": 0, "sampled_futures": 0}
+    few = {"evaluation_episodes": 100, "recorded_episodes": 0, "open_loop_starts": 0}
     wanted, paths = plan(
         task, "quick", agents=("dqn",), seeds=(TUNING_SEEDS,), budgets=(MEDIUM[task],), execution=_EXECUTION, **few
     )

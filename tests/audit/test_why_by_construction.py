@@ -31,7 +31,7 @@ def finished(root: Path, agent: str, task: str, **changes: Any) -> RunResult:
     """The run of a bench of one agent."""
     few: dict[str, Any] = {
         "agents": (agent,), "seeds": (0,), "budgets": (150,), "evaluation_episodes": 40, "execution": "kinematic",
-        "open_loop_starts": 0, "recorded_episodes": 0, "sampled_futures": 0,
+        "open_loop_starts": 0, "recorded_episodes": 0,
     }  # fmt: skip
     Sound.task = task
     folder = bench(protocol(task, "smoke", **{**few, **changes}), {}, root=root, launcher=Inline()).folder

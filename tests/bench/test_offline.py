@@ -27,7 +27,7 @@ from imagine_bench.seeding import episode_seed
 from imagine_bench.store.results import RunResult
 
 _FEW: dict[str, Any] = {
-    "seeds": (0,), "evaluation_episodes": 2, "execution": "kinematic", "open_loop_starts": 0, "sampled_futures": 0,
+    "seeds": (0,), "evaluation_episodes": 2, "execution": "kinematic", "open_loop_starts": 0,
     "recorded_episodes": 0, "appearance": "mild",
 }  # fmt: skip
 

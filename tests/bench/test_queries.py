@@ -271,9 +271,7 @@ def test_a_killed_and_taught_learner_ends_in_the_same_bits(
     kind = registry.agent_entry(agent).encoder_kind
     encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
     overrides = (("imagination.start_episode", 3),) if agent == "imagination" else ()
-    wanted = small(
-        agents=(agent,), budgets=(4, 7), evaluation_episodes=2, sampled_futures=0, overrides=overrides, **changes
-    )
+    wanted = small(agents=(agent,), budgets=(4, 7), evaluation_episodes=2, overrides=overrides, **changes)
 
     def go(folder: Path, every_s: float) -> RunResult:
         spec = RunSpec(protocol=wanted, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)

@@ -16,16 +16,21 @@ import numpy as np
 import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
+from numpy.typing import NDArray
 from small_runs import do
 
 from imagine_bench import registry
 from imagine_bench.bench import run_state
 from imagine_bench.bench.control import run_observed
 from imagine_bench.bench.launchers.jobs import Failure, Job
+from imagine_bench.capabilities import ExpectedOutcomes
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.judge.causes import true_model
 from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
+from imagine_bench.rules import states_of
+from imagine_bench.store.results import Beliefs
 from imagine_bench.studies.catalogue import STUDIES
 from imagine_bench.studies.study import BASE, Line, Study, Variant, _imagined_right, load_study, run_study
 
@@ -143,7 +148,7 @@ name = "other looks"
 factor = "appearance"
 agent = "table"
 against = "table"
-world = { test_appearance = "strong", sampled_futures = 0 }
+world = { test_appearance = "strong", open_loop_starts = 5 }
 
 [[variants]]
 name = "slippery"
@@ -245,13 +250,29 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
 
 
 def test_what_is_imagined_right_is_what_the_rules_have_too() -> None:
-    def run(*distances: list[list[float]] | None) -> Any:
-        given = [None if each is None else SimpleNamespace(total_variation=np.array(each)) for each in distances]
-        return SimpleNamespace(checkpoints=[SimpleNamespace(futures=futures) for futures in given])
+    task = registry.task("arrow_puzzle")
+    states, actions = states_of(task.rules), task.n_actions
+    truth = true_model(task.rules)
+    alive = [row for row, state in enumerate(states) if not task.rules.is_terminal(state)]
+    macrostates = np.array(states)[truth.following]
+    half = truth.p_continues.copy()
+    half[alive[: len(alive) // 2]] = 0.0  # of these it expects that every macro-action ends the episode
+    ends = truth.p_continues.sum(axis=2) == 0.0
 
-    one_ahead_then_two = [[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]]
-    right = _imagined_right([run(None, one_ahead_then_two), run(one_ahead_then_two, None)])
-    assert np.array_equal(right, [[np.nan, 0.5], [0.5, np.nan]], equal_nan=True)
+    def beliefs(shares: NDArray[np.float64]) -> Beliefs:
+        model = ExpectedOutcomes(macrostates=macrostates, p_continues=shares, reward=truth.reward)
+        return Beliefs(action=np.zeros(len(states), dtype=np.int16), model=model)
+
+    def run(*held: Beliefs | None) -> Any:
+        return SimpleNamespace(checkpoints=[SimpleNamespace(beliefs=each) for each in held])
+
+    runs = [run(None, beliefs(truth.p_continues)), run(beliefs(half), beliefs(np.zeros_like(half)))]
+    found = _imagined_right(task.rules, runs)
+    right = ends[alive].copy()
+    assert 0.0 < right.mean() < 1.0
+    right[len(alive) // 2 :] = True
+    expected = [[np.nan, 1.0], [right.mean(), ends[alive].mean()]]
+    assert right.shape == (len(alive), actions) and np.allclose(found, expected, equal_nan=True)
 
 
 UNSTUDIED = {

@@ -96,7 +96,7 @@ def test_all_are_listed_and_named_in_results(capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize("agent", ["dqn", pytest.param("imagination", marks=pytest.mark.slow)])
 def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str], agent: str) -> None:
     few = {"budgets": (2,), "evaluation_episodes": 2, "execution": "kinematic"}
-    few |= {"open_loop_starts": 2, "sampled_futures": 0, "recorded_episodes": 0}
+    few |= {"open_loop_starts": 2, "recorded_episodes": 0}
     wanted, paths = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)
     assert "The scale and the probe of tiles for arrow_puzzle at clean are made" in capsys.readouterr().out
     again, _ = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Rules, State, TaskSpec
 from imagine_bench.judge.calibration import auroc
-from imagine_bench.judge.futures import hallucinated_modes, missed_modes, total_variation
 from imagine_bench.judge.models.asking import Answers, Distribution
+from imagine_bench.judge.models.outcomes import hallucinated_modes, missed_modes, total_variation
 from imagine_bench.judge.models.truth import Questions, expected_reward, p_ended, shares
 from imagine_bench.judge.models.values import (
     exact_machine,

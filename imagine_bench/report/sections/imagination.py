@@ -37,16 +37,6 @@ _LOOP_ROWS = (
     ("aleatoric", "aleatoric", "{:.3g}"),
     ("modal", "modal", "{:.3g}"),
 )
-_FUTURES_ROWS = (
-    ("total_variation", "total variation", "{:.3g}"),
-    ("floor", "sampling noise", "{:.3g}"),
-    ("where_random", "total variation where several are possible", "{:.3g}"),
-    ("while_alive", "total variation while the episode goes on", "{:.3g}"),
-    ("missed", "missed outcomes, all starts", "{:.3g}"),
-    ("hallucinated", "hallucinated outcomes, all starts", "{:.3g}"),
-    ("reward_error", "error of the expected reward", "{:.3g}"),
-    ("termination_error", "error of P(episode over)", "{:.3g}"),
-)
 _CARD_NAMES = {
     "code_sizes": "values of each factor",
     "cpu_s": "CPU seconds",
@@ -75,8 +65,6 @@ def sections(data: ReportData) -> Iterator[Section]:
         yield _acceptance(data)
     if data.open_loop:
         yield _open_loop(data)
-    if data.futures:
-        yield _futures(data)
     is_here = bool(data.spec.action_names)
     if is_here and (sheets := list(_sampled_rollouts(data))):
         yield Section(
@@ -145,32 +133,6 @@ def _open_loop(data: ReportData) -> Section:
                 folded=f"In numbers: {agent_words(agent).title}" if deep else "",
             )
             for agent, loop in data.open_loop.items()
-        ],
-    )  # fmt: skip
-
-
-def _futures(data: ReportData) -> Section:
-    first = next(iter(data.futures.values()))
-    alt = "Imagined against exact distributions of outcomes: total variation, missed and hallucinated outcomes."
-    caption = (
-        f"Means over all starts and over seeds, after {data.budgets[-1]:,} real episodes but in the upper right panel. "
-        "Dashed gray: as many samples of the exact distribution itself. Every start by itself: futures.csv."
-    )
-    figure = plots.image("futures", lambda: plots.futures_figure(data), alt=alt, caption=caption, svg=True, dpi=180)
-    return Section(
-        title="Is the imagined distribution right?",
-        words=(
-            f"From each of the {first.pairs} pairs of a macrostate of play and a macro-action, {first.samples} futures "
-            "are sampled from the model, an optimal agent acting after the first macro-action on what it sees; the "
-            "rules give the exact distribution of the same. Total variation is 0 where the two are equal and 1 where "
-            "they share nothing. An outcome is missed if it happens at least one time in twenty and is imagined less "
-            "than a fifth as often; it is hallucinated if it is imagined at least one time in twenty and cannot "
-            "happen.",
-        ),
-        images=[figure],
-        tables=[
-            _by_depth("futures", agent, found, _FUTURES_ROWS, why="no start leads to several outcomes")
-            for agent, found in data.futures.items()
         ],
     )  # fmt: skip
 

@@ -1,0 +1,79 @@
+"""What the report shows of sampled rollouts, and only where there are any."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_results import bench_result, compared_rollout
+from PIL import Image
+
+from imagine_bench import registry
+from imagine_bench.judge.filmstrips import changes, sampled_filmstrips
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.report import write_report
+from imagine_bench.store.results import BenchResult, RunResult
+
+
+def with_chance(run: RunResult) -> RunResult:
+    rng = np.random.default_rng(run.seed)
+    if run.agent == "dqn":
+        return run
+    compared = compared_rollout(rng, depth=2)
+    states = np.array([[0, 1, 0, 2], [0, 0, 0, 2]])
+    inside = dataclasses.replace(compared.rollout, macrostates=states, actions=np.array([1, 1]))
+    compared = dataclasses.replace(compared, rollout=inside, start_macrostate=np.array([0, 0, 0, 1]))
+    return dataclasses.replace(run, imagined=(compared,), sampled_rollouts=(compared,) * 3)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
+    agents = ("dqn", "imagination_only")
+    protocol = Protocol(task="pick_place", preset="quick", agents=agents, seeds=(0, 1), budgets=(500, 1000))
+    plain = bench_result(tmp_path_factory.mktemp("bench"), protocol=protocol)
+    return dataclasses.replace(plain, runs=tuple(with_chance(run) for run in plain.runs))
+
+
+@pytest.fixture(scope="module")
+def folder(result: BenchResult) -> Path:
+    return write_report(result).parent
+
+
+def test_page_and_markdown_show_the_rollouts(result: BenchResult, folder: Path) -> None:
+    page, markdown = (folder / "index.html").read_text(), (folder / "report.md").read_text()
+    name = "sampled_rollouts_imagination_only.png"
+    with Image.open(folder / name) as picture:
+        assert picture.width > 300
+    assert name in markdown
+    assert "One start, several futures" in page
+
+
+def test_the_values_of_rollouts_are_not_clipped(result: BenchResult) -> None:
+    """Each value that changes is written in full: where all change, the image gets more lines."""
+    spec = registry.task("pick_place")
+    (compared,) = result.of("imagination_only")[0].imagined
+    few = sampled_filmstrips((compared,) * 2, spec)
+    start = np.array([0, 0, 0, 0])
+    other = np.array([len(values) - 1 for values in spec.macrostate_values])
+    rollout = dataclasses.replace(compared.rollout, macrostates=np.stack([other, start]))
+    many = sampled_filmstrips((dataclasses.replace(compared, start_macrostate=start, rollout=rollout),) * 2, spec)
+    words = textwrap.wrap(changes(start, other, spec), width=20)
+    assert len(words) > 4 and many.shape[0] > few.shape[0] and many.shape[1] == few.shape[1]
+    row = (many.shape[0] - 24) // 2
+    last_line = many[12 + row - 14 - 12 - 14 : 12 + row - 14, 150:]  # above the gap to the second row
+    assert (last_line != 255).any()
+
+
+def test_chapter_3_is_quoted_without_a_standard_deviation(folder: Path) -> None:
+    page = (folder / "index.html").read_text()
+    assert "<small>thesis 98.0</small>" in page
+    assert "<small>thesis 78.0</small>" in page
+    assert "mean of 10 runs, 100 test episodes each" in page
+
+
+def test_a_bench_without_chance_says_nothing_of_it(tmp_path: Path) -> None:
+    plain = write_report(bench_result(tmp_path)).parent
+    assert "several futures" not in (plain / "index.html").read_text()
