@@ -111,31 +111,6 @@ AGENTS: dict[str, AgentEntry] = {
         title="DQN, more updates",
         description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
     ),
-    "imagination_exact": AgentEntry(
-        make="imagine_bench.agents.controls.exact:make", privileged=True, title="imagination, exact model",
-        description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
-    ),
-    "imagination_exact_filter": AgentEntry(
-        make="imagine_bench.agents.controls.exact:make_filter", privileged=True, title="imagination, exact filter",
-        description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
-        "right by the rules.",
-    ),
-    "dqn_efficient": AgentEntry(
-        make="imagine_bench.agents.controls.efficient:make", title="DQN, data-efficient",
-        settings="imagine_bench.agents.controls.settings:EFFICIENT",
-        description="A control: the DQN with many updates, n-step targets and periodic resets, as SR-SPR and BBF.",
-    ),
-    "dqn_codes": AgentEntry(
-        make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
-        encoder_kind="codes", title="DQN (codes)",
-        description="A control: the DQN, which reads the discrete codes that factored sees in place of latents.",
-    ),
-    "dqn_swaps": AgentEntry(
-        make="imagine_bench.agents.controls.swaps:make", encoder_kind="codes", title="DQN (codes), swaps",
-        settings="imagine_bench.agents.controls.settings:SWAPPING",
-        description="A control: the same, also trained on real transitions that have untouched factors of others "
-        "(CoDA).",
-    ),
     "count_table": AgentEntry(
         make="imagine_bench.agents.tabular.count_table:make", encoder_kind="codes", settings=_COUNT_TABLE_SETTINGS,
         description="A control: counts what followed each action in each code of a frame, and plans by value "
@@ -146,21 +121,6 @@ AGENTS: dict[str, AgentEntry] = {
         settings=_COUNT_TABLE_SETTINGS, title="count table, directed",
         description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
     ),
-    "count_table_directed_macrostate": AgentEntry(
-        make="imagine_bench.agents.tabular.count_table:make_directed_macrostate", settings=_COUNT_TABLE_SETTINGS,
-        needs_encoder=False, privileged=True, encoder_kind="codes", title="count table, directed (true state)",
-        description=f"A control: the same R-max; its state is {_TRUE_STATE}.",
-    ),
-    **{
-        f"posterior_sampling{twin}": AgentEntry(
-            make=f"imagine_bench.agents.tabular.posterior_sampling:make{twin}", encoder_kind="codes",
-            settings="imagine_bench.agents.tabular.settings:POSTERIOR_SAMPLING", needs_encoder=not twin,
-            privileged=bool(twin), title="posterior sampling" + " (true state)" * bool(twin),
-            description="A control: a count table that follows, each episode, a model drawn from what it believes "
-            f"(PSRL); its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
-        )
-        for twin in ("", "_macrostate")
-    },
     **{
         f"{name}{twin}": AgentEntry(
             make=f"imagine_bench.agents.tabular.dyna_q:make_{name}{twin}", encoder_kind="codes",
@@ -196,6 +156,46 @@ AGENTS: dict[str, AgentEntry] = {
         title="SB3 PPO + imagination",
         description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
     ),
+    "imagination_exact": AgentEntry(
+        make="imagine_bench.agents.controls.exact:make", privileged=True, title="imagination, exact model",
+        description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
+    ),
+    "imagination_exact_filter": AgentEntry(
+        make="imagine_bench.agents.controls.exact:make_filter", privileged=True, title="imagination, exact filter",
+        description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
+        "right by the rules.",
+    ),
+    "dqn_efficient": AgentEntry(
+        make="imagine_bench.agents.controls.efficient:make", title="DQN, data-efficient",
+        settings="imagine_bench.agents.controls.settings:EFFICIENT",
+        description="A control: the DQN with many updates, n-step targets and periodic resets, as SR-SPR and BBF.",
+    ),
+    "dqn_codes": AgentEntry(
+        make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
+        encoder_kind="codes", title="DQN (codes)",
+        description="A control: the DQN, which reads the discrete codes that factored sees in place of latents.",
+    ),
+    "dqn_swaps": AgentEntry(
+        make="imagine_bench.agents.controls.swaps:make", encoder_kind="codes", title="DQN (codes), swaps",
+        settings="imagine_bench.agents.controls.settings:SWAPPING",
+        description="A control: the same, also trained on real transitions that have untouched factors of others "
+        "(CoDA).",
+    ),
+    "count_table_directed_macrostate": AgentEntry(
+        make="imagine_bench.agents.tabular.count_table:make_directed_macrostate", settings=_COUNT_TABLE_SETTINGS,
+        needs_encoder=False, privileged=True, encoder_kind="codes", title="count table, directed (true state)",
+        description=f"A control: the same R-max; its state is {_TRUE_STATE}.",
+    ),
+    **{
+        f"posterior_sampling{twin}": AgentEntry(
+            make=f"imagine_bench.agents.tabular.posterior_sampling:make{twin}", encoder_kind="codes",
+            settings="imagine_bench.agents.tabular.settings:POSTERIOR_SAMPLING", needs_encoder=not twin,
+            privileged=bool(twin), title="posterior sampling" + " (true state)" * bool(twin),
+            description="A control: a count table that follows, each episode, a model drawn from what it believes "
+            f"(PSRL); its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
+        )
+        for twin in ("", "_macrostate")
+    },
 }  # fmt: skip
 
 DEMONSTRATOR = "oracle"

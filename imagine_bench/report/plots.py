@@ -29,6 +29,8 @@ _COLORS = (
     "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
     "#44aa99", "#aa4499", "#117733", "#cc6677", "#7f5539", "#9aa600",
     "#4d9221", "#5b5ea6", "#c51b7d", "#5ab4ac", "#b35806", "#542788",
+    "#01665e", "#bf812d", "#762a83", "#7fbc41", "#2166ac", "#b2182b",
+    "#de77ae", "#35978f",
 )  # fmt: skip
 Value = TypeVar("Value")
 Failures = dict[str, dict[int, tuple[int, Counter[str]]]]
@@ -108,6 +110,41 @@ def success_figure(data: ReportData) -> Figure:
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
     last = {agent: 100.0 * scores[data.budgets[-1]].value for agent, scores in data.scores.items()}
     _end_labels(axes, last, _episodes_axis(axes, data))
+    return figure
+
+
+def ladder_figure(reached: Mapping[str, Sequence[int | None]], last: int, floor: float | None) -> Figure:
+    """Real episodes until the task is learned, a rung an agent and a point a seed, the quickest at the bottom.
+
+    Args:
+        reached: By agent, of every seed the test from which on it is solved; None where it never was.
+        last: Episodes of the last test: those that never solved it stand as triangles beyond it.
+        floor: Episodes of the information floor, or None where there is none.
+    """
+    beyond = 1.6 * last
+    found = {agent: [beyond if each is None else each for each in seeds] for agent, seeds in reached.items()}
+    rungs = sorted(found, key=lambda agent: (float(np.median(found[agent])), float(np.mean(found[agent]))))
+    figure = Figure(figsize=(9.2, 1.0 + 0.34 * len(rungs)), layout="constrained")
+    axes = figure.add_subplot()
+    for height, agent in enumerate(rungs):
+        middle = float(np.median(found[agent]))
+        axes.plot([floor or min(found[agent]), middle], [height] * 2, color=color(agent), alpha=0.35)
+        axes.plot([middle], [height], "|", color=color(agent), markersize=13, markeredgewidth=2.5)
+        for marker, never in (("o", False), (">", True)):
+            values = [each for each in found[agent] if (each == beyond) == never]
+            shifts = 0.24 * (np.arange(len(values)) - (len(values) - 1) / 2) / max(1, len(values) - 1)
+            axes.plot(values, height + shifts, marker, color=color(agent), markersize=4.5, linestyle="none")
+    if floor is not None:
+        axes.axvline(floor, **_REFERENCE_LINE)
+        axes.annotate(f"information floor, {floor:.0f}", (floor, len(rungs) - 0.45), fontsize=9, ha="center")
+    ticks = [each for each in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000) if each <= last]
+    axes.set_xscale("log")
+    axes.set_xticks([*ticks, beyond], [*(f"{each:,}" for each in ticks), "never"])
+    axes.minorticks_off()
+    axes.set_yticks(range(len(rungs)), [agent_words(agent).title for agent in rungs])
+    least = min(floor or beyond, *(min(seeds) for seeds in found.values()))
+    axes.set(xlim=(0.6 * least, 1.1 * beyond), ylim=(-0.6, len(rungs) - 0.1))
+    axes.set_xlabel("real training episodes (logarithmic)")
     return figure
 
 

@@ -259,7 +259,7 @@ def test_how_it_was_made_is_complete(result: BenchResult, folder: Path) -> None:
 
 def test_plots_take_the_pages_color_and_do_not_share_ids(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
-    assert text.count("<svg") == 4  # success, gain, acceptance, open loop
+    assert text.count("<svg") == 5  # success, ladder, gain, acceptance, open loop
     assert "currentColor" in text
     assert "#2b2b2f" not in text
     ids = re.findall(r'\bid="([^"]+)"', text)

@@ -263,8 +263,17 @@ def threshold(data: ReportData) -> Section:
         [agent_words(agent).title, lasting(seeds), ", ".join(DASH if s is None else f"{s:,}" for s in seeds)]
         for agent, seeds in data.reached.items()
     ]
+    known = data.result.certificate
+    floor = None if known is None or known.floor is None else known.floor.episodes
+    figure = plots.image(
+        "ladder", lambda: plots.ladder_figure(data.reached, data.budgets[-1], floor), svg=True, dpi=180,
+        alt=f"Real episodes until {asked} of tests are solved, one rung an agent.",
+        caption="Points: seeds; bars: medians; triangles: not by the last test."
+        + ("" if floor is None else " Dashed: what a learner needs that knows the factor graph, and nothing else."),
+    )  # fmt: skip
     return Section(
         title=f"Real episodes to {asked}",
+        images=(figure,),
         words=(
             f"The first tested budget from which on every test is solved to at least {asked}, this task's success "
             f"threshold. {DASH}: the last test is not.",
