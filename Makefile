@@ -11,7 +11,6 @@ takes_peers := $(takes_bench)
 takes_study := TASK VARIANTS LAUNCHER WORKERS ARGS
 takes_suite := EXPERIMENT AGENTS SEEDS LAUNCHER WORKERS ARGS
 takes_plan := TASK EXECUTION ENCODER ARGS
-takes_policy := TASK ENCODER ARGS
 takes_judge := TASK MODELS SEEDS APPEARANCE WORKERS ARGS
 takes_verify := TASK ARGS
 takes_why := TASK ENCODER ARGS
@@ -43,7 +42,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan policy judge verify why study suite view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan judge verify why study suite view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -63,9 +62,6 @@ peers: ready  ## Train a library's agents on TASK, with the budgets and tests of
 
 plan: ready  ## Let the best imagining agent of the newest bench plan from one frame and the arm do it blindly
 	@$(BIN)/imagine-bench plan $(options)
-
-policy: ready  ## Follow the policies of the newest bench's learners from every start by the rules
-	@$(BIN)/imagine-bench policy $(options)
 
 judge: ready  ## Judge world models against the exact truth of TASK; MODELS may name another package's
 	@$(BIN)/imagine-bench judge $(options)

@@ -204,35 +204,6 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
 
 
-Belief = dict[tuple[State, bool], float]  #: probability of each (macrostate, whether the episode ended there)
-
-
-def advance(rules: Rules, belief: Belief, action: int | None) -> tuple[Belief, float]:
-    """The belief after one more macro-action, and the reward expected of it; what has ended stays where it is.
-
-    ``action`` None is the optimal one in each macrostate.
-    """
-    after: Belief = {}
-    reward = 0.0
-    for (state, over), weight in belief.items():
-        if over:
-            after[state, True] = after.get((state, True), 0.0) + weight
-            continue
-        for outcome in rules.outcomes(state, rules.optimal_action(state) if action is None else action):
-            share, key = weight * outcome.probability, (outcome.macrostate, outcome.terminated)
-            after[key] = after.get(key, 0.0) + share
-            reward += share * outcome.reward
-    return after, reward
-
-
-def by_macrostate(belief: Belief) -> dict[State, float]:
-    """Probability of each macrostate, whether or not the episode ended there."""
-    shares: dict[State, float] = {}
-    for (state, _), share in belief.items():
-        shares[state] = shares.get(state, 0.0) + share
-    return shares
-
-
 def is_random(rules: Rules) -> bool:
     """Whether some macro-action may lead to one thing or another."""
     return any(

@@ -108,7 +108,7 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         (["study", "--task", "toy"], "No task 'toy'."),
         *(
             ([command, "a", "--task", "arrow_puzzle"], "Both a and --task arrow_puzzle were given; leave one of them")
-            for command in ("report", "plan", "policy", "view")
+            for command in ("report", "plan", "why", "view")
         ),
         (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
         (["report", "--task", "robot_ik", "--out", str(tmp_path)], "There is no such bench below"),

@@ -21,6 +21,8 @@ from .settings import DynamicsSettings
 
 _LARGEST_TABLE = 1 << 16
 """Parent sets whose table would have more rows are not considered."""
+_NEGLIGIBLE = 1e-12
+"""Structures of less posterior probability, for every action, are left out of predictions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +88,18 @@ class FactorDynamics:
         weight, prior = self.weights(), self.settings.concentration
         stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]  # [N, A, K]
         expected, seen, unknown = stay, stay * self._tried[:, None], np.zeros(stay.shape[:2])
-        for index, table in enumerate(self.tables):
-            counts = table.counts[:, table.row(codes)].transpose(1, 0, 2)  # [N, A, K]
-            total, own = counts.sum(axis=2, keepdims=True), weight[None, :, 1 + index, None]
+        for index in np.flatnonzero(weight[:, 1:].max(axis=0) > _NEGLIGIBLE).tolist():
+            table, own = self.tables[index], weight[:, 1 + index, None]
+            rows = table.row(codes)
+            if len(rows) > table.counts.shape[1]:  # whole tables are less work
+                counts, at = table.counts.transpose(1, 0, 2), rows
+            else:
+                counts, at = table.counts[:, rows].transpose(1, 0, 2), np.arange(len(rows))
+            total = counts.sum(axis=2, keepdims=True)
             known = total + prior * self.values
-            expected = expected + own * (counts + prior) / known
-            seen = seen + own * counts / np.maximum(total, 1.0)
-            unknown += (own * prior * self.values / known)[..., 0]
+            expected = expected + (own * (counts + prior) / known)[at]
+            seen = seen + (own * counts / np.maximum(total, 1.0))[at]
+            unknown += (own * prior * self.values / known)[at, :, 0]
         return FactorPrediction(expected, seen, unknown)
 
 

@@ -37,6 +37,9 @@ _ROUND = 0.05  # added to heights where gaps are compared by their ratio
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
+_TELLING, _NOISE = 20, 0.5  # in so many frames, the share of looks seen once beyond which a region is noise
+_RESTS = 0.5  # share of the steps in which a pixel of noise may change and yet show something else, too
+_SEEN = 3  # times that a value must have been seen to tell whether it varies freely
 _EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
 _ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)
 _NEIGHBOURS = (
@@ -88,7 +91,7 @@ def find(frames: Frame) -> list[Factor]:
     """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes."""
     images = relative(frames)
     shapes = contours(images)
-    parts = [part for mask in regions(images) if (part := _part(shapes, mask)) is not None]
+    parts = _parts(changes(images), shapes)
     factors: list[tuple[tuple[Part, ...], Codes]]
     factors = [((part,), part.read(shapes)[0][:, None]) for part in parts]
     while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
@@ -96,6 +99,21 @@ def find(frames: Frame) -> list[Factor]:
         (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
         factors[one] = ((*parts_1, *parts_2), np.concatenate([joint_1, joint_2], axis=1))
     return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
+
+
+def _parts(change: Mask, shapes: Images) -> list[Part]:
+    """Regions that have values; of one of which hardly a look is seen twice, those of its pixels that mostly rest."""
+    times, share = _CHANGES
+    often = change.sum(axis=0) >= max(times, share * len(change))
+    parts, noise = [], np.zeros_like(often)
+    for mask in regions(change, often):
+        part, singles = _part(shapes, mask)
+        noise |= mask & (singles > _NOISE)
+        parts += [part] if part is not None and singles <= _NOISE else []
+    if noise.any():
+        found = [_part(shapes, mask) for mask in regions(change, noise & (change.mean(axis=0) < _RESTS))]
+        parts += [part for part, singles in found if part is not None and singles <= _NOISE]
+    return parts
 
 
 def _numbers(joint: Codes) -> NDArray[np.int64]:
@@ -116,7 +134,10 @@ def bound(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
     """
     table = np.zeros((one.max() + 1, other.max() + 1))
     np.add.at(table, (one, other), 1.0)
-    expected = np.multiply.outer(table.sum(axis=1), table.sum(axis=0)) / len(one)
+    table = table[table.sum(axis=1) >= _SEEN][:, table.sum(axis=0) >= _SEEN]
+    if min(table.shape) < 2:
+        return False
+    expected = np.multiply.outer(table.sum(axis=1), table.sum(axis=0)) / table.sum()
     few = (table > 0).sum() < sum(table.shape)
     return bool(few and expected[table == 0].sum() >= _EXPECTED)
 
@@ -148,31 +169,34 @@ def _beyond(one: Images, other: Images) -> Images:
     return np.maximum(np.maximum(other - high, low - other), 0.0)
 
 
-def regions(images: Images) -> list[Mask]:
-    """Where successive images (N, 64, 64, 3) change: regions (64, 64), the largest first.
+def changes(images: Images) -> Mask:
+    """Where successive images (N, 64, 64, 3) differ, small holes closed. Shape (N - 1, 64, 64)."""
+    change = np.pad(changed(images[:-1], images[1:]), ((0, 0), (2, 2), (2, 2)))
+    return np.asarray(scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2])
+
+
+def regions(change: Mask, pixels: Mask) -> list[Mask]:
+    """Regions (64, 64) of ``pixels``, of which each changes at the same times (N, 64, 64), the largest first.
 
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does.
     """
-    change = changed(images[:-1], images[1:])
-    change = scipy.ndimage.binary_closing(np.pad(change, ((0, 0), (2, 2), (2, 2))), np.ones((1, 3, 3)))[:, 2:-2, 2:-2]
-    times, share = _CHANGES
-    often = change.sum(axis=0) >= max(times, share * len(change))
-    place = np.cumsum(often).reshape(often.shape) - 1
-    change = change[:, often].astype(np.float32)  # [N - 1, pixels]
+    place = np.cumsum(pixels).reshape(pixels.shape) - 1
+    change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
     alone, links = change.sum(axis=0), []
     for one, other in _NEIGHBOURS:
-        near = often[one] & often[other]
+        near = pixels[one] & pixels[other]
         rows, columns = place[one][near], place[other][near]
         both = (change[:, rows] * change[:, columns]).sum(axis=0)
-        links.append(np.stack([rows, columns])[:, both >= _TOGETHER * (alone[rows] + alone[columns] - both)])
+        together = both > np.maximum(_TOGETHER * (alone[rows] + alone[columns] - both), 0.5)  # once, or oftener
+        links.append(np.stack([rows, columns])[:, together])
     graph = scipy.sparse.coo_matrix(
         (np.ones(sum(link.shape[1] for link in links)), np.concatenate(links, axis=1)), shape=(len(alone), len(alone))
     )
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     size = np.bincount(label) if len(label) else np.zeros(0)
     order = [index for index in np.argsort(-size, kind="stable") if size[index] >= _LEAST_PX]
-    whole = np.full(often.shape, -1)
-    whole[often] = label
+    whole = np.full(pixels.shape, -1)
+    whole[pixels] = label
     return [whole == index for index in order]
 
 
@@ -200,8 +224,8 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
-def _part(shapes: Images, mask: Mask) -> Part | None:
-    """The part at a mask, or None where all of its crops are alike."""
+def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
+    """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
     flat = _FLAT * float(np.quantile((own**2).sum(axis=1), 0.9))
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
@@ -210,9 +234,10 @@ def _part(shapes: Images, mask: Mask) -> Part | None:
         values, reach = groups(np.minimum(apart, apart.T))
         rows = _exemplars(apart, values)
         part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
+        singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
         strange = np.setdiff1d(np.flatnonzero(~part.read(shapes)[1]), chosen)
-        if not len(strange) or len(chosen) > _COMPARED:
-            return part if part.values.max() > 0 else None
+        if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
+            return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])
 
 

@@ -58,18 +58,18 @@ class FactoredModel:
         factors = self.dynamics.predict(codes)
         chance, following = self._branches([factor.expected for factor in factors])
         shape = chance.shape
-        start = np.repeat(codes, shape[1] * shape[2], axis=0)
-        actions = np.tile(np.repeat(np.arange(shape[1]), shape[2]), shape[0])
-        outcomes, untested = self.outcomes.predict(start, actions, following.reshape(-1, following.shape[-1]))
-        reward = (outcomes * self.outcomes.rewards).sum(axis=1).reshape(shape)
-        ends = (outcomes * self.outcomes.ends).sum(axis=1).reshape(shape)
+        reward, ends, untested = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        count, action, branch = comes = np.nonzero(chance)
+        outcomes, untested[comes] = self.outcomes.predict(codes[count], action, following[count, action, branch])
+        reward[comes] = (outcomes * self.outcomes.rewards).sum(axis=1)
+        ends[comes] = (outcomes * self.outcomes.ends).sum(axis=1)
         known = np.prod([1.0 - factor.unknown for factor in factors], axis=0)  # [N, A]
         return Successors(
             following=following,
             p_continues=chance * (1.0 - ends),
             reward=(chance * reward).sum(axis=2),
             p_terminated=(chance * ends).sum(axis=2),
-            unknown=1.0 - known * (1.0 - (chance * untested.reshape(shape)).sum(axis=2)),
+            unknown=1.0 - known * (1.0 - (chance * untested).sum(axis=2)),
         )
 
     def sample(self, code: Code, action: int, rng: np.random.Generator) -> tuple[Code, float]:
@@ -94,11 +94,10 @@ class FactoredModel:
         for factor in factors:
             values = factor.shape[2]
             joint = (chance[..., :, None] * factor[:, :, None, :]).reshape(count, actions, -1)
-            value = np.broadcast_to(np.tile(np.arange(values), chance.shape[2])[:, None], (*joint.shape, 1))
-            codes = np.concatenate([np.repeat(codes, values, axis=2), value], axis=3)
             order = np.argsort(-joint, axis=2, kind="stable")[:, :, :most]
             chance = np.take_along_axis(joint, order, axis=2)
-            codes = np.take_along_axis(codes, order[..., None], axis=2)
+            before, value = np.divmod(order[..., None], values)
+            codes = np.concatenate([np.take_along_axis(codes, before, axis=2), value], axis=3)
         spare = most - chance.shape[2]
         chance = np.pad(chance, ((0, 0), (0, 0), (0, spare)))
         codes = np.pad(codes, ((0, 0), (0, 0), (0, spare), (0, 0)))

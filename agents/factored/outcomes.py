@@ -71,12 +71,23 @@ class Conjunctions:
 
     def active(self, codes: Codes, actions: NDArray[np.int64], following: Codes) -> NDArray[np.int64]:
         """Which conjunctions hold in transitions between codes (N, P) by actions (N,). Shape (N, templates)."""
-        columns = []
-        for template in self._templates:
-            source = codes if template.with_action else following
-            number = source[:, template.factors] @ template.strides
-            columns.append(template.first + (number * self._n_actions + actions if template.with_action else number))
-        return np.stack(columns, axis=1)
+        return np.concatenate([self.of_next(following), self.of_choice(codes, actions)], axis=1)
+
+    def of_next(self, following: Codes) -> NDArray[np.int64]:
+        """Those of them that are about the next code alone."""
+        return self._numbers([template for template in self._templates if not template.with_action], following, 1, 0)
+
+    def of_choice(self, codes: Codes, actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of them that are about the action and the code before it."""
+        chosen = [template for template in self._templates if template.with_action]
+        return self._numbers(chosen, codes, self._n_actions, actions)
+
+    @staticmethod
+    def _numbers(
+        templates: list[_Template], codes: Codes, n_actions: int, actions: NDArray[np.int64] | int
+    ) -> NDArray[np.int64]:
+        numbers = [each.first + codes[:, each.factors] @ each.strides * n_actions + actions for each in templates]
+        return np.stack(numbers, axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +117,8 @@ class OutcomeModel:
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: OutcomeSettings) -> None:
         self.settings = settings
         self.conjunctions = Conjunctions(sizes, n_actions, settings)
+        self._strides = strides(tuple(range(len(sizes))), sizes)
+        self._strides_of_choice = strides(tuple(range(len(sizes) + 1)), (*sizes, n_actions))
         self.outcomes: list[Outcome] = []
         self._priors: dict[Outcome, Floats] = {}
         self._counts: dict[tuple[Code, int, Code, int], int] = {}
@@ -163,13 +176,20 @@ class OutcomeModel:
         """Outcome probabilities (N, O) of N transitions, and the probability that something untested decides (N,)."""
         causes = self.causes
         assert causes is not None, "fit before predicting"
-        active, settings = self.conjunctions.active(codes, actions, following), self.settings
-        probability = _noisy_or(causes.strength, active, causes.default, leak=0.0)  # [O, N]
-        unexplained = probability[causes.default]
-        rate = causes.cause_rate[self.conjunctions.group[active]]
-        untested = rate * settings.pseudo_tests / (settings.pseudo_tests + causes.tests[active])
-        unknown = (1.0 - np.prod(1.0 - untested, axis=1)) * unexplained
-        return (probability / probability.sum(axis=0)).T, unknown
+        pseudo_tests = self.settings.pseudo_tests
+        known = 1.0 - causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)  # [J]
+        spared = np.log1p(-causes.strength)  # [O, J]
+        which, at = _distinct(following, self._strides)
+        how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
+        none, tested = np.zeros((len(spared), len(codes))), np.ones(len(codes))
+        for active, back in (
+            (self.conjunctions.of_next(following[which]), at),
+            (self.conjunctions.of_choice(codes[how], actions[how]), at_choice),
+        ):
+            none += spared[:, active].sum(axis=2)[:, back]
+            tested *= known[active].prod(axis=1)[back]
+        probability = _by_causes(np.exp(none), causes.default)  # [O, N]
+        return (probability / probability.sum(axis=0)).T, (1.0 - tested) * probability[causes.default]
 
     def _explain(self, evidence: _Evidence, default: int) -> Causes:
         """Causes of every outcome but ``default``."""
@@ -197,20 +217,22 @@ class OutcomeModel:
         rivals: int,
     ) -> tuple[Floats, Floats]:  # fmt: skip
         """Expectation maximisation for one outcome: strengths (J,) and how likely each group holds causes (G,)."""
-        settings, group = self.settings, self.conjunctions.group
+        settings, group = self.settings, self.conjunctions.group[met]
         positive = evidence.outcome == outcome
         weight = np.where(positive | (evidence.outcome == default), 1.0, settings.masked_weight) * evidence.count
-        tests = _spread(evidence.active, weight, len(group))
-        active, count = evidence.active[positive], evidence.count[positive]
+        tests = _spread(evidence.active, weight, len(met))[met]
+        active, count = (np.cumsum(met) - 1)[evidence.active[positive]], evidence.count[positive]  # among those met
         base = self.conjunctions.prior / rivals
-        prior, strength = base, self._prior(outcome, base)
+        prior, strength = base, self._prior(outcome, base)[met]
         for _ in range(settings.sweeps):
             responsibility = _responsibility(strength, active, count, settings.leak, len(group))
-            hits = settings.pseudo_tests * self._prior(outcome, prior) + responsibility
+            hits = settings.pseudo_tests * self._prior(outcome, prior)[met] + responsibility
             strength = np.minimum(hits / (settings.pseudo_tests + tests), _CERTAIN)
-            found = np.bincount(group[met], strength[met], len(base))
+            found = np.bincount(group, strength, len(base))
             prior = (settings.pseudo_conjunctions * base + found) / (settings.pseudo_conjunctions + tried)
-        return np.where(met, strength, self._prior(outcome, prior)), prior
+        whole = self._prior(outcome, prior)
+        whole[met] = strength
+        return whole, prior
 
     def _tests(self, strength: Floats, evidence: _Evidence, default: int) -> Floats:
         """Tests of each conjunction: where nothing happened, and where it was itself what decided. Shape (J,)."""
@@ -226,11 +248,21 @@ class OutcomeModel:
 
 def _noisy_or(strength: Floats, active: NDArray[np.int64], default: int, leak: float) -> Floats:
     """Activation of each outcome by noisy-OR; of the default, that no other is active. Shape (O, N)."""
-    inactive = (1.0 - leak) * np.exp(np.log1p(-strength)[:, active].sum(axis=2))  # [O, N]
+    return _by_causes((1.0 - leak) * np.exp(np.log1p(-strength)[:, active].sum(axis=2)), default)
+
+
+def _by_causes(inactive: Floats, default: int) -> Floats:
+    """Activation of each outcome, of which no cause is active with this probability (O, N); the default's is unused."""
     inactive[default] = 1.0
     probability = 1.0 - inactive
     probability[default] = inactive.prod(axis=0)
     return probability
+
+
+def _distinct(values: Codes, multipliers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where each distinct row (N, V) comes first, and which of these each row is: (U,) and (N,)."""
+    _, first, which = np.unique(values @ multipliers, return_index=True, return_inverse=True)
+    return first, which
 
 
 def _responsibility(strength: Floats, active: NDArray[np.int64], count: Floats, leak: float, size: int) -> Floats:

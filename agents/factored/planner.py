@@ -123,10 +123,15 @@ class Planner:
 
     def _rows(self, codes: Codes, follows: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[Code]]:
         """Rows of the codes (N, A, B, P) that follow, 0 elsewhere, and those among them that are new."""
-        rows = np.zeros(follows.shape, dtype=np.int64)
-        flat, new = codes.reshape(-1, codes.shape[-1]).tolist(), dict[Code, int]()
-        for position in np.flatnonzero(follows):
-            code = tuple(flat[position])
-            row = self._index.get(code)
-            rows.flat[position] = new.setdefault(code, len(self._index) + len(new)) if row is None else row
+        rows, new = np.zeros(follows.shape, dtype=np.int64), dict[Code, int]()
+        if follows.any():
+            found = codes[follows]
+            packed = np.ravel_multi_index(tuple(found.T), tuple(found.max(axis=0) + 1))
+            _, first, which = np.unique(packed, return_index=True, return_inverse=True)
+            numbers = np.empty(len(first), dtype=np.int64)
+            for index in np.argsort(first).tolist():
+                code = tuple(found[first[index]].tolist())
+                row = self._index.get(code)
+                numbers[index] = new.setdefault(code, len(self._index) + len(new)) if row is None else row
+            rows[follows] = numbers[which]
         return rows, list(new)

@@ -21,6 +21,11 @@ _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
 
 
+def weight_samples(settings: Settings) -> int:
+    """Different samples of each member's weights, 1 where nothing is dropped."""
+    return settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
+
+
 class EpistemicFilter:
     """Epistemic uncertainty above a threshold discards a transition, and the rollout discards what would follow.
 
@@ -31,7 +36,7 @@ class EpistemicFilter:
     """
 
     def __init__(self, settings: Settings, *, active: bool) -> None:
-        samples = settings.imagination.weight_samples if settings.model.dropout > 0.0 else 1
+        samples = weight_samples(settings)
         weighed = settings.imagination.confidence_scale is not None
         readers = {
             "The filter": (active, "choose the agent without the filter"),

@@ -22,6 +22,7 @@ from imagine_bench.world_models import UNCERTAINTIES, Imagined
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
+from ..imagination.filter import weight_samples
 from ..imagination.rollouts import Imagination
 from ..imagination.settings import HYPERPARAMETERS, Settings
 from ..imagination.uncertainty import decompose
@@ -38,12 +39,14 @@ class LatentModel:
 
     def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
         self.encoder, self.settings = encoder, settings
+        self.compares = settings.model.members * weight_samples(settings) > 1
+        """Whether there are several networks, whose disagreement is an epistemic uncertainty."""
         self.imagination = self.new_imagination(context)
 
     def new_imagination(self, context: AgentContext) -> Imagination:
         """What imagines, of which nothing is learned yet."""
         size, seeds, device = self.encoder.latent_size, context.seeds, self.encoder.device
-        return Imagination(size, context.n_actions, self.settings, filtered=True, seeds=seeds, device=device)
+        return Imagination(size, context.n_actions, self.settings, filtered=self.compares, seeds=seeds, device=device)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Encode every frame once and make :data:`UPDATES` updates."""
@@ -101,6 +104,8 @@ class LatentModel:
         found = {name: np.stack(each, axis=1) for name, each in steps.items()}
         for name in ("pictures", "rewards", "p_ended"):
             found[name] = found[name].reshape(rows, samples, *found[name].shape[1:])
+        if not self.compares:
+            del found["epistemic"], found["accepted"]  # not offered, which is another thing than 0
         return Imagined(**found)
 
     def parameters(self) -> int:
@@ -133,5 +138,5 @@ def make_gaussian(context: AgentContext) -> LatentModel:
 
 
 def make_thesis(context: AgentContext) -> LatentModel:
-    """At the settings that the thesis prints."""
+    """At the settings that the thesis prints; those of chapter 3 have one network, and so no epistemic uncertainty."""
     return _make(replace(context, hyperparameters="published"), {})

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from imagine_bench import registry
 from imagine_bench.bench.evaluation import Env
+from imagine_bench.bench.progress import counted
 from imagine_bench.bench.run_state import make_env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.judge.causes import Attribution, FailedEpisode, frames_to_ask_with, misread
-from imagine_bench.report.analysis import Analysis, Measured, analyse, chosen, markdown
+from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.page import write_report
 from imagine_bench.report.sections.causes import HEAD, causes_table, failures
+from imagine_bench.report.text import origin
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
+from imagine_bench.store.files import csv_text, lock, make_folder, write_bytes, write_json
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import KeptEpisodes
-from imagine_bench.store.trained import Trained
+from imagine_bench.store.trained import Trained, learners, load_trained, protocol_of_agents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,28 +40,51 @@ class Tested:
 
 
 def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
-    """Find the causes for every learner of a bench, and write its report anew: see :func:`.analysis.analyse`."""
+    """Find the causes for every learner of a bench, keep them in its folder, and write its report anew.
+
+    The bench is as in :func:`.analysis.chosen`, ``encoder`` as in :func:`imagine_bench.store.trained.load_trained`.
+    Returns what to print.
+
+    Raises:
+        ImagineBenchError: No bench, or none with an agent that can be taken up again.
+        BusyError: Another process is at the same.
+        SetupError: The bench's folder cannot be written.
+    """
     bench = chosen(folder, root, task)
-    said = analyse(WhyAnalysis, bench, root=root, task=None, encoder=encoder)
+    protocol, where = protocol_of_agents(bench), bench / "why"
+    spec, appearance, folders = registry.task(protocol.task), protocol.appearance_in_tests, learners(bench)
+    with lock(bench / ".why.lock", f"The folder {where}"):
+        analysis = WhyAnalysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
+        rows: list[Sequence[object]] = []
+        runs = []
+        for run in counted(folders, "runs", total=len(folders)):
+            trained = load_trained(run, encoder=encoder)
+            found, head = analysis.measure(trained), {"agent": trained.spec.agent, "seed": trained.spec.seed}
+            by_budget = {str(each.episodes): Counter(each.causes.values()) for each in found}
+            runs.append({**head, "episodes": trained.episodes, "failures": by_budget})
+            for each in found:  # a row a failure; and one a test without any, whose cause is empty
+                facts = (*head.values(), each.episodes, each.tests)
+                rows += [(*facts, test, cause) for test, cause in each.causes.items() or [("", "")]]
+        table, made = causes_table(failures(rows)), {**provenance(protocol.hash), "appearance": appearance}
+        text = "\n".join([*markdown(table.header, table.rows), "", table.remark])
+        make_folder(where)
+        write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
+        write_json(where / "summary.json", {**made, "frames": "kinematic", "runs": runs})
+        write_bytes(where / "why.md", f"# {spec.title}: why agents failed\n\n{text}\n\n{origin(made)}\n".encode())
     write_report(load_so_far(bench))
-    return said
+    return f"{spec.title}, {appearance}\n\n{text}\n\nAll rows:   {where / 'causes.csv'}"
 
 
-class WhyAnalysis(Analysis[tuple[Tested, ...]]):
+class WhyAnalysis:
     """The causes of every failure."""
 
-    name = "why"
-    heading = "why agents failed"
-    rows_file = "causes.csv"
-
     def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
-        super().__init__(spec, appearance=appearance, purpose=purpose)
         if spec.sight is not None:
             raise InvalidValueError(
                 f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
                 "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
             )
-        self._appearance, self._purpose = appearance, purpose
+        self.spec, self._appearance, self._purpose = spec, appearance, purpose
         self._states = np.array(states_of(spec.rules), dtype=np.int64)
 
     def measure(self, trained: Trained) -> tuple[Tested, ...]:
@@ -91,24 +117,6 @@ class WhyAnalysis(Analysis[tuple[Tested, ...]]):
                 causes = {test: attribution.cause(episodes.of(row.kept, test)) for test in failed}
                 found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
         return tuple(found)
-
-    def table(self, runs: Sequence[Measured[tuple[Tested, ...]]]) -> str:
-        """Shares of the failures by agent and budget, as Markdown."""
-        _, *rows = self.rows(runs)
-        found = causes_table(failures(rows))
-        return "\n".join([*markdown(found.header, found.rows), "", found.remark])
-
-    def rows(self, runs: Sequence[Measured[tuple[Tested, ...]]]) -> Iterable[Sequence[object]]:
-        """One row a failure; and one a test without any, whose cause is empty."""
-        yield HEAD
-        for run in runs:
-            for each in run.value:
-                head = [run.agent, run.seed, each.episodes, each.tests]
-                yield from ([*head, test, cause] for test, cause in each.causes.items() or [("", "")])
-
-    def summary(self, value: tuple[Tested, ...]) -> dict[str, Any]:
-        """Failures by budget and cause."""
-        return {"failures": {str(each.episodes): Counter(each.causes.values()) for each in value}}
 
 
 class _FailedEpisodes:

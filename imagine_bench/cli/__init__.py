@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from imagine_bench import __version__
-from imagine_bench.cli.analysis import Judge, Plan, Policy, Verify, Why
+from imagine_bench.cli.analysis import Judge, Plan, Verify, Why
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
 from imagine_bench.cli.suite import Suite
@@ -30,7 +30,6 @@ Command = (
     Bench
     | Report
     | Plan
-    | Policy
     | Judge
     | Verify
     | Why

@@ -129,8 +129,8 @@ class Verify:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfBench:
-    """Which bench a question is put to."""
+class Why:
+    """Give every failed test episode of a bench the one cause that it has; its report then shows them."""
 
     folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
     """A bench's folder."""
@@ -140,22 +140,6 @@ class _OfBench:
     """The encoder the runs saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Policy(_OfBench):
-    """Follow the policies of a bench, finished or not, from every start by the rules: what they miss, and how."""
-
-    def __call__(self) -> None:
-        """Ask and follow."""
-        from imagine_bench.report.policy import policy_report  # noqa: PLC0415 - as above
-
-        print(policy_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Why(_OfBench):
-    """Give every failed test episode of a bench the one cause that it has; its report then shows them."""
 
     def __call__(self) -> None:
         """Play, swap truth in, report."""

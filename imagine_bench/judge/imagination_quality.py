@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from imagine_bench.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
 from imagine_bench.judge.calibration import auroc
-from imagine_bench.rules import Belief, advance, by_macrostate, is_random
+from imagine_bench.judge.models.truth import advance, certainly, expected_reward, shares
+from imagine_bench.rules import is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
@@ -249,13 +250,13 @@ def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps:
 def _start(
     spec: TaskSpec, alive: Alive, start: State, frame: Frame, depth: int, rng: np.random.Generator
 ) -> OpenLoopStart:
-    belief: Belief = {(start, False): 1.0}
+    outcomes = certainly(start)
     actions, beliefs, rewards = [], [], []
     for step in range(depth):
-        actions.append(int(rng.choice(_safe_actions(spec, alive, by_macrostate(belief), depth - step))))
-        belief, reward = advance(spec.rules, belief, actions[-1])
-        beliefs.append(by_macrostate(belief))
-        rewards.append(reward)
+        actions.append(int(rng.choice(_safe_actions(spec, alive, shares(outcomes), depth - step))))
+        outcomes = advance(spec.rules, outcomes, actions[-1])
+        beliefs.append(shares(outcomes))
+        rewards.append(expected_reward(outcomes))
     return OpenLoopStart(
         frame=frame,
         actions=np.array(actions, dtype=np.int64),

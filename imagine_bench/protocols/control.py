@@ -53,9 +53,8 @@ class Protocol(ProtocolData):
     appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
-    sampled_futures: int = (
-        0  #: What benches of before 2026-11-25 asked models for, of which "judge" asks now; no longer read
-    )
+    #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
+    sampled_futures: int = 0
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
     #: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
     encoder: str | None = None

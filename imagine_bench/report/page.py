@@ -11,7 +11,7 @@ import jinja2
 
 from imagine_bench.report import plots, text
 from imagine_bench.report.data import ReportData, collect, open_loop_csv, summary_csv
-from imagine_bench.report.sections import Page, Section, causes, certificate, imagination, success
+from imagine_bench.report.sections import Page, Section, causes, certificate, imagination, policy, success
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, sweep, write_bytes
@@ -56,6 +56,7 @@ def _sections(data: ReportData) -> list[Section]:
     parts += [certificate.world(data.result.certificate)] if data.result.certificate is not None else []
     parts += [success.area(data)] if data.areas else []
     parts += [success.gain(data)] if data.comparisons else []
+    parts += [policy.policies(data, led)] if (led := policy.followed(data)) else []
     parts += [causes.causes(found)] if (found := causes.read_failures(data.result.folder)) else []
     parts += imagination.sections(data)
     parts += [success.threshold(data)] if data.reached else []

@@ -299,7 +299,7 @@ def test_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         (["plan", "--task", "arrow_puzle"], "No task 'arrow_puzle'"),
         (["plan", "--count", "0"], "Asked for 0 plans"),
         (["plan"], "There is no such bench below"),
-        (["policy"], "There is no such bench below"),
+        (["why"], "There is no such bench below"),
     ):
         assert main([*words, "--out", str(tmp_path / "runs")]) == 2
         (line,) = capsys.readouterr().err.splitlines()

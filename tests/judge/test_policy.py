@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import shutil
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from fake_agents import FakeAgent
 from numpy.typing import NDArray
 from small_runs import Inline, small
 
@@ -21,23 +19,15 @@ from imagine_bench import registry
 from imagine_bench.bench import bench as benches
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Observation, State, TaskSpec
-from imagine_bench.judge.policy import (
-    FRAMES,
-    EvalStates,
-    Terminations,
-    action_shares,
-    eval_states,
-    optimal_length,
-    terminations,
-)
+from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.judge.policy import Terminations, optimal_length, terminations
 from imagine_bench.protocols.control import protocol
-from imagine_bench.report.analysis import Measured
-from imagine_bench.report.policy import PolicyAnalysis
-from imagine_bench.rules import fewest_actions, greedy
+from imagine_bench.report.data import collect
+from imagine_bench.report.sections.policy import followed, policies
+from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.store import encoders
 from imagine_bench.store.files import lock, sealed
-from imagine_bench.store.results import BenchResult
+from imagine_bench.store.results import Beliefs, BenchResult, RunResult
 from imagine_bench.store.trained import learners, load_trained
 
 HARD = registry.task("arrow_puzzle_hard")
@@ -50,17 +40,14 @@ def bench(root: Path, launcher: Inline, **changes: Any) -> BenchResult:
     return result
 
 
-@pytest.fixture(scope="module")
-def hard() -> EvalStates:
-    return eval_states(HARD, appearance="clean")
-
-
 def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Terminations:
     """Where a rule of choice leads; what the frames show does not matter to it."""
-    states = np.array([state for state in spec.rules.states if not spec.rules.is_terminal(state)])
-    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
-    chosen = np.array([choose(tuple(state)) for state in states.tolist()])
-    return terminations(spec, shown, greedy(chosen, spec.n_actions))
+    return terminations(spec, greedy(everywhere(spec, choose), spec.n_actions), spec.rules.start_states)
+
+
+def everywhere(spec: TaskSpec, choose: Callable[[State], int]) -> NDArray[np.int64]:
+    """What it chooses in each macrostate; anything in terminal ones. Shape (S,)."""
+    return np.array([0 if spec.rules.is_terminal(state) else choose(state) for state in states_of(spec.rules)])
 
 
 def means(ends: Terminations) -> tuple[float, float, float, float]:
@@ -92,8 +79,10 @@ def walked(spec: TaskSpec, choose: Callable[[State], int], start: State, patienc
 def test_the_optimal_policy_misses_nothing() -> None:
     ends = ends_of(HARD, HARD.rules.optimal_action)
     assert means(ends) == (1.0, 0.0, 0.0, 0.0)
-    assert np.array_equal(ends.length, optimal_length(HARD))
-    assert optimal_length(HARD).tolist() == [fewest_actions(HARD.rules, state) for state in HARD.rules.start_states]
+    assert np.array_equal(ends.length, optimal_length(HARD, HARD.rules.start_states))
+    assert optimal_length(HARD, HARD.rules.start_states).tolist() == [
+        fewest_actions(HARD.rules, state) for state in HARD.rules.start_states
+    ]
 
 
 def test_the_long_way_round_comes_late() -> None:
@@ -127,11 +116,12 @@ def test_who_undoes_what_was_done_never_comes() -> None:
 
 def test_late_failures_are_told_from_what_never_ends() -> None:
     """Where one frame in a hundred makes the agent break a rule, going to and fro ends that way, but mostly late."""
-    states = np.array(HARD.rules.start_states)
-    to_and_fro = greedy(np.array([legal(tuple(state))[0] for state in states.tolist()]), 6)
-    illegal = greedy(np.array([min(set(range(6)) - set(legal(tuple(state)))) for state in states.tolist()]), 6)
-    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 1, 64, 64, 3), dtype=np.uint8))
-    pure, mixed = terminations(HARD, shown, to_and_fro), terminations(HARD, shown, 0.99 * to_and_fro + 0.01 * illegal)
+    to_and_fro = greedy(everywhere(HARD, lambda state: legal(state)[0]), 6)
+    illegal = greedy(everywhere(HARD, lambda state: min(set(range(6)) - set(legal(state)))), 6)
+    pure, mixed = (
+        terminations(HARD, policy, HARD.rules.start_states)
+        for policy in (to_and_fro, 0.99 * to_and_fro + 0.01 * illegal)
+    )
     stuck = pure.endless == 1.0
     assert stuck.any() and mixed.endless == pytest.approx(0.0, abs=1e-4)
     assert mixed.failure[stuck] == pytest.approx(1 - 0.99**HARD.horizon)
@@ -161,94 +151,72 @@ def test_chance_in_the_rules_is_kept() -> None:
 
 
 def test_wavering_between_two_ways_is_a_walk_by_chance() -> None:
-    """Half of the frames say one legal turn and half the other: a fair walk on the ring, solved by hand."""
-    half = {state: legal(state) for state in HARD.rules.start_states}
-    states = np.array(list(half))
-    policy = sum(greedy(np.array([half[tuple(s)][way] for s in states.tolist()]), 6) for way in (0, 1)) / 2
-    shown = EvalStates(macrostates=states, frames=np.zeros((len(states), 2, 64, 64, 3), dtype=np.uint8))
-    ends = terminations(HARD, shown, policy)
+    """One legal turn half of the time and the other else: a fair walk on the ring, solved by hand."""
+    ways = [everywhere(HARD, lambda state, way=way: legal(state)[way]) for way in (0, 1)]  # type: ignore[misc]
+    ends = terminations(HARD, np.mean([greedy(way, 6) for way in ways], axis=0), HARD.rules.start_states)
     ring = np.zeros(13)  # the goal is at 0 and at 12, one turn a step
     ring[[0, 12]] = 1.0
     for _ in range(HARD.horizon):
         ring[1:12] = (ring[:11] + ring[2:]) / 2
-    by_distance = {int(far): ring[int(far)] for far in optimal_length(HARD)}
-    assert ends.success == pytest.approx(np.array([by_distance[int(far)] for far in optimal_length(HARD)]))
+    by_distance = {int(far): ring[int(far)] for far in optimal_length(HARD, HARD.rules.start_states)}
+    assert ends.success == pytest.approx(
+        np.array([by_distance[int(far)] for far in optimal_length(HARD, HARD.rules.start_states)])
+    )
     assert ends.failure == pytest.approx(0.0) and ends.success + ends.late_success == pytest.approx(
         np.ones(66), abs=1e-4
     )
 
 
-def test_every_frame_is_seen_once_and_acted_on_greedily(hard: EvalStates) -> None:
-    assert len(hard.macrostates) == 66 == len(HARD.rules.start_states)
-    assert hard.frames.shape == (66, FRAMES, 64, 64, 3)
-    assert not np.array_equal(hard.frames[0, 0], hard.frames[0, 1]), "cubes lie a little otherwise each time"
-    again = eval_states(HARD, appearance="clean")
-    assert np.array_equal(again.frames, hard.frames)
+def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None:
+    """A page of a bench whose agents held the optimal policy, and the wrong way round the ring."""
+    few: dict[str, Any] = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted = protocol(
+        "arrow_puzzle_hard", "smoke", agents=("table", "imaginer"), seeds=(0, 1), execution="kinematic", **few
+    )
+    result: BenchResult = benches.bench(wanted, {}, root=tmp_path, launcher=Inline())
+    optimal = everywhere(HARD, HARD.rules.optimal_action).astype(np.int16)
+    astray = everywhere(HARD, other_way).astype(np.int16)
 
-    class Watched(FakeAgent):
-        seen: list[NDArray[np.uint8]] = []  # noqa: RUF012 - one agent only
+    def holding(run: RunResult, action: NDArray[np.int16]) -> RunResult:
+        row = dataclasses.replace(run.checkpoints[-1], beliefs=Beliefs(action=action, model=None))
+        return dataclasses.replace(run, checkpoints=(row,))
 
-        def act(self, observation: Observation, *, explore: bool) -> int:
-            assert not explore and observation.macrostate is None
-            self.seen.append(observation.frame)
-            return 5 if len(self.seen) % FRAMES == 1 else 2
-
-    policy = action_shares(Watched(), hard, 6)
-    assert np.array_equal(policy[5], np.full(66, 1 / FRAMES)) and np.array_equal(policy[2], np.full(66, 1 - 1 / FRAMES))
-    assert np.array_equal(np.stack(Watched.seen), hard.frames.reshape(-1, 64, 64, 3))
-
-    class Told(FakeAgent):
-        def act(self, observation: Observation, *, explore: bool) -> int:
-            assert observation.macrostate is not None
-            return HARD.rules.optimal_action(tuple(observation.macrostate.tolist()))
-
-    best = [HARD.rules.optimal_action(tuple(state)) for state in hard.macrostates.tolist()]
-    assert action_shares(Told(), hard, 6, privileged=True).argmax(axis=0).tolist() == best
-
-
-def test_table_and_files(tmp_path: Path) -> None:
-    good, bad = ends_of(HARD, HARD.rules.optimal_action), ends_of(HARD, other_way)
-    runs = [
-        Measured(agent="dqn", seed=0, episodes=100, value=good),
-        Measured(agent="dqn", seed=1, episodes=100, value=bad),
-        Measured(agent="imagination", seed=0, episodes=50, value=good),
-    ]
-    analysis = PolicyAnalysis(HARD, appearance="clean")
-    table = analysis.table(runs)
-    assert "All 66 starts" in table and "(optimal: 3.27)" in table
-    assert f"| DQN | 100 | 2 | {50 + 50 * bad.success.mean():.1f} [" in table
-    assert "| imagination | 50 | 1 | 100.0 | 0.0 | 0.0 | 0.0 | 0.0 | 3.27 |" in table
-    assert f"Starts that some run does not always solve: {(bad.success < 1).sum()} of 66. Solved least:" in table
-    near = [end for end, need in zip(bad.success, optimal_length(HARD), strict=True) if need == 2]
-    assert f"| 2 | 12 | {50 + 50 * np.mean(near):.1f} | 100.0 |" in table
-    assert table.endswith("| 50.0 | 100.0 |") and table.split("Solved least:")[1].count("| 50.0 | 100.0 |") == 12
-    assert "Every run solves every start." in analysis.table(runs[2:])
-    seldom = dataclasses.replace(good, success=np.where(np.arange(66) == 5, 0.998, 1.0))
-    many = [Measured(agent="dqn", seed=seed, episodes=9, value=seldom if seed == 3 else good) for seed in range(5)]
-    assert "does not always solve: 1 of 66." in analysis.table(many), "the mean of five is 99.96 %"
-    analysis.write(tmp_path / "out", runs, {"commit": "abc"})
-    with (tmp_path / "out" / "starts.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 3 * 66
-    assert sum(float(row["success"]) for row in rows[66:132]) == pytest.approx(bad.success.sum())
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["commit"] == "abc" and summary["runs"][1]["success"] == pytest.approx(bad.success.mean())
+    runs = [holding(run, astray if (run.agent, run.seed) == ("imaginer", 1) else optimal) for run in result.runs]
+    data = collect(dataclasses.replace(result, runs=tuple(runs)))
+    section = policies(data, followed(data))
+    whole, by_length, missed = section.tables
+    bad = ends_of(HARD, other_way)
+    assert "from all 66 starts" in whole.caption and whole.header[-1] == "macro-actions (optimal: 3.27)"
+    assert whole.rows[0] == ["table", "100.0 [100.0, 100.0]", *["0.0 [0.0, 0.0]"] * 4, "3.27 [3.27, 3.27]"]
+    assert str(whole.rows[1][1]).startswith(f"{50 + 50 * bad.success.mean():.1f} [")
+    near = bad.success[optimal_length(HARD, HARD.rules.start_states) == 2].mean()
+    assert by_length.rows[1] == ["2", "12", "100.0", f"{50 + 50 * near:.1f}"]
+    assert f"{(bad.success < 1).sum()} starts are not always solved" in missed.caption and len(missed.rows) == 12
+    assert all(row[2:] == ["100.0", "50.0"] for row in missed.rows)
+    alone = dataclasses.replace(result, runs=tuple(holding(run, optimal) for run in result.runs))
+    assert len(policies(collect(alone), followed(collect(alone))).tables) == 2, "none is missed"
+    rows = [tuple(dataclasses.replace(row, beliefs=None) for row in run.checkpoints) for run in result.runs]
+    runs = [dataclasses.replace(run, checkpoints=row) for run, row in zip(result.runs, rows, strict=True)]
+    assert followed(collect(dataclasses.replace(result, runs=tuple(runs)))) == {}
 
 
-def test_an_unfinished_bench_is_analysed_as_it_stands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        bench(tmp_path, Inline(patience=3))  # both agents of seed 0, and one of seed 1, to the end
-    (folder,) = tmp_path.glob("*/*/")
-    assert [path.relative_to(folder).as_posix() for path in learners(folder)] == [
-        "table/seed_0", "imaginer/seed_0", "imaginer/seed_1",
-    ]  # fmt: skip
-    with lock(folder / ".policy.lock", "This"):
-        assert main(["policy", str(folder)]) == 2
+def test_starts_of_tests_alone_are_followed() -> None:
+    """Of rules that list no macrostates, whose order begins with the starts."""
+    task = registry.task("arrows:cubes=2")
+    policy = greedy(everywhere(task, task.rules.optimal_action), task.n_actions)
+    some = task.rules.start_states[::-2]
+    found, every = terminations(task, policy, some), terminations(task, policy, task.rules.start_states)
+    assert (
+        np.array_equal(found.length, every.length[::-2])
+        and found.length.tolist() == optimal_length(task, some).tolist()
+    )
+
+
+def test_an_analysis_is_made_by_one_process_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,)).folder
+    with lock(folder / ".why.lock", "This"):
+        assert main(["why", str(folder)]) == 2
     assert "is in use by process" in capsys.readouterr().err
-    assert main(["policy", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert "| table | 9 | 1 |" in said and "| imaginer | 9 | 2 |" in said and str(folder / "policy") in said
-    assert len((folder / "policy" / "starts.csv").read_text().splitlines()) == 1 + 3 * 54
 
 
 @pytest.mark.parametrize(
@@ -263,7 +231,7 @@ def test_folders_without_agents_are_named(
     folder: str, complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(Path(__file__).parents[2])
-    assert main(["policy", folder]) == 2
+    assert main(["why", folder]) == 2
     assert complaint in capsys.readouterr().err
 
 

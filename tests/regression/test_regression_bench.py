@@ -14,6 +14,7 @@ from imagine_bench.agents.regressors import settings as regressor_settings
 from recordings import contents, times
 
 from imagine_bench import registry
+from imagine_bench.audit.why import why_report
 from imagine_bench.bench.bench import plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
@@ -30,7 +31,6 @@ from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.page import flat
-from imagine_bench.report.policy import policy_report
 from imagine_bench.report.sections import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import read_json
@@ -219,7 +219,7 @@ def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path:
     with pytest.raises(ArtefactError, match="is of a regression task, in which no agent acts"):
         load_trained(toy.folder)
     with pytest.raises(ArtefactError, match="Task 'toy_regression' is of a regression task"):
-        policy_report(None, root=tmp_path, task="toy_regression", encoder=None)
+        why_report(None, root=tmp_path, task="toy_regression", encoder=None)
 
 
 def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ at the end. Shapes: ``N`` questions, ``K`` frames of history, ``D`` macro-action
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,18 +43,24 @@ class Questions:
 
 def outcomes_by_depth(rules: Rules, state: State, actions: Sequence[int]) -> tuple[Outcomes, ...]:
     """What may come of macro-actions from a macrostate, after each of them."""
-    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
-    found = []
-    for action in actions:
-        after: dict[tuple[State, bool], list[float]] = {}
-        for (before, over), (weight, _) in outcomes.items():
-            for outcome in rules.outcomes(before, int(action)):
-                sums = after.setdefault((outcome.macrostate, over or outcome.terminated), [0.0, 0.0])
-                sums[0] += weight * outcome.probability
-                sums[1] += weight * outcome.probability * (0.0 if over else outcome.reward)
-        outcomes = {key: (share, earned / share if share else 0.0) for key, (share, earned) in after.items()}
-        found.append(outcomes)
-    return tuple(found)
+    reached = itertools.accumulate(actions, functools.partial(advance, rules), initial=certainly(state))
+    return tuple(reached)[1:]
+
+
+def certainly(state: State) -> Outcomes:
+    """A macrostate in which nothing was done yet."""
+    return {(state, False): (1.0, 0.0)}
+
+
+def advance(rules: Rules, outcomes: Outcomes, action: int) -> Outcomes:
+    """What may come of one more macro-action, the same whatever has come before."""
+    after: dict[tuple[State, bool], list[float]] = {}
+    for (before, over), (weight, _) in outcomes.items():
+        for outcome in rules.outcomes(before, int(action)):
+            sums = after.setdefault((outcome.macrostate, over or outcome.terminated), [0.0, 0.0])
+            sums[0] += weight * outcome.probability
+            sums[1] += weight * outcome.probability * (0.0 if over else outcome.reward)
+    return {key: (share, earned / share if share else 0.0) for key, (share, earned) in after.items()}
 
 
 def shares(outcomes: Outcomes) -> dict[State, float]:
@@ -85,7 +92,7 @@ def transitions(rules: Rules, rng: np.random.Generator, most: int) -> list[tuple
 def lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Generator) -> list[int]:
     """Random macro-actions after which the episode is least likely to be over, one after another."""
     chosen: list[int] = []
-    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
+    outcomes = certainly(state)
     for _ in range(depth):
         risks = []
         for action in range(rules.n_actions):
@@ -94,7 +101,7 @@ def lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Gener
             risks.append((sum(outcome.probability for outcome in after if outcome.terminated), dead_end))
         best = [action for action, risk in enumerate(risks) if risk == min(risks)]
         chosen.append(int(rng.choice(best)))
-        outcomes = outcomes_by_depth(rules, state, chosen)[-1]
+        outcomes = advance(rules, outcomes, chosen[-1])
     return chosen
 
 

@@ -96,6 +96,18 @@ def test_where_nothing_happens_nothing_is_found() -> None:
     assert looks.find(tinted) == [], "light is no factor"
 
 
+def test_noise_in_view_is_no_factor_and_hides_none() -> None:
+    """A screen of noise behind one wheel's edge, and no frame twice: the factors are the same."""
+    rng = np.random.default_rng(0)
+    truth, frames = walk(120, rng)
+    frames[:, 24:40, 2:30] = rng.integers(256, size=(120, 16, 28, 3))
+    found = looks.find(frames)
+    assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
+    codes, known = looks.read(found, frames)
+    assert known.mean() > 0.98
+    assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
+
+
 def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
@@ -140,13 +152,13 @@ def test_the_widest_gap_parts_the_groups() -> None:
 def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
     rng = np.random.default_rng(0)
     bits = (rng.random((120, 2)) < 0.25).cumsum(axis=0) % 2
-    images = np.ones((120, 64, 64, 3), dtype=np.float32)
+    images, everywhere = np.ones((120, 64, 64, 3), dtype=np.float32), np.ones((64, 64), dtype=np.bool_)
     images[:, 20:40, 10:30] += bits[:, 0, None, None, None]
     images[:, 20:40, 30:50] += bits[:, 1, None, None, None]  # they touch
-    found = looks.regions(images)
+    found = looks.regions(looks.changes(images), everywhere)
     assert len(found) == 2 and not (found[0] & found[1]).any()
     images[:, 20:40, 30:50] = 1.0 + bits[:, 0, None, None, None]
-    assert len(looks.regions(images)) == 1, "what changes together is one"
+    assert len(looks.regions(looks.changes(images), everywhere)) == 1, "what changes together is one"
 
 
 def test_what_does_not_vary_freely_is_one_factor() -> None:

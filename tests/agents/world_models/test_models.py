@@ -33,8 +33,9 @@ def made(name: str, task: str = "arrow_puzzle") -> WorldModel:
     entry, spec = registry.WORLD_MODELS[name], registry.task(task)
     path = None if entry.encoder_kind is None else encoders.own(spec, "clean", entry.encoder_kind)
     context = AgentContext(
-        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models")
-    )
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models"),
+        config_group=spec.config_group,
+    )  # fmt: skip
     model: WorldModel = registry.load(entry.make)(context)
     return model
 
@@ -79,6 +80,15 @@ def test_latent_models_offer_three_uncertainties(name: str, quick: Callable[[str
     assert found.epistemic is not None and found.aleatoric is not None and found.modal is not None
     assert (found.epistemic > 0).all() and (found.aleatoric > 0).all()
     assert (found.modal == 0).all() == (name == "gaussian")
+
+
+def test_one_network_offers_no_epistemic_uncertainty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chapter 3 of the thesis, pick-and-place, has neither dropout nor an ensemble: a dash, not zeros."""
+    monkeypatch.setattr(latent, "UPDATES", 3)
+    model, seen = made("mdn_thesis", "pick_place"), data("pick_place", 20)
+    model.fit(seen, np.random.default_rng(1))
+    found = model.imagine(seen.frames[:2, None], np.zeros((2, 1), dtype=np.int64), 3, np.random.default_rng(2))
+    assert found.epistemic is None and found.accepted is None and found.aleatoric is not None
 
 
 def test_the_filter_discards_what_its_threshold_says_and_all_that_follows(quick: Callable[[str], WorldModel]) -> None:

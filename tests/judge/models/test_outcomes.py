@@ -11,13 +11,14 @@ from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
 from imagine_bench.agents.replay import RealMemory
 
-from imagine_bench.interfaces import State
+from imagine_bench.interfaces import Outcome, State
 from imagine_bench.judge.models.outcomes import (
     hallucinated_modes,
     missed_modes,
     sampling_noise_floor,
     total_variation,
 )
+from imagine_bench.judge.models.truth import advance, expected_reward
 from imagine_bench.seeding import SeedTree
 
 SHARES = (0.5, 0.3, 0.2)
@@ -50,6 +51,28 @@ def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
     distance = 0.5 * np.abs(shares - np.array(list(exact.values()))).sum(axis=1)
     assert sampling_noise_floor(exact, 50) == pytest.approx(distance.mean(), rel=0.01)
     assert sampling_noise_floor({(1,): 1.0}, 50) == 0.0
+
+
+class Toss:
+    """From state 0, one in four wins and ends; what was won stays, and would pay again."""
+
+    n_actions = 1
+
+    def outcomes(self, state: State, action: int) -> tuple[Outcome, ...]:
+        if state == (1,):
+            return (Outcome(1.0, (1,), 5.0, terminated=True, success=True),)
+        win = Outcome(0.25, (1,), 2.0, terminated=True, success=True)
+        return win, Outcome(0.75, (2,), -1.0, terminated=False, success=False)
+
+
+def test_the_truth_advances_by_hand() -> None:
+    """Dynamics go on after the end, and rewards stop."""
+    before = {((0,), False): (0.5, 0.0), ((1,), True): (0.5, 0.0)}
+    after = advance(Toss(), before, 0)  # type: ignore[arg-type]
+    assert set(after) == {((1,), True), ((2,), False)}
+    assert after[(1,), True] == pytest.approx((0.625, 0.125 * 2.0 / 0.625))
+    assert after[(2,), False] == pytest.approx((0.375, -1.0))
+    assert expected_reward(after) == pytest.approx(0.125 * 2.0 - 0.375)
 
 
 def learned(components: int) -> Imagination:

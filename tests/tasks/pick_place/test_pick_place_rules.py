@@ -18,8 +18,7 @@ from imagine_bench.tasks.pick_place.rules import (
 from imagine_bench.tasks.pick_place.spec import HORIZON
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Outcome, State
-from imagine_bench.rules import advance, facts, is_random, optimal_values, require_macrostates, tabulate
+from imagine_bench.rules import facts, is_random, optimal_values, require_macrostates, tabulate
 
 RULES = PickPlaceRules()
 PLAY = [state for state in RULES.states if not RULES.is_terminal(state)]
@@ -145,23 +144,3 @@ def test_macrostates_of_another_shape_or_type_are_refused(given):
     with pytest.raises(InvalidValueError, match=r"Macrostates must be integers of shape \(N, 4\), not"):
         require_macrostates(RULES, given)
     assert require_macrostates(RULES, PLAY).tolist() == [list(state) for state in PLAY]
-
-
-def test_a_belief_advances_by_hand() -> None:
-    """What has ended stays and adds up; the rest is shared out by chance, and its reward expected."""
-
-    class Coin:
-        def optimal_action(self, state: State) -> int:
-            return 7
-
-        def outcomes(self, state: State, action: int) -> tuple[Outcome, ...]:
-            assert (state, action) == ((0,), 7)
-            win = Outcome(macrostate=(1,), probability=0.25, reward=2.0, terminated=True, success=True)
-            lose = Outcome(macrostate=(2,), probability=0.75, reward=-1.0, terminated=False, success=False)
-            return win, lose
-
-    belief = {((0,), False): 0.5, ((1,), True): 0.3, ((0,), True): 0.2}
-    for action in (None, 7):
-        after, reward = advance(Coin(), belief, action)  # type: ignore[arg-type]
-        assert after == pytest.approx({((1,), True): 0.425, ((2,), False): 0.375, ((0,), True): 0.2})
-        assert reward == pytest.approx(0.125 * 2.0 - 0.375)
