@@ -250,7 +250,10 @@ def make() -> Callable[..., tuple[int, str]]:
         ("bench AGENTS=dqn+oracle SEEDS=0+1 BUDGETS=1", "bench --task {} --agents dqn oracle --seeds 0 1 --budgets 1"),
         ("bench TASK=pick_place PRESET=smoke ARGS=--out+x", "bench --task pick_place --preset smoke --out x"),
         ("bench APPEARANCE=mild EXECUTION=x ENCODER=y", "bench --task {} --appearance mild --execution x --encoder y"),
-        ("peers SEEDS=7 BUDGETS=9", "bench --task {} --agents sb3_dqn sb3_qrdqn sb3_dqn_latents --seeds 7 --budgets 9"),
+        (
+            "peers SEEDS=7 BUDGETS=9",
+            "bench --task {} --agents sb3_dqn sb3_qrdqn sb3_dqn_latents dreamer_v3 --seeds 7 --budgets 9",
+        ),
         ("plan", "plan"),
         ("report TASK=pick_place", "report --task pick_place"),
         ("test ARGS=-k+setup", "-m pytest -n auto --dist loadfile -k setup"),

@@ -6,11 +6,12 @@ success, or out of time, and then whether it would have come to a success, to an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats, TaskSpec
+from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
 
 _PATIENCE = 1_000  # macro-actions after which a termination is taken for one that never comes
@@ -33,22 +34,22 @@ class Terminations:
         return np.maximum(0.0, 1.0 - ended)  # but for rounding
 
 
-def optimal_length(spec: TaskSpec) -> Floats:
+def optimal_length(spec: TaskSpec, starts: Sequence[State]) -> Floats:
     """Expected macro-actions of an optimal agent within the horizon, from each start. Shape (S,)."""
     tables = tabulate(spec.rules)
     best = greedy(optimal_policy(tables), spec.n_actions)
-    return evaluate(tables, best, spec.horizon).length[tables.starts]
+    return evaluate(tables, best, spec.horizon).length[[tables.index[start] for start in starts]]
 
 
-def terminations(spec: TaskSpec, policy: Floats) -> Terminations:
-    """Follow a policy from every start, by the rules: probabilities (A, S), macrostates as :func:`.rules.states_of`."""
+def terminations(spec: TaskSpec, policy: Floats, starts: Sequence[State]) -> Terminations:
+    """Follow a policy from S starts by the rules; its probabilities are (A, X), of the X macrostates of the rules."""
     tables = tabulate(spec.rules)
-    within = evaluate(tables, policy, spec.horizon)
-    patient = evaluate(tables, policy, max(spec.horizon, _PATIENCE))
+    within, patient = (evaluate(tables, policy, most) for most in (spec.horizon, max(spec.horizon, _PATIENCE)))
+    rows = [tables.index[start] for start in starts]
     return Terminations(
-        success=within.success[tables.starts],
-        failure=within.failure[tables.starts],
-        late_success=(patient.success - within.success)[tables.starts],
-        late_failure=(patient.failure - within.failure)[tables.starts],
-        length=within.length[tables.starts],
+        success=within.success[rows],
+        failure=within.failure[rows],
+        late_success=(patient.success - within.success)[rows],
+        late_failure=(patient.failure - within.failure)[rows],
+        length=within.length[rows],
     )

@@ -167,6 +167,13 @@ def price(budget: str, where: str, what: str) -> str:
     return "–" if np.isnan(mean) else f"{mean:,.0f}"
 
 
+def raw(budget: str, folder: str, column: str) -> str:
+    """A column of the one run of a folder."""
+    with (RESULTS / folder / "results.csv").open() as file:
+        (row,) = (row for row in csv.DictReader(file) if row["episodes"] == budget)
+    return f"{float(row[column]):,.0f}"
+
+
 def price_to(where: str, level: str, what: str) -> str:
     """The same until the test from which on all reach a level, mean over seeds."""
     if what == "frames":
@@ -456,6 +463,6 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
         last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
         thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
-        shortest, price, price_to, coverage, certified,
+        shortest, price, price_to, raw, coverage, certified,
     )
 }  # fmt: skip

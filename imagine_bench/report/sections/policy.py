@@ -28,21 +28,24 @@ def followed(data: ReportData) -> Found:
 
     In each macrostate an agent does what it did in a frame of it that it read right, if one of a few was.
     """
-    spec = data.result.protocol.spec(testing=True) if data.spec.action_names else data.spec
-    held = {
-        agent: [run.checkpoints[-1].beliefs for run in data.result.of(agent)] for agent in data.result.protocol.agents
-    }
-    return {
-        agent: [terminations(spec, greedy(one.action.astype(np.int64), spec.n_actions)) for one in each if one]
-        for agent, each in held.items()
-        if data.spec.action_names and all(each)
-    }
+    spec, found = data.spec, dict[str, list[Terminations]]()
+    for agent in data.result.protocol.agents if spec.action_names else ():
+        held = [run.checkpoints[-1].beliefs for run in data.result.of(agent)]
+        if all(held):
+            policies_of = [greedy(one.action.astype(np.int64), spec.n_actions) for one in held if one]
+            found[agent] = [terminations(spec, one, _starts(data)) for one in policies_of]
+    return found
+
+
+def _starts(data: ReportData) -> tuple[State, ...]:
+    """Those of the tests."""
+    return data.result.protocol.spec(testing=True).rules.start_states
 
 
 def policies(data: ReportData, found: Found) -> Section:
     """What policies do from every start, by the shortest plan, and from the starts that they miss."""
-    spec = data.result.protocol.spec(testing=True)
-    optimal, episodes = optimal_length(spec), f"{data.budgets[-1]:,} real episodes"
+    starts = _starts(data)
+    optimal, episodes = optimal_length(data.spec, starts), f"{data.budgets[-1]:,} real episodes"
     solved = np.array([np.mean([one.success for one in seeds], axis=0) for seeds in found.values()])  # [agents, starts]
     titles = [agent_words(agent).title for agent in found]
     rows = [
@@ -59,28 +62,27 @@ def policies(data: ReportData, found: Found) -> Section:
         Table(
             name="policies", rows=rows,
             header=["agent, %", *_SHARES.values(), f"macro-actions (optimal: {optimal.mean():.2f})"],
-            caption=f"After {episodes}, from all {len(optimal)} starts. Means over seeds [95 %].",
+            caption=f"After {episodes}, from all {len(starts)} starts. Means over seeds [95 %].",
         ),
         Table(name="policies_by_length", header=["optimal macro-actions", "starts", *titles], rows=by_need,
               caption="Solved, %, by what an optimal agent needs.", folded="By the length of the optimal plan"),
     ]  # fmt: skip
     worst = np.min([one.success for seeds in found.values() for one in seeds], axis=0)  # [starts]
     if missed := [index for index in np.argsort(solved.mean(axis=0), kind="stable") if worst[index] < _SURE]:
-        tables.append(_missed(spec, missed, optimal, solved, titles))
+        tables.append(_missed(data.spec, [starts[at] for at in missed], optimal[missed], solved[:, missed], titles))
     words = "Each policy is followed by the rules: no episode is sampled, and no frame misread that can be read right."
     return Section(title="Where the greedy policies lead", words=[words], tables=tables)
 
 
-def _missed(spec: TaskSpec, missed: Sequence[int], optimal: Floats, solved: Floats, titles: Sequence[str]) -> Table:
-    starts = spec.rules.start_states
-
+def _missed(spec: TaskSpec, starts: Sequence[State], optimal: Floats, solved: Floats, titles: Sequence[str]) -> Table:
     def words(state: State) -> str:
         named = zip(spec.macrostate_names, spec.value_names(state), strict=True)
         return ", ".join(f"{name} {value}" for name, value in named)
 
+    rows = zip(starts[:_LISTED], optimal[:_LISTED], solved.T[:_LISTED], strict=True)
     return Table(
         name="policies_missed", header=["start", "optimal macro-actions", *titles],
-        rows=[[words(starts[at]), f"{optimal[at]:.2f}", *map(percent, solved[:, at])] for at in missed[:_LISTED]],
-        caption=f"Solved, %. Some run does not always solve {len(missed)} of {len(optimal)} starts.",
+        rows=[[words(start), f"{need:.2f}", *map(percent, shares)] for start, need, shares in rows],
+        caption=f"Solved, %. {len(starts)} starts are not always solved by every run.",
         folded="The starts that are solved least",
     )  # fmt: skip
