@@ -227,7 +227,8 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
 def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
-    flat = _FLAT * float(np.quantile((own**2).sum(axis=1), 0.9))
+    energy = (own**2).sum(axis=1)
+    flat = _FLAT * float(np.quantile(energy, 0.9) or energy.max() or 1.0)
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
     while True:
         apart = distances(own[chosen], own[chosen], mask, flat)

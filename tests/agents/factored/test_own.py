@@ -108,6 +108,16 @@ def test_noise_in_view_is_no_factor_and_hides_none() -> None:
     assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
 
 
+def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
+    """Where most crops of a region have no contour at all."""
+    frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
+    frames[[5, 20, 40], 20:32, 20:32] += (100 * _shape(0))[..., None].astype(np.uint8)
+    found = looks.find(frames)
+    codes, known = looks.read(found, frames)
+    assert codes.shape == (60, 1) and known.all()
+    assert codes[[5, 20, 40]].tolist() == [[1]] * 3 and codes.sum() == 3
+
+
 def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
