@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import functools
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -363,8 +364,8 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
 
 
 def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
-    """The same by what the model learned from."""
-    return judged(folder, model, transitions, score)
+    """The same by what the model learned from, without the interval."""
+    return re.sub(r" \[.*\]", "", judged(folder, model, transitions, score))
 
 
 # Regression, speed, rules ----------------------------------------------------------------------------------------
