@@ -40,6 +40,7 @@ _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of
 _TELLING, _NOISE = 20, 0.5  # in so many frames, the share of looks seen once beyond which a region is noise
 _RESTS = 0.5  # share of the steps in which a pixel of noise may change and yet show something else, too
 _SEEN = 3  # times that a value must have been seen to tell whether it varies freely
+_MOST = 0.7  # share of the pixels that hang together
 _EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
 _ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)
 _NEIGHBOURS = (
@@ -179,6 +180,7 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
     """Regions (64, 64) of ``pixels``, of which each changes at the same times (N, 64, 64), the largest first.
 
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does.
+    Pixels that hang together are parted so only if most of them are in a region then; else they are one.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
@@ -193,11 +195,16 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
         (np.ones(sum(link.shape[1] for link in links)), np.concatenate(links, axis=1)), shape=(len(alone), len(alone))
     )
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    size = np.bincount(label) if len(label) else np.zeros(0)
-    order = [index for index in np.argsort(-size, kind="stable") if size[index] >= _LEAST_PX]
-    whole = np.full(pixels.shape, -1)
-    whole[pixels] = label
-    return [whole == index for index in order]
+    pieces = np.full(pixels.shape, -1)
+    pieces[pixels] = label
+    large = np.flatnonzero(np.bincount(label) >= _LEAST_PX)
+    whole, count = scipy.ndimage.label(pixels, np.ones((3, 3)))
+    found = []
+    for mask in (whole == index + 1 for index in range(count)):
+        inside = np.intersect1d(large, pieces[mask])
+        parted = [pieces == piece for piece in inside]
+        found += parted if sum(map(np.sum, parted)) >= _MOST * mask.sum() else [mask]
+    return sorted((mask for mask in found if mask.sum() >= _LEAST_PX), key=np.sum, reverse=True)
 
 
 def crops(shapes: Images, mask: Mask) -> Images:
@@ -227,7 +234,8 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
 def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
-    flat = _FLAT * float(np.quantile((own**2).sum(axis=1), 0.9))
+    energy = (own**2).sum(axis=1)
+    flat = _FLAT * float(np.quantile(energy, 0.9) or energy.max() or 1.0)
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
     while True:
         apart = distances(own[chosen], own[chosen], mask, flat)

@@ -156,11 +156,11 @@ class OutcomeModel:
             self._priors = {causes.outcomes[index]: weight * causes.strength[index] for index in order}
         self._counts, self.causes = {}, None
 
-    def _prior(self, outcome: int, groups: Floats) -> Floats:
-        """Prior probability of each conjunction to cause ``outcome``: its group's (G,), or an earlier task's. (J,)."""
+    def _prior(self, outcome: int, groups: Floats, which: NDArray[np.int64] | slice = slice(None)) -> Floats:
+        """Prior probability of these conjunctions to cause ``outcome``: their groups' (G,), or an earlier task's."""
         earlier = self._priors.get(self.outcomes[outcome])
-        own = groups[self.conjunctions.group]
-        return own if earlier is None else np.maximum(own, earlier)
+        own = groups[self.conjunctions.group[which]]
+        return own if earlier is None else np.maximum(own, earlier[which])
 
     @property
     def rewards(self) -> Floats:
@@ -217,21 +217,22 @@ class OutcomeModel:
         rivals: int,
     ) -> tuple[Floats, Floats]:  # fmt: skip
         """Expectation maximisation for one outcome: strengths (J,) and how likely each group holds causes (G,)."""
-        settings, group = self.settings, self.conjunctions.group[met]
+        settings, rows = self.settings, np.flatnonzero(met)
+        group = self.conjunctions.group[rows]
         positive = evidence.outcome == outcome
         weight = np.where(positive | (evidence.outcome == default), 1.0, settings.masked_weight) * evidence.count
-        tests = _spread(evidence.active, weight, len(met))[met]
+        tests = _spread(evidence.active, weight, len(met))[rows]
         active, count = (np.cumsum(met) - 1)[evidence.active[positive]], evidence.count[positive]  # among those met
         base = self.conjunctions.prior / rivals
-        prior, strength = base, self._prior(outcome, base)[met]
+        prior, strength = base, self._prior(outcome, base, rows)
         for _ in range(settings.sweeps):
             responsibility = _responsibility(strength, active, count, settings.leak, len(group))
-            hits = settings.pseudo_tests * self._prior(outcome, prior)[met] + responsibility
+            hits = settings.pseudo_tests * self._prior(outcome, prior, rows) + responsibility
             strength = np.minimum(hits / (settings.pseudo_tests + tests), _CERTAIN)
             found = np.bincount(group, strength, len(base))
             prior = (settings.pseudo_conjunctions * base + found) / (settings.pseudo_conjunctions + tried)
         whole = self._prior(outcome, prior)
-        whole[met] = strength
+        whole[rows] = strength
         return whole, prior
 
     def _tests(self, strength: Floats, evidence: _Evidence, default: int) -> Floats:

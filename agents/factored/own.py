@@ -9,6 +9,7 @@ stays as it is.
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +97,29 @@ class OwnPerception:
         self.unknown = False
         self._recent.clear()
 
+    def arrays(self) -> snapshot.Arrays:
+        """The frames that it remembers, and which are those of each transition."""
+        seen = np.stack(self.frames) if self.frames else np.zeros((0, 64, 64, 3), dtype=np.uint8)
+        pairs: NDArray[np.int64] = np.array(self.transitions, dtype=np.int64).reshape(-1, 2)
+        return {"replay/frames": seen, "replay/frame_pairs": pairs}
+
+    def values(self) -> dict[str, Any]:
+        """What belongs to :meth:`arrays` in a snapshot."""
+        return {"looked_at": self.looked_at, "unknown": self.unknown}
+
+    def load(self, state: AgentState) -> None:
+        """Take up what :meth:`arrays` and :meth:`values` gave: find the same factors in the same frames."""
+        self.frames = list(state.arrays["replay/frames"])
+        self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
+        self.look(state.values["looked_at"])
+        self.unknown = state.values["unknown"]
+
+    def diagnostics(self) -> dict[str, float]:
+        """How many factors and values it sees, in how many frames it found them, and how many it remembers."""
+        sizes = self.sizes
+        found = {"factors": len(sizes), "values": sum(sizes), "looked_at": self.looked_at, "frames": len(self.frames)}
+        return {f"perception/{name}": float(value) for name, value in found.items()}
+
 
 class OwnPerceptionAgent(CodeAgent[OwnPerception]):
     """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
@@ -121,21 +145,14 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         self._relearn(self.tasks, len(self.replay))
 
     def diagnostics(self) -> dict[str, float]:
-        """Also how many factors and values it sees, in how many frames it found them, and how many it remembers."""
-        eyes, sizes = self.perception, self.perception.sizes
-        counted = {"factors": len(sizes), "values": sum(sizes), "looked_at": eyes.looked_at, "frames": len(eyes.frames)}
-        return {**super().diagnostics(), **{f"perception/{name}": float(value) for name, value in counted.items()}}
+        """Also what it sees."""
+        return {**super().diagnostics(), **self.perception.diagnostics()}
 
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
         eyes, common = self.perception, super().state()
-        seen = np.stack(eyes.frames) if eyes.frames else np.zeros((0, 64, 64, 3), dtype=np.uint8)
-        pairs: NDArray[np.int64] = np.array(eyes.transitions, dtype=np.int64).reshape(-1, 2)
         values = {key: value for key, value in common.values.items() if key != "code_sizes"}
-        return AgentState(
-            arrays={**common.arrays, "replay/frames": seen, "replay/frame_pairs": pairs},
-            values={**values, "looked_at": eyes.looked_at, "unknown": eyes.unknown},
-        )
+        return AgentState(arrays={**common.arrays, **eyes.arrays()}, values={**values, **eyes.values()})
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot: find the same factors in the same frames, and learn from all that is replayed.
@@ -143,11 +160,7 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         ArtefactError if it does not fit this agent, and then nothing was changed.
         """
         snapshot.require_fit(_flat(state), _flat(self.state()), equal=("settings", "n_actions"))
-        eyes = self.perception
-        eyes.frames = list(state.arrays["replay/frames"])
-        eyes.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
-        eyes.look(state.values["looked_at"])
-        eyes.unknown = state.values["unknown"]
+        self.perception.load(state)
         self._take_up(state)
 
 

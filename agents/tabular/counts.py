@@ -131,9 +131,13 @@ class CountTable:
         }
         return found | {"count": np.array(list(self._rows.values()), dtype=np.int64)}
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self._index, self._rows, self._branches, self.largest_reward = {}, {}, {}, 0.0
+
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""
-        self._index, self._rows, self._branches, self.largest_reward = {}, {}, {}, 0.0
+        self.clear()
         for *row, count in zip(*(arrays[name].tolist() for name in self.arrays()), strict=True):
             self.add(*row)
             self._rows[tuple(row)] = count

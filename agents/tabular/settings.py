@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..dqn_settings import FAST_3, FAST_5, GreedySettings
+from ..factored.settings import OwnPerceptionSettings
 from ..settings import POSITIVE, RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
 
 
@@ -13,6 +14,13 @@ class CountTableSettings:
     """All settings of the count tables; where exploration is directed, the epsilons do nothing."""
 
     controller: GreedySettings = field(default_factory=GreedySettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnCountTableSettings(CountTableSettings):
+    """All settings of the count table that learns to see."""
+
+    perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +65,7 @@ def _hyperparameters(published: S, *unused: str) -> Hyperparameters[S]:
 
 
 HYPERPARAMETERS = _hyperparameters(CountTableSettings())
+OWN = _hyperparameters(OwnCountTableSettings())
 POSTERIOR_SAMPLING = _hyperparameters(PosteriorSamplingSettings())
 DYNA_Q = _hyperparameters(DynaQSettings())
 Q_LEARNING = _hyperparameters(DynaQSettings(table=UpdateSettings(planning_steps=0)), "table.planning_steps")

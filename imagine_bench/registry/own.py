@@ -121,6 +121,11 @@ AGENTS: dict[str, AgentEntry] = {
         settings=_COUNT_TABLE_SETTINGS, title="count table, directed",
         description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
     ),
+    "count_table_own": AgentEntry(
+        make="imagine_bench.agents.tabular.own:make", needs_encoder=False, title="count table, own eyes",
+        settings="imagine_bench.agents.tabular.settings:OWN",
+        description="A control: like count table, directed, but it learns to see from its own frames as factored_own.",
+    ),
     **{
         f"{name}{twin}": AgentEntry(
             make=f"imagine_bench.agents.tabular.dyna_q:make_{name}{twin}", encoder_kind="codes",

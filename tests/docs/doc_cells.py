@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import functools
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -362,6 +363,11 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     return (value if "nan" in ends or len({value, *ends}) == 1 else f"{value} [{', '.join(ends)}]") + few
 
 
+def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
+    """The same by what the model learned from, without the interval."""
+    return re.sub(r" \[.*\]", "", judged(folder, model, transitions, score))
+
+
 # Regression, speed, rules ----------------------------------------------------------------------------------------
 
 
@@ -461,7 +467,8 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     for function in (
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
         mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
-        last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, choice,
+        last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, judged_after,
+        choice,
         thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
         shortest, price, price_to, raw, coverage, certified,
     )

@@ -108,6 +108,16 @@ def test_noise_in_view_is_no_factor_and_hides_none() -> None:
     assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
 
 
+def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
+    """Where most crops of a region have no contour at all."""
+    frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
+    frames[[5, 20, 40], 20:32, 20:32] += (100 * _shape(0))[..., None].astype(np.uint8)
+    found = looks.find(frames)
+    codes, known = looks.read(found, frames)
+    assert codes.shape == (60, 1) and known.all()
+    assert codes[[5, 20, 40]].tolist() == [[1]] * 3 and codes.sum() == 3
+
+
 def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
@@ -152,13 +162,25 @@ def test_the_widest_gap_parts_the_groups() -> None:
 def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
     rng = np.random.default_rng(0)
     bits = (rng.random((120, 2)) < 0.25).cumsum(axis=0) % 2
-    images, everywhere = np.ones((120, 64, 64, 3), dtype=np.float32), np.ones((64, 64), dtype=np.bool_)
-    images[:, 20:40, 10:30] += bits[:, 0, None, None, None]
-    images[:, 20:40, 30:50] += bits[:, 1, None, None, None]  # they touch
-    found = looks.regions(looks.changes(images), everywhere)
+
+    def regions(left: NDArray[np.int64], right: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
+        images = np.ones((120, 64, 64, 3), dtype=np.float32)
+        images[:, 20:40, 10:30] += left[:, None, None, None]
+        images[:, 20:40, 30:50] += right[:, None, None, None]  # they touch
+        change = looks.changes(images)
+        return looks.regions(change, change.any(axis=0))
+
+    found = regions(bits[:, 0], bits[:, 1])
     assert len(found) == 2 and not (found[0] & found[1]).any()
-    images[:, 20:40, 30:50] = 1.0 + bits[:, 0, None, None, None]
-    assert len(looks.regions(looks.changes(images), everywhere)) == 1, "what changes together is one"
+    assert len(regions(bits[:, 0], bits[:, 0])) == 1, "what changes together is one"
+
+
+def test_what_falls_into_crumbs_stays_whole() -> None:
+    """Every pixel changes at times of its own: no part covers the square, so that it is one region, and is not lost."""
+    change = np.zeros((400, 64, 64), dtype=np.bool_)
+    change[:, 20:30, 20:30] = np.random.default_rng(0).random((400, 10, 10)) < 0.2
+    (found,) = looks.regions(change, change.any(axis=0))
+    assert found.sum() == 100 and found[20:30, 20:30].all()
 
 
 def test_what_does_not_vary_freely_is_one_factor() -> None:

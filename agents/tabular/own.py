@@ -1,0 +1,80 @@
+"""The control ``count_table_own``: a count table that learns to see as ``factored_own`` does, from its own frames.
+
+It has the same codes and counts, and neither structure nor uncertainty: R-max on whole codes. Whenever factors are
+found anew, it counts all remembered transitions once more by the codes that their frames have now.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from .. import snapshot
+from ..encoders.perception import prepare_torch
+from ..factored.own import OwnPerception
+from .count_table import CountTableAgent
+from .settings import OWN, OwnCountTableSettings
+
+
+class OwnCountTableAgent(CountTableAgent):
+    """R-max on codes of its own; states are whole codes as numbers."""
+
+    settings: OwnCountTableSettings
+
+    def __init__(self, n_actions: int, settings: OwnCountTableSettings, seeds: SeedTree) -> None:
+        self.eyes = OwnPerception(settings.perception, factored=False)
+        super().__init__(self._see, n_actions, settings, seeds, directed=True)
+        self._happened: list[tuple[int, float, bool]] = []
+        """Action, reward and end of every remembered transition."""
+
+    def _see(self, observation: Observation) -> int:
+        return self.eyes.code(observation.frame)[0]
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Remember what was seen, see anew if that is due, and count."""
+        eyes = self.eyes
+        if not eyes.full:
+            eyes.remember(transition.observation.frame, transition.next_observation.frame)
+            if eyes.renew():
+                self._recount()
+            self._happened.append((transition.action, transition.reward, transition.terminated))
+        super().observe(transition, episode=episode)
+
+    def _recount(self) -> None:
+        """Count every remembered transition by the codes that its frames have now."""
+        self.table.clear()
+        self._plans.clear()
+        codes, _ = self.eyes.codes(np.stack(self.eyes.frames))
+        for (before, after), (action, reward, terminated) in zip(self.eyes.transitions, self._happened, strict=False):
+            self.table.add(codes[before][0], action, codes[after][0], reward, terminated)
+
+    def diagnostics(self) -> dict[str, float]:
+        """Also what it sees."""
+        return {**super().diagnostics(), **self.eyes.diagnostics()}
+
+    def state(self) -> AgentState:
+        """A snapshot: also the frames that it remembers."""
+        common, columns = super().state(), zip(*self._happened, strict=True) if self._happened else [()] * 3
+        kinds = {"action": np.int64, "reward": np.float64, "terminated": np.bool_}
+        happened: snapshot.Arrays = {
+            f"replay/{name}": np.array(column, dtype=kind)
+            for (name, kind), column in zip(kinds.items(), columns, strict=True)
+        }
+        arrays: snapshot.Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
+        return AgentState(arrays=arrays, values={**common.values, **self.eyes.values()})
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
+        super().restore(state)
+        self.eyes.load(state)
+        columns = (state.arrays[f"replay/{name}"].tolist() for name in ("action", "reward", "terminated"))
+        self._happened = list(zip(*columns, strict=True))
+
+
+def make(context: AgentContext) -> OwnCountTableAgent:
+    """The ``count_table_own`` agent, of whatever frames are 64 x 64."""
+    prepare_torch(context.device)
+    settings = OWN.resolve(context.hyperparameters, context.overrides, context.config_group)
+    return OwnCountTableAgent(context.n_actions, settings, context.seeds)
