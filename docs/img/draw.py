@@ -13,7 +13,9 @@ import matplotlib as mpl
 import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
+from imagine_bench.certificates.certificate import certificate
 from imagine_bench.report import plots
+from imagine_bench.report.radar import radar_figure
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -80,6 +82,32 @@ def learning_curves() -> None:
     finish(axes, [100, 250, 500, 1000, 2000])
     figure.legend(loc="outside right upper", frameon=False)
     figure.savefig(HERE / "learning_curves.png", dpi=150)
+
+
+LADDER = {
+    "arrow_puzzle-controls-tabular": (
+        "count_table", "count_table_directed", "posterior_sampling", "posterior_sampling_macrostate",
+    ),
+    "arrow_puzzle-controls-dqn": ("dqn_swaps", "imagination_exact"),
+    "arrow_puzzle-2000-episodes": ("imagination_uncertainty", "imagination", "dqn"),
+    "arrow_puzzle-sample_efficiency": ("factored",),
+}  # fmt: skip
+"""Agents by the kept bench that tested them most often before 95 %."""
+
+
+def ladder() -> None:
+    """Episodes to 95 % of each agent, down to the information floor."""
+    tested = {agent: rates(folder, agent) for folder, agents in LADDER.items() for agent in agents}
+    reached: dict[str, list[int | None]] = {"random": [None] * 5}
+    for agent, table in tested.items():
+        by_seed = np.stack(list(table.values()), axis=1)
+        reached[agent] = [statistics.first_lasting(list(table), seed, 0.95) for seed in by_seed]
+    floor = certificate(registry.task("arrow_puzzle")).floor
+    last = max(max(table) for table in tested.values())
+    figure = plots.image(
+        "ladder", lambda: plots.ladder_figure(reached, last, floor and floor.episodes), alt="", caption="", dpi=110
+    )
+    (HERE / "ladder.png").write_bytes(figure.draw()[0])
 
 
 def thesis_settings() -> None:
@@ -151,6 +179,18 @@ def why() -> None:
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
+def radar() -> None:
+    """Scores of the kept suite."""
+    scores: dict[str, dict[str, statistics.Estimate]] = {}
+    with (RESULTS / "suite" / "scores.csv").open() as file:
+        for row in csv.DictReader(file):
+            values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
+            scores.setdefault(row["agent"], {})[row["experiment"]] = statistics.Estimate(*values)
+    spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
+    figure = radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
+    figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")
+
+
 DIALS = ({}, {"slip": 0.5}, {"fickle": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
 FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
 TURNS = {"start": None, "left turned": 0, "middle turned": 2, "right turned": 4}
@@ -189,7 +229,7 @@ def dials() -> None:
     figure.savefig(HERE / "dials.png", dpi=110)
 
 
-PICTURES = {each.__name__: each for each in (learning_curves, thesis_settings, mild, margins, why, dials)}
+PICTURES = {each.__name__: each for each in (learning_curves, thesis_settings, mild, margins, why, radar, dials)}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:
