@@ -1,7 +1,8 @@
-"""Whether two snapshots of agents are equal."""
+"""Whether two snapshots of agents are equal, and whether an agent that takes one up goes on as the other does."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,3 +22,20 @@ def same(first: AgentState, second: AgentState) -> bool:
         and first.arrays.keys() == second.arrays.keys()
         and all(np.array_equal(array, second.arrays[name]) for name, array in first.arrays.items())
     )
+
+
+def goes_on(agent: Any, other: Any, live: Callable[[Any, int, int], object], steps: int) -> AgentState:
+    """Have ``other`` live otherwise, take up the snapshot of ``agent``, and live on as it does; the snapshot.
+
+    ``live`` trains an agent for some steps by a seed.
+    """
+    live(agent, steps, 1)
+    live(other, steps // 2, 9)
+    saved = agent.state()
+    other.restore(saved)
+    assert same(agent.state(), other.state())
+    for each in (agent, other):
+        live(each, steps, 3)
+    assert same(agent.state(), other.state())
+    assert not same(agent.state(), saved), "what was learned since changed no snapshot"
+    return saved

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from agent_states import same
+from agent_states import goes_on
 from fake_latents import ACTIONS, CODES, FakeEncoder, context, frame, transition
 from imagine_bench.agents.controls import exact
 from imagine_bench.agents.controls.exact import LOOKS, ExactFilterAgent, ExactImaginationAgent
@@ -127,13 +127,7 @@ def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPa
 
 def test_a_restored_agent_goes_on_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     agent, other = knowing(monkeypatch), knowing(monkeypatch)
-    live(agent, 20)
-    live(other, 9, seed=3)
-    other.restore(agent.state())
-    assert same(agent.state(), other.state())
-    for each in (agent, other):
-        live(each, 10, seed=5)
-    assert same(agent.state(), other.state())
+    goes_on(agent, other, live, 20)
 
 
 def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -> None:

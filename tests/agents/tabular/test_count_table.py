@@ -7,7 +7,7 @@ from pathlib import Path
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
+from agent_states import goes_on, same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench.agents.tabular.count_table import CodeCountTableAgent
 from imagine_bench.agents.tabular.counts import CountTable
@@ -119,13 +119,7 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
 @pytest.mark.parametrize("directed", [False, True])
 def test_a_restored_agent_goes_on_bit_for_bit(directed: bool) -> None:
     learner, other = agent(directed=directed), agent(directed=directed, seed=5)
-    live(learner, 60)
-    live(other, 25, seed=9)
-    other.restore(learner.state())
-    assert same(learner.state(), other.state())
-    for each in (learner, other):
-        live(each, 60, seed=3)
-    assert same(learner.state(), other.state())
+    goes_on(learner, other, live, 60)
     seen = Observation(frame=fake_codes.frame(fake_codes.starts()[0]))
     assert learner.q_values(seen).tobytes() == other.q_values(seen).tobytes()
 

@@ -8,7 +8,7 @@ from typing import Any
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
+from agent_states import goes_on, same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench.agents.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench.agents.tabular.counts import CountTable
@@ -129,16 +129,10 @@ def test_exploration_draws_among_equals_and_only_those() -> None:
 def test_a_restored_agent_goes_on_bit_for_bit(planning: int) -> None:
     learner, other = agent(planning), agent(planning, seed=5)
     other.restore(learner.state())
-    live(learner, 60)
-    live(other, 25, seed=9)
-    saved = learner.state()
-    other.restore(saved)
-    assert same(learner.state(), other.state())
-    for each in (learner, other):
-        live(each, 60, seed=3)
-    assert same(learner.state(), other.state()) and learner.state().values["steps"] == 120
+    saved = goes_on(learner, other, live, 60)
+    assert learner.state().values["steps"] == 120
     learner.restore(saved)
-    assert same(learner.state(), saved) and learner.steps == 60, "what was learned since changed no snapshot"
+    assert same(learner.state(), saved) and learner.steps == 60
     assert not same(learner.state(), other.state())
     live(learner, 60, seed=3)
     assert same(learner.state(), other.state())
