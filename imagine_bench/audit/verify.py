@@ -1,7 +1,7 @@
 """Verification: every kept test episode is played again, and all that follows from them is computed anew.
 
-What a replay cannot show is not vouched for: CPU times, diagnostics, what observers measured, and that the agents would
-choose these actions again.
+What a replay cannot show is not vouched for: CPU times, diagnostics, what observers measured, pictures, and that the
+agents would choose these actions again.
 """
 
 from __future__ import annotations
