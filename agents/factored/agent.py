@@ -22,14 +22,13 @@ from .exploration import last_step, query
 from .factors import Code, CodeReplay, CodeTransition
 from .model import FactoredModel
 from .perception import CodePerception, ImaginedStep, load_code_perception
-from .planner import Planner
+from .planner import TIE, Planner
 from .settings import HYPERPARAMETERS, FactoredSettings
 
 _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
 _TERMINAL = 0.5
 """Predicted probability above which an imagined episode ends."""
-_TIE = 1e-9
 
 
 class Perception(Protocol):
@@ -81,7 +80,7 @@ class CodeAgent(Generic[PerceptionT]):
         if not explore:
             return int(self._values(code).argmax())
         values = self._exploring_values(code)
-        return int(self.rng.choice(np.flatnonzero(values >= values.max() - _TIE)))
+        return int(self.rng.choice(np.flatnonzero(values >= values.max() - TIE)))
 
     def _exploring_values(self, code: Code) -> Floats:
         planning = self.settings.planning

@@ -4,7 +4,7 @@ Two values are planned. The *value* of an action is the expected discounted rewa
 model, Sutton 1990). Its *novelty* is the largest discounted chance of meeting something unknown on the way: the best
 single discovery, not a sum, so that cycles gain nothing. Acting for novelty until there is nothing left to find, then
 for value, is "explicit explore or exploit" (E3, Kearns & Singh 2002); valuing the unknown at the best reward seen is
-R-max (Brafman & Tennenholtz 2002).
+R-max (Brafman & Tennenholtz 2002). A search for the unknown ends as soon as nothing farther can be worth as much.
 """
 
 from __future__ import annotations
@@ -12,22 +12,29 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats
 
-from .factors import Code, Codes
+from .factors import Code
 from .model import FactoredModel
+from .predictions import Predictions, Rows
 from .settings import PlanningSettings
 
-_HAPPENS = 1e-3
-"""Branches in which the episode goes on less probably than this are not followed."""
+_KEPT = 20
+"""Predictions of more codes than so many plans visit are dropped."""
+TIE = 1e-9
+"""Actions whose values differ by less are worth the same."""
 
 Objective = Literal["value", "optimistic", "novelty"]
 
 
 class Planner:
-    """Plans with one model; :meth:`clear` what was predicted whenever the model has learned."""
+    """Plans with one model; :meth:`clear` what was predicted whenever the model has learned.
+
+    A plan holds everything within reach of a code, and then all its codes share it, or, where too much is within
+    reach, what is nearest to that code: so values never depend on what was asked before, and a resumed agent finds the
+    same.
+    """
 
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
         self._model, self._settings = model, settings
@@ -35,103 +42,72 @@ class Planner:
 
     def clear(self) -> None:
         """Drop every prediction."""
-        shape = (0, self._model.n_actions)
-        self._index: dict[Code, int] = {}
-        self._reward, self._unknown, self._ends = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self._next = np.zeros((*shape, self._settings.branches), dtype=np.int64)
-        self._continues = np.zeros((*shape, self._settings.branches))
-        self._planned: dict[Objective, Floats] = {}
-        self._only: Code | None = None
-
-    @property
-    def expanded(self) -> int:
-        """Codes whose successors are predicted."""
-        return len(self._reward)
+        self._predictions = Predictions(self._model, self._settings.branches)
+        self._known: dict[Objective, dict[int, Floats]] = {"value": {}, "optimistic": {}, "novelty": {}}
+        self.expanded = 0
+        """Codes of the newest plan whose successors are predicted."""
 
     def values(self, code: Code, objective: Objective = "value") -> Floats:
         """What each action in ``code`` is worth. Shape (A,).
 
         ``"value"`` is the expected discounted reward; ``"optimistic"`` the same if whatever is unknown brought the
-        largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown.
+        largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
+        largest need be exact.
         """
-        row = self._row(code)
-        if objective not in self._planned:
-            self._planned[objective] = self._back_up(objective)
-        return np.asarray(self._planned[objective][row])
+        if len(self._predictions) > _KEPT * self._settings.states:
+            self.clear()
+        root, known = self._predictions.row(code), self._known[objective]
+        if root not in known:
+            known.update(self._plan(root, objective))
+        return known[root].copy()
 
     def outcome(self, code: Code) -> tuple[Floats, Floats, Floats]:
         """Expected reward of each action, P(it ends the episode), and how much it does is unknown: three (A,)."""
-        row = self._row(code)
-        return self._reward[row], self._ends[row], self._unknown[row]
+        row, predictions = self._predictions.row(code), self._predictions
+        predictions.expand(np.array([row]))
+        return predictions.reward[row], predictions.ends[row], predictions.unknown[row]
 
-    def _back_up(self, objective: Objective) -> Floats:
-        """Action values of every expanded code, ``depth`` macro-actions deep. Shape (expanded, A)."""
-        settings = self._settings
+    def _plan(self, root: int, objective: Objective) -> dict[int, Floats]:
+        """Action values (A,) of every row within reach of ``root``, or of it alone where that is too much."""
+        rows = front = np.array([root])
+        self.expanded = 0
+        while len(front) and len(rows) <= self._settings.states:
+            self._predictions.expand(front)
+            self.expanded = len(rows)
+            front = np.setdiff1d(self._predictions.following(front), rows)
+            rows = np.concatenate([rows, front])
+            if objective == "novelty" and len(front) and (found := self._discovery(rows)) is not None:
+                return {root: found}
+        values = self._back_up(rows, objective)
+        return {root: values[0].copy()} if len(front) else dict(zip(rows.tolist(), values, strict=True))
+
+    def _discovery(self, rows: Rows) -> Floats | None:
+        """Novelty (A,) of the first of ``rows``; None where what lies beyond them may change the best actions."""
+        near = self._back_up(rows, "novelty")[0]
+        far = self._back_up(rows, "novelty", beyond=1.0)[0]
+        return None if ((far > near) & (far >= near.max() - TIE)).any() else near
+
+    def _back_up(self, rows: Rows, objective: Objective, beyond: float = 0.0) -> Floats:
+        """Action values of the expanded rows, which come first, (expanded, A); all others are worth ``beyond``."""
+        settings, predictions, inside = self._settings, self._predictions, rows[: self.expanded]
         best = self._model.outcomes.rewards.max()
-        state, action = np.zeros(len(self._index)), self._reward
+        place = np.zeros(len(predictions), dtype=np.int64)
+        place[rows] = np.arange(len(rows))
+        reward, unknown, continues = (
+            predictions.reward[inside],
+            predictions.unknown[inside],
+            predictions.continues[inside],
+        )
+        following = place[predictions.next[inside]]
+        state, action = np.zeros(len(rows)), reward
+        state[self.expanded :] = beyond
         for _ in range(settings.depth):
-            ahead = (self._continues * state[self._next]).sum(axis=2)
+            ahead = (continues * state[following]).sum(axis=2)
             if objective == "novelty":
-                action = np.maximum(self._unknown, settings.novelty_discount * ahead)
+                action = np.maximum(unknown, settings.novelty_discount * ahead)
             else:
-                action = self._reward + settings.discount * ahead
+                action = reward + settings.discount * ahead
             if objective == "optimistic":
-                action = (1.0 - self._unknown) * action + self._unknown * best
-            state[: len(action)] = action.max(axis=1)
+                action = (1.0 - unknown) * action + unknown * best
+            state[: self.expanded] = action.max(axis=1)
         return action
-
-    def _row(self, code: Code) -> int:
-        """Row of a code; everything within its reach is expanded first if it is new.
-
-        A plan is whole or, where too much is within reach, belongs to one code only: so values never depend on what
-        was asked before, and a resumed agent finds the same.
-        """
-        if self._only not in (None, code):
-            self.clear()
-        if code not in self._index:
-            alone = not self._index
-            whole = self._expand_from(code)
-            if not whole and not alone:
-                self.clear()
-                whole = self._expand_from(code)
-            self._only = None if whole else code
-        return self._index[code]
-
-    def _expand_from(self, code: Code) -> bool:
-        """Expand a new code and all that follow; whether they are within bounds."""
-        front, self._planned = [code], {}
-        self._reserve(front)
-        while front and len(self._index) <= self._settings.states:
-            front = self._expand(front)
-            self._reserve(front)
-        return not front
-
-    def _reserve(self, codes: list[Code]) -> None:
-        self._index.update({code: len(self._index) + offset for offset, code in enumerate(codes)})
-
-    def _expand(self, front: list[Code]) -> list[Code]:
-        """Predict the successors of codes that have rows reserved; the codes met first there."""
-        found = self._model.successors(np.array(front, dtype=np.int64))
-        continues = np.where(found.p_continues > _HAPPENS, found.p_continues, 0.0)
-        rows, met = self._rows(found.following, continues > 0.0)
-        self._reward = np.concatenate([self._reward, found.reward])
-        self._unknown = np.concatenate([self._unknown, found.unknown])
-        self._ends = np.concatenate([self._ends, found.p_terminated])
-        self._next = np.concatenate([self._next, rows])
-        self._continues = np.concatenate([self._continues, continues])
-        return met
-
-    def _rows(self, codes: Codes, follows: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[Code]]:
-        """Rows of the codes (N, A, B, P) that follow, 0 elsewhere, and those among them that are new."""
-        rows, new = np.zeros(follows.shape, dtype=np.int64), dict[Code, int]()
-        if follows.any():
-            found = codes[follows]
-            packed = np.ravel_multi_index(tuple(found.T), tuple(found.max(axis=0) + 1))
-            _, first, which = np.unique(packed, return_index=True, return_inverse=True)
-            numbers = np.empty(len(first), dtype=np.int64)
-            for index in np.argsort(first).tolist():
-                code = tuple(found[first[index]].tolist())
-                row = self._index.get(code)
-                numbers[index] = new.setdefault(code, len(self._index) + len(new)) if row is None else row
-            rows[follows] = numbers[which]
-        return rows, list(new)

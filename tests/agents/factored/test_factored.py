@@ -15,7 +15,7 @@ from imagine_bench.agents.factored.dynamics import Dynamics
 from imagine_bench.agents.factored.factors import CodeTransition
 from imagine_bench.agents.factored.model import FactoredModel
 from imagine_bench.agents.factored.outcomes import OutcomeModel
-from imagine_bench.agents.factored.planner import Planner
+from imagine_bench.agents.factored.planner import TIE, Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
@@ -170,6 +170,27 @@ def test_a_bounded_plan_does_not_depend_on_what_was_asked_before(states: int) ->
         assert np.array_equal(Planner(model, planning).outcome(code), used.outcome(code))  # asked first, it imagines
         assert used.expanded <= states
     assert states >= len(starts()) or used.expanded < len(starts()), "the bound must bind"
+
+
+@pytest.mark.parametrize("discount", [0.95, 0.5])
+def test_a_search_that_ends_early_finds_the_same_best_actions(discount: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    planning = dataclasses.replace(FactoredSettings().planning, novelty_discount=discount)
+    seen, rng, early = rows(starts()), np.random.default_rng(0), 0
+    for few in (1, 3, 8, 20, 60):
+        model = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings())
+        for index in rng.integers(len(seen), size=few).tolist():
+            model.add(seen[index])
+        model.outcomes.fit()
+        ending, whole = Planner(model, planning), Planner(model, planning)
+        for code in starts():
+            found = ending.values(code, "novelty")
+            with monkeypatch.context() as patch:
+                patch.setattr(Planner, "_discovery", lambda *_: None)
+                wanted = whole.values(code, "novelty")
+            assert found.max() == wanted.max() and (found <= wanted).all()
+            assert np.array_equal(found >= found.max() - TIE, wanted >= wanted.max() - TIE)
+            early += ending.expanded < whole.expanded
+    assert early > 10, "searches must end early"
 
 
 def test_thirty_episodes_solve_the_tiny_task_far_above_chance() -> None:
