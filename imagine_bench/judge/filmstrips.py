@@ -99,8 +99,8 @@ def transition_sheet(
         draw.multiline_text((left_px(column), 8), lines, font=font(12, bold=True), fill=INK, spacing=3)
     for row, (name, images, verdicts) in enumerate(rows):
         top = HEADER_PX + row * height
-        label = "\n".join(textwrap.wrap(name, width=12, break_long_words=False))
-        draw.multiline_text((8, top + 40), label, font=font(13, bold=True), fill=INK, spacing=4)
+        label = "\n".join(textwrap.wrap(name, width=13))
+        draw.multiline_text((4, top + 40), label, font=font(11, bold=True), fill=INK, spacing=4)
         for column, image in enumerate(images):
             left = left_px(column)
             _paste(canvas, image, (left, top))

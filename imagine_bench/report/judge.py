@@ -85,7 +85,7 @@ _WORDS = {
     "What does it cost?": "On one core. What was spent on an encoder beforehand is in frames.",
 }
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
-_COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100")
+_COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100", "#000000")
 _SHARES = {
     *("total_variation", "tv_5", "tv_10", "after_the_end", "nothing"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
