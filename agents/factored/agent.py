@@ -110,10 +110,11 @@ class CodeAgent(Generic[PerceptionT]):
 
     def learn(self, end: int | None = None) -> None:
         """Bring the model from the first ``learned`` transitions to the first ``end``, or all, and plan anew."""
-        for row in self.replay.rows(self.learned, end):
+        rows = self.replay.rows(self.learned, end)
+        for row in rows:
             self.model.add(row)
         self.model.outcomes.fit()
-        self.planner.clear()
+        self.planner.learned({row.action for row in rows if row.has_dynamics})
         self.learned = len(self.replay) if end is None else end
 
     def _relearn(self, tasks: list[int], learned: int) -> None:
@@ -134,7 +135,7 @@ class CodeAgent(Generic[PerceptionT]):
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
         self.model.outcomes.reset_for_new_task()
-        self.planner.clear()
+        self.planner.learned(())
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
@@ -232,8 +233,10 @@ class FactoredAgent(CodeAgent[CodePerception]):
             nothing = np.zeros((len(codes), self.n_actions))
             where = np.repeat(self.perception.macrostates(codes)[:, None, None], self.n_actions, axis=1)
             return ExpectedOutcomes(macrostates=where, p_continues=nothing[..., None], reward=nothing)
-        found = self.model.successors(np.array(codes, dtype=np.int64))
-        branches = found.following.reshape(-1, found.following.shape[-1]).tolist()
+        where = np.array(codes, dtype=np.int64)
+        moves = self.model.moves(where)
+        found = self.model.results(where, moves)
+        branches = moves.following.reshape(-1, where.shape[1]).tolist()
         read = self.perception.macrostates([tuple(code) for code in branches])
         return ExpectedOutcomes(
             macrostates=read.reshape(*found.p_continues.shape, -1), p_continues=found.p_continues, reward=found.reward

@@ -22,7 +22,9 @@ from .settings import DynamicsSettings
 _LARGEST_TABLE = 1 << 16
 """Parent sets whose table would have more rows are not considered."""
 _NEGLIGIBLE = 1e-12
-"""Structures of less posterior probability, for every action, are left out of predictions."""
+"""Structures of no more posterior probability are left out of predictions."""
+EVERY = slice(None)
+"""All actions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,18 +85,19 @@ class FactorDynamics:
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
         return weight / weight.sum(axis=1, keepdims=True)
 
-    def predict(self, codes: Codes) -> FactorPrediction:
-        """What every action would lead to in ``codes`` (N, P)."""
-        weight, prior = self.weights(), self.settings.concentration
+    def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
+        """What some actions would lead to in ``codes`` (N, P)."""
+        weight, prior = self.weights()[actions], self.settings.concentration
+        weight[weight <= _NEGLIGIBLE] = 0.0
         stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]  # [N, A, K]
-        expected, seen, unknown = stay, stay * self._tried[:, None], np.zeros(stay.shape[:2])
-        for index in np.flatnonzero(weight[:, 1:].max(axis=0) > _NEGLIGIBLE).tolist():
+        expected, seen, unknown = stay, stay * self._tried[actions, None], np.zeros(stay.shape[:2])
+        for index in np.flatnonzero(weight[:, 1:].any(axis=0)).tolist():
             table, own = self.tables[index], weight[:, 1 + index, None]
             rows = table.row(codes)
             if len(rows) > table.counts.shape[1]:  # whole tables are less work
-                counts, at = table.counts.transpose(1, 0, 2), rows
+                counts, at = table.counts[actions].transpose(1, 0, 2), rows
             else:
-                counts, at = table.counts[:, rows].transpose(1, 0, 2), np.arange(len(rows))
+                counts, at = table.counts[actions, rows].transpose(1, 0, 2), np.arange(len(rows))
             total = counts.sum(axis=2, keepdims=True)
             known = total + prior * self.values
             expected = expected + (own * (counts + prior) / known)[at]
@@ -114,6 +117,6 @@ class Dynamics:
         for factor, value in zip(self.factors, following.tolist(), strict=True):
             factor.add(code, action, value)
 
-    def predict(self, codes: Codes) -> list[FactorPrediction]:
-        """What every action would make of each factor in ``codes`` (N, P)."""
-        return [factor.predict(codes) for factor in self.factors]
+    def predict(self, codes: Codes, actions: slice = EVERY) -> list[FactorPrediction]:
+        """What some actions would make of each factor in ``codes`` (N, P)."""
+        return [factor.predict(codes, actions) for factor in self.factors]

@@ -8,17 +8,25 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 
-from .dynamics import Dynamics
+from .dynamics import EVERY, Dynamics
 from .factors import Code, Codes, CodeTransition, as_codes
 from .outcomes import OutcomeModel
 from .settings import FactoredSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Successors:
-    """What every action would lead to from N codes; B branches each."""
+class Moves:
+    """Where actions would lead from N codes, as far as dynamics alone say; B branches each."""
 
     following: Codes  #: next codes. Shape (N, A, B, P).
+    chance: Floats  #: probability of each branch. Shape (N, A, B).
+    known: Floats  #: probability that nothing untested decides. Shape (N, A).
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """What these moves would bring."""
+
     p_continues: Floats  #: probability that this branch comes about and the episode goes on. Shape (N, A, B).
     reward: Floats  #: expected reward. Shape (N, A), as of all that follow.
     p_terminated: Floats  #: probability that the episode ends
@@ -29,7 +37,7 @@ class FactoredModel:
     """Learns from transitions between codes and predicts them; ``sizes`` are the numbers of values of the P factors."""
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings) -> None:
-        self.n_actions, self._planning = n_actions, settings.planning
+        self.n_actions, self.sizes, self._planning = n_actions, sizes, settings.planning
         self.dynamics = Dynamics(sizes, n_actions, settings.dynamics)
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
 
@@ -53,23 +61,26 @@ class FactoredModel:
         unknown = 1.0 - (1.0 - untested[0]) * np.prod([1.0 - each.unknown[0, action] for each in factors])
         return float(moved) * float(outcomes[0, causes.outcomes.index(outcome)]), float(unknown)
 
-    def successors(self, codes: Codes) -> Successors:
-        """What every action would lead to from ``codes`` (N, P)."""
-        factors = self.dynamics.predict(codes)
+    def moves(self, codes: Codes, actions: slice = EVERY) -> Moves:
+        """Where some actions would lead from ``codes`` (N, P)."""
+        factors = self.dynamics.predict(codes, actions)
         chance, following = self._branches([factor.expected for factor in factors])
-        shape = chance.shape
-        reward, ends, untested = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        known = np.prod([1.0 - factor.unknown for factor in factors], axis=0)
+        return Moves(following, chance, known)
+
+    def results(self, codes: Codes, moves: Moves) -> Results:
+        """What the moves of every action from ``codes`` (N, P) would bring."""
+        chance = moves.chance
+        reward, ends, untested = np.zeros(chance.shape), np.zeros(chance.shape), np.zeros(chance.shape)
         count, action, branch = comes = np.nonzero(chance)
-        outcomes, untested[comes] = self.outcomes.predict(codes[count], action, following[count, action, branch])
+        outcomes, untested[comes] = self.outcomes.predict(codes[count], action, moves.following[count, action, branch])
         reward[comes] = (outcomes * self.outcomes.rewards).sum(axis=1)
         ends[comes] = (outcomes * self.outcomes.ends).sum(axis=1)
-        known = np.prod([1.0 - factor.unknown for factor in factors], axis=0)  # [N, A]
-        return Successors(
-            following=following,
+        return Results(
             p_continues=chance * (1.0 - ends),
             reward=(chance * reward).sum(axis=2),
             p_terminated=(chance * ends).sum(axis=2),
-            unknown=1.0 - known * (1.0 - (chance * untested).sum(axis=2)),
+            unknown=1.0 - moves.known * (1.0 - (chance * untested).sum(axis=2)),
         )
 
     def sample(self, code: Code, action: int, rng: np.random.Generator) -> tuple[Code, float]:

@@ -9,6 +9,7 @@ R-max (Brafman & Tennenholtz 2002). A search for the unknown ends as soon as not
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -29,7 +30,7 @@ Objective = Literal["value", "optimistic", "novelty"]
 
 
 class Planner:
-    """Plans with one model; :meth:`clear` what was predicted whenever the model has learned.
+    """Plans with one model, which must say when it :meth:`learned`.
 
     A plan holds everything within reach of a code, and then all its codes share it, or, where too much is within
     reach, what is nearest to that code: so values never depend on what was asked before, and a resumed agent finds the
@@ -38,14 +39,19 @@ class Planner:
 
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
         self._model, self._settings = model, settings
-        self.clear()
-
-    def clear(self) -> None:
-        """Drop every prediction."""
-        self._predictions = Predictions(self._model, self._settings.branches)
-        self._known: dict[Objective, dict[int, Floats]] = {"value": {}, "optimistic": {}, "novelty": {}}
         self.expanded = 0
         """Codes of the newest plan whose successors are predicted."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop every prediction."""
+        self._predictions = Predictions(self._model, self._settings.branches)
+        self.learned(())
+
+    def learned(self, actions: Iterable[int]) -> None:
+        """The model has learned something, and of the dynamics of these actions: plan anew."""
+        self._predictions.learned(actions)
+        self._known: dict[Objective, dict[int, Floats]] = {"value": {}, "optimistic": {}, "novelty": {}}
 
     def values(self, code: Code, objective: Objective = "value") -> Floats:
         """What each action in ``code`` is worth. Shape (A,).
@@ -55,7 +61,7 @@ class Planner:
         largest need be exact.
         """
         if len(self._predictions) > _KEPT * self._settings.states:
-            self.clear()
+            self._forget()
         root, known = self._predictions.row(code), self._known[objective]
         if root not in known:
             known.update(self._plan(root, objective))

@@ -13,7 +13,7 @@ from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
 from imagine_bench.agents.factored.dynamics import Dynamics
 from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.model import FactoredModel
+from imagine_bench.agents.factored.model import FactoredModel, Moves, Results
 from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.planner import TIE, Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
@@ -125,18 +125,19 @@ class _Chain:
     outcomes = SimpleNamespace(rewards=np.array([10.0]))
 
     def __init__(self, length: int, branches: int) -> None:
-        self.length, self.branches = length, branches
+        self.length, self.branches, self.sizes = length, branches, (length,)
 
-    def successors(self, codes: NDArray[np.int64]) -> SimpleNamespace:
-        last = codes[:, :1] == self.length - 1  # [N, A]
+    def moves(self, codes: NDArray[np.int64], actions: slice) -> Moves:
         following = np.zeros((len(codes), 1, self.branches, 1), dtype=np.int64)
-        following[:, 0, 0] = codes + 1
-        p_continues = np.zeros((len(codes), 1, self.branches))
-        p_continues[:, :, 0] = ~last
-        ends = last.astype(float)
-        return SimpleNamespace(
-            following=following, p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends
-        )
+        following[:, 0, 0] = np.minimum(codes + 1, self.length - 1)
+        chance = np.zeros((len(codes), 1, self.branches))
+        chance[:, :, 0] = 1.0
+        return Moves(following, chance, np.ones((len(codes), 1)))
+
+    def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
+        ends = (codes[:, :1] == self.length - 1).astype(float)  # [N, A]
+        p_continues = moves.chance * (1.0 - ends[:, :, None])
+        return Results(p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends)
 
 
 @pytest.mark.parametrize("depth", [1, 4, 5, 20])
@@ -170,6 +171,23 @@ def test_a_bounded_plan_does_not_depend_on_what_was_asked_before(states: int) ->
         assert np.array_equal(Planner(model, planning).outcome(code), used.outcome(code))  # asked first, it imagines
         assert used.expanded <= states
     assert states >= len(starts()) or used.expanded < len(starts()), "the bound must bind"
+
+
+def test_predictions_that_are_kept_are_those_that_would_be_made_now() -> None:
+    """To the bit, though only what an action was learned of is predicted anew."""
+    model, rng = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings()), np.random.default_rng(0)
+    planner = Planner(model, FactoredSettings().planning)
+    seen = rows(starts())
+    for index in rng.permutation(len(seen)).tolist():
+        model.add(seen[index])
+        model.outcomes.fit()
+        planner.learned({seen[index].action})
+        for code in starts():
+            fresh = Planner(model, FactoredSettings().planning)
+            assert np.array_equal(planner.outcome(code), fresh.outcome(code))
+            assert np.array_equal(planner.values(code), fresh.values(code))
+            assert np.array_equal(planner.values(code, "optimistic"), fresh.values(code, "optimistic"))
+            assert planner.values(code, "novelty").max() == fresh.values(code, "novelty").max()
 
 
 @pytest.mark.parametrize("discount", [0.95, 0.5])
@@ -326,9 +344,9 @@ def test_optimism_values_the_unknown_at_the_best_reward(place: int) -> None:
     class Untried(_Chain):
         """Only the end brings a reward; what the others do is half unknown."""
 
-        def successors(self, codes: NDArray[np.int64]) -> SimpleNamespace:
-            found = super().successors(codes)
-            return SimpleNamespace(**{**vars(found), "unknown": np.full_like(found.unknown, 0.5)})
+        def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
+            found = super().results(codes, moves)
+            return dataclasses.replace(found, unknown=np.full_like(found.unknown, 0.5))
 
     settings = dataclasses.replace(FactoredSettings().planning, depth=9, discount=0.9)
     planner = Planner(Untried(5, settings.branches), settings)  # type: ignore[arg-type]

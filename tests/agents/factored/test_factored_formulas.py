@@ -115,7 +115,8 @@ def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) 
 
 
 def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
-    found = model.successors(np.array(CODES))
+    moves = model.moves(np.array(CODES))
+    found = model.results(np.array(CODES), moves)
     causes = model.outcomes.causes
     assert causes is not None and len(causes.outcomes) == 2
     dropped = 0
@@ -132,7 +133,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
             over = sum(share for outcome, share in chance.items() if causes.outcomes[outcome][1])
             reward += weight * sum(share * causes.outcomes[outcome][0] for outcome, share in chance.items())
             ends, untested, goes_on[after] = ends + weight * over, untested + weight * unsure, weight * (1.0 - over)
-        branches = zip(map(tuple, found.following[row, action].tolist()), found.p_continues[row, action], strict=True)
+        branches = zip(map(tuple, moves.following[row, action].tolist()), found.p_continues[row, action], strict=True)
         assert {after: share for after, share in branches if share > 0.0} == pytest.approx(goes_on)
         assert found.reward[row, action] == pytest.approx(reward)
         assert found.p_terminated[row, action] == pytest.approx(ends)
