@@ -46,7 +46,7 @@ class PlanningSettings:
     discount: float = setting(0.95, PROBABILITY)  #: of rewards, a macro-action
     branches: int = setting(8, COUNT)  #: most next codes of one action
     least_probability: float = setting(0.02, PROBABILITY)  #: less likely ones are not followed, but for the likeliest
-    states: int = setting(1500, between(1, 1_000_000))  #: most codes that one plan visits
+    states: int = setting(400, between(1, 1_000_000))  #: most codes that one plan visits
     #: ``"curiosity"`` goes where most is unknown, ``"optimism"`` values the unknown at the best reward seen,
     #: ``"random"`` acts greedily but for random actions (the last two are ablations).
     exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))
