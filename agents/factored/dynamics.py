@@ -9,6 +9,7 @@ over the hypothesis that the action leaves the factor alone. Stochastic results 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +33,6 @@ class FactorPrediction:
     """What each action would make of one factor in N codes."""
 
     expected: Floats  #: predictive probability of each value. Shape (N, A, K).
-    #: From observations alone: staying, if ever tried, and frequencies; 0 where there are none. Shape (N, A, K).
-    seen: Floats
     unknown: Floats  #: weight of the prior in ``expected``. Shape (N, A).
 
 
@@ -87,23 +86,55 @@ class FactorDynamics:
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
         """What some actions would lead to in ``codes`` (N, P)."""
-        weight, prior = self.weights()[actions], self.settings.concentration
+        weight, prior = self._weights(actions), self.settings.concentration
+        expected = self._stays(weight, codes)
+        unknown = np.zeros(expected.shape[:2])
+        for own, counts, at in self._counted(weight, codes, actions):
+            known = counts.sum(axis=2, keepdims=True) + prior * self.values
+            expected = expected + (own * (counts + prior) / known)[at]
+            unknown += (own * prior * self.values / known)[at, :, 0]
+        return FactorPrediction(expected, unknown)
+
+    def seen(self, codes: Codes) -> Floats:
+        """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
+        weight = self._weights(EVERY)
+        seen = self._stays(weight, codes) * self._tried[:, None]
+        for own, counts, at in self._counted(weight, codes, EVERY):
+            seen = seen + (own * counts / np.maximum(counts.sum(axis=2, keepdims=True), 1.0))[at]
+        return seen
+
+    def happens(self, codes: Codes, actions: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """How probable each value is after one action (N,) each, as it was seen to happen, or as expected where never.
+
+        Returns these, (N, K), and the weight of the prior, (N,).
+        """
+        each, predicted = np.arange(len(codes)), self.predict(codes)
+        seen, unknown = self.seen(codes)[each, actions], predicted.unknown[each, actions]
+        chance = np.where((seen.sum(axis=1) > unknown)[:, None], seen, predicted.expected[each, actions])
+        return chance / chance.sum(axis=1, keepdims=True), unknown
+
+    def _weights(self, actions: slice) -> Floats:
+        """Those of :meth:`weights` that are not negligible."""
+        weight = self.weights()[actions]
         weight[weight <= _NEGLIGIBLE] = 0.0
-        stay = weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]  # [N, A, K]
-        expected, seen, unknown = stay, stay * self._tried[actions, None], np.zeros(stay.shape[:2])
+        return weight
+
+    def _stays(self, weight: Floats, codes: Codes) -> Floats:
+        """The share of structures by which the factor is left alone, at its value. Shape (N, A, K)."""
+        return weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]
+
+    def _counted(
+        self, weight: Floats, codes: Codes, actions: slice
+    ) -> Iterator[tuple[Floats, Floats, NDArray[np.int64]]]:
+        """Of each table that matters: its weights (A, 1), counts (R, A, K), and which R is a code's, (N,)."""
         for index in np.flatnonzero(weight[:, 1:].any(axis=0)).tolist():
-            table, own = self.tables[index], weight[:, 1 + index, None]
+            table = self.tables[index]
             rows = table.row(codes)
             if len(rows) > table.counts.shape[1]:  # whole tables are less work
                 counts, at = table.counts[actions].transpose(1, 0, 2), rows
             else:
                 counts, at = table.counts[actions, rows].transpose(1, 0, 2), np.arange(len(rows))
-            total = counts.sum(axis=2, keepdims=True)
-            known = total + prior * self.values
-            expected = expected + (own * (counts + prior) / known)[at]
-            seen = seen + (own * counts / np.maximum(total, 1.0))[at]
-            unknown += (own * prior * self.values / known)[at, :, 0]
-        return FactorPrediction(expected, seen, unknown)
+            yield weight[:, 1 + index, None], counts, at
 
 
 class Dynamics:

@@ -31,12 +31,13 @@ SHIFT_PX = 5
 _CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no change
 _CHANGES = (2, 0.03)  # times, and share of the frames, that a pixel must change to belong to a factor
 _LEAST_PX = 36  # pixels of a factor
-_FLAT = 0.02  # of a crop's energy, as most have it: what a crop without contours counts as
+_FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
 _SAME, _OTHER = 0.15, 0.2  # distance that jitter makes; the least distance of two values
 _ROUND = 0.05  # added to heights where gaps are compared by their ratio
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
+_TOLD = 8  # times that either of two pixels must change in half of the time for that half to tell
 _TELLING, _NOISE = 20, 0.5  # in so many frames, the share of looks seen once beyond which a region is noise
 _RESTS = 0.5  # share of the steps in which a pixel of noise may change and yet show something else, too
 _SEEN = 3  # times that a value must have been seen to tell whether it varies freely
@@ -179,21 +180,22 @@ def changes(images: Images) -> Mask:
 def regions(change: Mask, pixels: Mask) -> list[Mask]:
     """Regions (64, 64) of ``pixels``, of which each changes at the same times (N, 64, 64), the largest first.
 
-    A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does.
+    A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does, and
+    in each half of the time, too, where it tells. Else a habit of the agent, kept for a while, would bind two things.
     Pixels that hang together are parted so only if most of them are in a region then; else they are one.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
-    alone, links = change.sum(axis=0), []
+    spans, told, links = (change, *np.array_split(change, 2)), np.array([[0], [_TOLD], [_TOLD]]), []
     for one, other in _NEIGHBOURS:
         near = pixels[one] & pixels[other]
         rows, columns = place[one][near], place[other][near]
-        both = (change[:, rows] * change[:, columns]).sum(axis=0)
-        together = both > np.maximum(_TOGETHER * (alone[rows] + alone[columns] - both), 0.5)  # once, or oftener
-        links.append(np.stack([rows, columns])[:, together])
-    graph = scipy.sparse.coo_matrix(
-        (np.ones(sum(link.shape[1] for link in links)), np.concatenate(links, axis=1)), shape=(len(alone), len(alone))
-    )
+        both = np.stack([(span[:, rows] * span[:, columns]).sum(axis=0) for span in spans])
+        either = np.stack([span[:, rows].sum(axis=0) + span[:, columns].sum(axis=0) for span in spans]) - both
+        together = (both > _TOGETHER * either) | (either < told)
+        links.append(np.stack([rows, columns])[:, together.all(axis=0)])
+    every = np.concatenate(links, axis=1)
+    graph = scipy.sparse.coo_matrix((np.ones(every.shape[1]), every), shape=(change.shape[1], change.shape[1]))
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     pieces = np.full(pixels.shape, -1)
     pieces[pixels] = label

@@ -89,10 +89,8 @@ class FactoredModel:
         Returns the code, and the probability of the likeliest one.
         """
         following, p_likeliest = [], 1.0
-        for factor in self.dynamics.predict(as_codes(code)[None]):
-            seen = factor.seen[0, action]
-            chance = seen if seen.sum() > factor.unknown[0, action] else factor.expected[0, action]
-            chance = chance / chance.sum()
+        for factor in self.dynamics.factors:
+            (chance,), _ = factor.happens(as_codes(code)[None], np.array([action]))
             following.append(int(rng.choice(len(chance), p=chance)))
             p_likeliest *= float(chance.max())
         return tuple(following), p_likeliest

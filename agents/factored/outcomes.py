@@ -12,6 +12,7 @@ conjunctions rather than by whole states (width-based search, Lipovetzky & Geffn
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,14 +32,24 @@ Outcome = tuple[float, bool]
 """Reward, and whether the episode ended."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Template:
-    """Conjunctions over one set of factors: ``first`` numbers its first; those ``with_action`` hold the action too."""
+class _Templates:
+    """Conjunctions over T sets of factors, numbered by the values of these: one number in each set holds in a code."""
 
-    factors: list[int]
-    strides: NDArray[np.int64]
-    with_action: bool
-    first: int
+    def __init__(self) -> None:
+        self._first: list[int] = []
+        self._multipliers: list[Floats] = []
+
+    def append(self, factors: Sequence[int], sizes: Sequence[int], first: int) -> None:
+        """One more set, of factors of so many values; ``first`` is its first number."""
+        multipliers = np.zeros(len(sizes))
+        multipliers[list(factors)] = strides(tuple(factors), tuple(sizes))
+        self._first.append(first)
+        self._multipliers.append(multipliers)
+
+    def numbers(self, codes: Codes) -> NDArray[np.int64]:
+        """Those that hold in codes (N, P). Shape (N, T)."""
+        found = codes.astype(np.float64) @ np.stack(self._multipliers, axis=1)  # fast, and these numbers are exact
+        return np.asarray(found.astype(np.int64) + np.array(self._first))
 
 
 class Conjunctions:
@@ -50,19 +61,21 @@ class Conjunctions:
     """
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: OutcomeSettings) -> None:
-        self._n_actions = n_actions
         count = len(sizes)
         orders = sorted({*range(1, min(settings.order, count) + 1), count})
         sets = [factors for order in orders for factors in itertools.combinations(range(count), order)]
-        self._templates: list[_Template] = []
+        self._next, self._choice = _Templates(), _Templates()
         members: list[NDArray[np.int64]] = []
         groups: dict[tuple[bool, int], int] = {}
         first = 0
-        for with_action, factors in [(False, each) for each in sets] + [(True, each) for each in [(), *sets]]:
-            size = table_size(factors, sizes) * (n_actions if with_action else 1)
+        for templates, with_action, factors in (
+            *((self._next, False, each) for each in sets), *((self._choice, True, each) for each in [(), *sets])
+        ):  # fmt: skip
+            whole, every = ((*factors, count), (*sizes, n_actions)) if with_action else (factors, sizes)
+            size = table_size(whole, every)
             if size > _LARGEST_TEMPLATE:
                 continue
-            self._templates.append(_Template(list(factors), strides(factors, sizes), with_action, first))
+            templates.append(whole, every, first)
             members.append(np.full(size, groups.setdefault((with_action, len(factors)), len(groups))))
             first += size
         self.group = np.concatenate(members)
@@ -75,19 +88,11 @@ class Conjunctions:
 
     def of_next(self, following: Codes) -> NDArray[np.int64]:
         """Those of them that are about the next code alone."""
-        return self._numbers([template for template in self._templates if not template.with_action], following, 1, 0)
+        return self._next.numbers(following)
 
     def of_choice(self, codes: Codes, actions: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of them that are about the action and the code before it."""
-        chosen = [template for template in self._templates if template.with_action]
-        return self._numbers(chosen, codes, self._n_actions, actions)
-
-    @staticmethod
-    def _numbers(
-        templates: list[_Template], codes: Codes, n_actions: int, actions: NDArray[np.int64] | int
-    ) -> NDArray[np.int64]:
-        numbers = [each.first + codes[:, each.factors] @ each.strides * n_actions + actions for each in templates]
-        return np.stack(numbers, axis=1)
+        return self._choice.numbers(np.column_stack([codes, actions]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +128,8 @@ class OutcomeModel:
         self._priors: dict[Outcome, Floats] = {}
         self._counts: dict[tuple[Code, int, Code, int], int] = {}
         self.causes: Causes | None = None
+        self._known, self._spared = np.ones(0), np.zeros((0, 0))
+        """Probability that each conjunction is no untested cause, (J,), and log of that it causes nothing, (O, J)."""
 
     def add(self, row: CodeTransition) -> None:
         """Take in one transition; :meth:`fit` learns from it."""
@@ -140,7 +147,10 @@ class OutcomeModel:
         active = self.conjunctions.active(codes, actions, following)
         evidence = _Evidence(active, outcome, np.array(list(self._counts.values()), dtype=np.float64))
         candidates = [self._explain(evidence, default) for default in range(len(self.outcomes))]
-        self.causes = max(candidates, key=lambda causes: causes.log_posterior)
+        self.causes = causes = max(candidates, key=lambda causes: causes.log_posterior)
+        pseudo_tests = self.settings.pseudo_tests
+        self._known = 1.0 - causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)
+        self._spared = np.log1p(-causes.strength)
 
     def reset_for_new_task(self) -> None:
         """Forget all that was seen; earlier causes become priors, until a test of this task refutes them.
@@ -176,9 +186,7 @@ class OutcomeModel:
         """Outcome probabilities (N, O) of N transitions, and the probability that something untested decides (N,)."""
         causes = self.causes
         assert causes is not None, "fit before predicting"
-        pseudo_tests = self.settings.pseudo_tests
-        known = 1.0 - causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)  # [J]
-        spared = np.log1p(-causes.strength)  # [O, J]
+        known, spared = self._known, self._spared
         which, at = _distinct(following, self._strides)
         how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
         none, tested = np.zeros((len(spared), len(codes))), np.ones(len(codes))

@@ -67,14 +67,10 @@ class StructuredModel:
         self, codes: Codes, action: NDArray[np.int64], rng: np.random.Generator
     ) -> tuple[Codes, Floats, Floats, Floats, Floats]:
         """Next codes (R, P), and of each row reward, P(end), P(untested) and P(other), (R,)."""
-        every, following = np.arange(len(codes)), np.zeros_like(codes)
-        known, likeliest = np.ones(len(codes)), np.ones(len(codes))
-        for factor, predicted in enumerate(self.model.dynamics.predict(codes)):
-            seen, unknown = predicted.seen[every, action], predicted.unknown[every, action]
-            trusted = (seen.sum(axis=1) > unknown)[:, None]
-            chance = np.where(trusted, seen, predicted.expected[every, action])
-            chance = chance / chance.sum(axis=1, keepdims=True)
-            following[:, factor] = (chance.cumsum(axis=1) < rng.random((len(codes), 1))).sum(axis=1)
+        following, known, likeliest = np.zeros_like(codes), np.ones(len(codes)), np.ones(len(codes))
+        for index, factor in enumerate(self.model.dynamics.factors):
+            chance, unknown = factor.happens(codes, action)
+            following[:, index] = (chance.cumsum(axis=1) < rng.random((len(codes), 1))).sum(axis=1)
             known, likeliest = known * (1.0 - unknown), likeliest * chance.max(axis=1)
         following = np.minimum(following, np.array(self.sizes) - 1)
         outcomes, untested = self.model.outcomes.predict(codes, action, following)

@@ -11,6 +11,7 @@ import tyro
 from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.cli.options import added_up, listed, require_values, shown
 from imagine_bench.errors import RunFailedError
+from imagine_bench.machine import usable_cores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,8 @@ class Suite:
             require_values(name, getattr(self, name))
         suite = with_seeds(LADDER, self.seeds).only(added_up("experiment", self.experiment))
         where = launcher(self.launcher, self.workers)
-        result = run_suite(suite, self.agents or AGENTS, root=self.out, launcher=where)
+        planners = self.workers or usable_cores()
+        result = run_suite(suite, self.agents or AGENTS, root=self.out, launcher=where, planners=planners)
         print(suite_table(result))
         print(f"\nReport:     {write_suite(result, self.out)}")
         if result.failures:

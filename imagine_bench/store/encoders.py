@@ -22,6 +22,7 @@ from imagine_bench.store.files import lock, make_folder, read_json, sha256
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.offered_encoder:fit_offered"
 _SUFFIX = ".safetensors"
+_PATIENCE_S = 3600.0
 
 
 def bundled() -> dict[str, Path]:
@@ -49,7 +50,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
     Raises:
         InvalidValueError: What is offered gives no latents for frames.
         SetupError: As :func:`.registry.task_entry`.
-        BusyError: Another process makes it.
+        BusyError: Another process makes it, for longer than an hour.
     """
     entry = registry.offered(name, {}, registry.ENCODER_GROUP)
     frames = spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
@@ -108,7 +109,7 @@ def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str
 def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
     """The task's own encoder of a kind; one of looks that none is bundled for is trained once.
 
-    Raises as :func:`resolve`, and BusyError: another process trains it.
+    Raises as :func:`resolve`, and BusyError: another process trains it, for longer than an hour.
     """
     named = registry.is_own(spec.id) and appearance in APPEARANCES
     looks_bundled = named and any(name.startswith(f"{spec.encoder}-") for name in bundled())
@@ -122,9 +123,9 @@ def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
 
 
 def _once(path: Path, what: str, make: Callable[[], object]) -> None:
-    """Make an artefact unless it is there; two processes do not make it at once."""
+    """Make an artefact unless it is there; a process waits while another makes it."""
     make_folder(path.parent)
-    with lock(path.parent / ".lock", f"The folder of encoders {path.parent}"):
+    with lock(path.parent / ".lock", f"The folder of encoders {path.parent}", patience_s=_PATIENCE_S):
         if not path.is_file():
             print(f"{what} into {path.parent}, once.")
             make()

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import multiprocessing
+import os
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.bench.bench import carry_out, plan
 from imagine_bench.bench.launchers.jobs import Launcher
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders
@@ -26,6 +30,9 @@ from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_benc
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.suite.experiments import Experiment, Level, Suite
 from imagine_bench.suite.score import Scale, auroc, score
+
+Planned = list[tuple[tuple[Protocol, ...], Encoders]]
+"""Of each agent its benches of one level, one a seed, and the encoders they need."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,16 +87,45 @@ def plan_level(suite: Suite, level: Level, agent: str) -> tuple[tuple[Protocol, 
     return tuple(dataclasses.replace(whole, seeds=(seed,)) for seed in whole.seeds), paths
 
 
-def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher) -> SuiteResult:
-    """Run what is missing of a suite; runs that fail cost the others nothing.
+def _plan_all(suite: Suite, level: Level, agents: Sequence[str]) -> Planned:
+    return [plan_level(suite, level, agent) for agent in agents]
+
+
+def _try_to_plan(suite: Suite, level: Level, agents: Sequence[str]) -> Planned | None:
+    """The same, or None where it fails: an error is raised where it is asked for again."""
+    try:
+        return _plan_all(suite, level, agents)
+    except ImagineBenchError:
+        return None
+
+
+def plan_suite(suite: Suite, agents: Sequence[str], workers: int) -> dict[tuple[str, str], Planned]:
+    """Of every experiment and level what :func:`plan_level` gives each agent; as many encoders are trained at once.
+
+    Raises as :func:`plan_level`.
+    """
+    every = [(each, level) for each in suite.experiments for level in each.levels]
+    found: list[Planned | None] = [None] * len(every)
+    if workers > 1:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            found = list(pool.map(_try_to_plan, repeat(suite), [level for _, level in every], repeat(agents)))
+    return {
+        (each.name, level.name): known or _plan_all(suite, level, agents)
+        for (each, level), known in zip(every, found, strict=True)
+    }
+
+
+def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher, planners: int = 1) -> SuiteResult:
+    """Run what is missing of a suite, planned by so many processes; runs that fail cost the others nothing.
 
     Raises as :func:`.bench.bench`, but for runs that fail.
     """
-    pairs = [(each, agent) for each in suite.experiments for agent in agents]
-    planned = {(e.name, a): [plan_level(suite, level, a) for level in e.levels] for e, a in pairs}
+    planned = plan_suite(suite, agents, planners)
     work: dict[str, tuple[ProtocolData, Encoders]] = {
         protocol.hash: (protocol, paths)
-        for levels in planned.values() for protocols, paths in levels for protocol in protocols
+        for each in suite.experiments for index, _ in enumerate(agents) for level in each.levels
+        for protocols, paths in [planned[each.name, level.name][index]] for protocol in protocols
     }  # fmt: skip
     failures, _ = carry_out(list(work.values()), root=root, launcher=launcher)
     return SuiteResult(
@@ -97,10 +133,10 @@ def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Laun
         agents=tuple(agents),
         levels={
             (each.name, agent): tuple(
-                _read(each, level, protocols, root)
-                for level, (protocols, _) in zip(each.levels, planned[each.name, agent], strict=True)
+                _read(each, level, planned[each.name, level.name][index][0], root) for level in each.levels
             )
-            for each, agent in pairs
+            for each in suite.experiments
+            for index, agent in enumerate(agents)
         },
         failures=tuple(
             f"{failure.job.spec.agent} seed {failure.job.spec.seed} in {failure.job.spec.protocol.task}: "

@@ -47,7 +47,8 @@ def test_the_unseen_is_unknown_and_noise_is_learned_as_noise() -> None:
     noisy = dynamics.predict(np.array([[0, 0]]))[1]
     assert noisy.expected[0, 1] == pytest.approx(np.full(3, 1 / 3), abs=0.08)
     assert noisy.unknown[0, 1] < 0.01 < noisy.unknown[0, 0], "noise that is known is not novel"
-    assert noisy.seen[0, 1] == pytest.approx(noisy.expected[0, 1], abs=0.01) and not noisy.seen[0, 0].any()
+    (seen,) = dynamics.factors[1].seen(np.array([[0, 0]]))
+    assert seen[1] == pytest.approx(noisy.expected[0, 1], abs=0.01) and not seen[0].any()
 
 
 @pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7), (3, 3, 2)])

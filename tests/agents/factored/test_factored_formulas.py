@@ -18,6 +18,8 @@ from imagine_bench.agents.factored.settings import (
     PlanningSettings,
 )
 
+from imagine_bench.interfaces import Floats
+
 SIZES, ACTIONS = (2, 3), 2
 DYNAMICS = DynamicsSettings(parents=2, persistence=0.4, parent_decay=0.25, concentration=0.5, slip=0.02)
 SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1))
@@ -44,8 +46,11 @@ def model() -> FactoredModel:
     return learned
 
 
-def predicted(factor: int, code: Code, action: int) -> FactorPrediction:
-    """Averages over what a factor may depend on, each weighted by its prior and by how well it told what came next."""
+def predicted(factor: int, code: Code, action: int) -> tuple[FactorPrediction, Floats]:
+    """What is predicted, and what was seen.
+
+    Averages over what a factor may depend on, each weighted by its prior and by how well it told what came next.
+    """
     values, own = SIZES[factor], code[factor]
     pseudo = DYNAMICS.concentration
     rows = [row for row in lived() if row.action == action]
@@ -66,16 +71,16 @@ def predicted(factor: int, code: Code, action: int) -> FactorPrediction:
         seen.append(here / max(here.sum(), 1))
         unknown.append(pseudo * values / (here.sum() + pseudo * values))
     weight = prior * told / (prior * told).sum()
-    return FactorPrediction(weight @ np.array(expected), weight @ np.array(seen), weight @ np.array(unknown))
+    return FactorPrediction(weight @ np.array(expected), weight @ np.array(unknown)), weight @ np.array(seen)
 
 
 @pytest.mark.parametrize("factor", [0, 1])
 def test_dynamics_average_over_what_a_factor_may_depend_on(model: FactoredModel, factor: int) -> None:
-    found = model.dynamics.predict(np.array(CODES))[factor]
+    found, seen = model.dynamics.predict(np.array(CODES))[factor], model.dynamics.factors[factor].seen(np.array(CODES))
     for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
-        by_hand = predicted(factor, code, action)
+        by_hand, seen_by_hand = predicted(factor, code, action)
         assert found.expected[row, action] == pytest.approx(by_hand.expected)
-        assert found.seen[row, action] == pytest.approx(by_hand.seen)
+        assert seen[row, action] == pytest.approx(seen_by_hand)
         assert found.unknown[row, action] == pytest.approx(by_hand.unknown)
 
 
@@ -121,7 +126,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
     assert causes is not None and len(causes.outcomes) == 2
     dropped = 0
     for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
-        factors = [predicted(factor, code, action) for factor in range(2)]
+        factors = [predicted(factor, code, action)[0] for factor in range(2)]
         joint = {after: float(factors[0].expected[after[0]] * factors[1].expected[after[1]]) for after in CODES}
         likely = {after: share for after, share in joint.items() if share >= min(0.1, max(joint.values()))}
         dropped += len(joint) - len(likely)
@@ -142,7 +147,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
     assert dropped > 0
     for each in lived()[:3]:
         probability, unknown = model.probability(each)
-        factors = [predicted(factor, each.code, each.action) for factor in range(2)]
+        factors = [predicted(factor, each.code, each.action)[0] for factor in range(2)]
         chance, untested = by_noisy_or(model, each.code, each.action, each.following)
         moved = factors[0].expected[each.following[0]] * factors[1].expected[each.following[1]]
         assert probability == pytest.approx(moved * chance[causes.outcomes.index((each.reward, each.terminated))])

@@ -118,6 +118,19 @@ def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
     assert codes[[5, 20, 40]].tolist() == [[1]] * 3 and codes.sum() == 3
 
 
+def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
+    """A sliver of what lies beside it has contours, but hardly any beside those of what may lie there."""
+    value = np.arange(90) % 3  # nothing, or one of two marks
+    frames = np.full((90, 64, 64, 3), 120, dtype=np.uint8)
+    for kind in (0, 1):
+        frames[value == kind + 1, 20:32, 20:32] += (100 * _shape(kind))[..., None].astype(np.uint8)
+    frames[(value == 0) & (np.arange(90) % 2 == 0), 20:32, 20:21] += 50
+    found = looks.find(frames)
+    codes, known = looks.read(found, frames)
+    assert [len(factor.joint) for factor in found] == [3] and known.all()
+    assert len(set(zip(codes[:, 0].tolist(), value.tolist(), strict=True))) == 3
+
+
 def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
@@ -173,6 +186,8 @@ def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
     found = regions(bits[:, 0], bits[:, 1])
     assert len(found) == 2 and not (found[0] & found[1]).any()
     assert len(regions(bits[:, 0], bits[:, 0])) == 1, "what changes together is one"
+    later = np.where(np.arange(120) < 80, bits[:, 0], bits[:, 1])
+    assert len(regions(bits[:, 0], later)) == 2, "unless it did so for a while only"
 
 
 def test_what_falls_into_crumbs_stays_whole() -> None:
