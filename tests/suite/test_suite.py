@@ -16,7 +16,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.registry import AgentEntry
 from imagine_bench.report.suite import levels_csv, scores_csv, suite_table, write_suite
 from imagine_bench.suite.experiments import LADDER, Experiment, Level, Suite
-from imagine_bench.suite.run import plan_level, run_suite, with_seeds
+from imagine_bench.suite.run import plan_level, plan_suite, run_suite, with_seeds
 
 TINY = Suite(
     name="tiny",
@@ -114,6 +114,13 @@ def test_an_agent_of_another_package_takes_part(tmp_path, monkeypatch):
     suite = with_seeds(TINY.only(["size"]), [0])
     guest, own = run_suite(suite, ("guest", "table"), root=tmp_path, launcher=Inline()).levels.values()
     assert np.array_equal(guest[0].values, own[0].values)
+
+
+def test_planned_by_several_processes_it_is_the_same():
+    suite = TINY.only(["size", "transfer"])
+    assert plan_suite(suite, ("random", "oracle"), 2) == plan_suite(suite, ("random", "oracle"), 1)
+    with pytest.raises(UnknownNameError, match="No agent 'nobody'"):
+        plan_suite(suite, ("nobody",), 2)
 
 
 # --- the ladder itself -------------------------------------------------------------------------------------------
