@@ -11,7 +11,6 @@ import tyro
 from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.cli.options import added_up, listed, require_values, shown
 from imagine_bench.errors import RunFailedError
-from imagine_bench.machine import usable_cores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +40,7 @@ class Suite:
             require_values(name, getattr(self, name))
         suite = with_seeds(LADDER, self.seeds).only(added_up("experiment", self.experiment))
         where = launcher(self.launcher, self.workers)
-        planners = self.workers or usable_cores()
-        result = run_suite(suite, self.agents or AGENTS, root=self.out, launcher=where, planners=planners)
+        result = run_suite(suite, self.agents or AGENTS, root=self.out, launcher=where, planners=self.workers)
         print(suite_table(result))
         print(f"\nReport:     {write_suite(result, self.out)}")
         if result.failures:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from imagine_bench.bench.bench import carry_out, plan
 from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.machine import usable_cores
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders
@@ -99,13 +100,16 @@ def _try_to_plan(suite: Suite, level: Level, agents: Sequence[str]) -> Planned |
         return None
 
 
-def plan_suite(suite: Suite, agents: Sequence[str], workers: int) -> dict[tuple[str, str], Planned]:
+def plan_suite(suite: Suite, agents: Sequence[str], workers: int | None) -> dict[tuple[str, str], Planned]:
     """Of every experiment and level what :func:`plan_level` gives each agent; as many encoders are trained at once.
+
+    ``workers`` are processes; None is one a core.
 
     Raises as :func:`plan_level`.
     """
     every = [(each, level) for each in suite.experiments for level in each.levels]
     found: list[Planned | None] = [None] * len(every)
+    workers = usable_cores() if workers is None else workers
     if workers > 1:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -116,7 +120,9 @@ def plan_suite(suite: Suite, agents: Sequence[str], workers: int) -> dict[tuple[
     }
 
 
-def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher, planners: int = 1) -> SuiteResult:
+def run_suite(
+    suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher, planners: int | None = 1
+) -> SuiteResult:
     """Run what is missing of a suite, planned by so many processes; runs that fail cost the others nothing.
 
     Raises as :func:`.bench.bench`, but for runs that fail.
