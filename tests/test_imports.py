@@ -38,7 +38,7 @@ ARROWS: dict[str, set[str]] = {
     "judge": {*_DATA, "data", "machine", "statistics"},
     "recording": {*_DATA, "judge"},
     "studies": {*_DATA, "bench", "judge", "statistics"},
-    "suite": {*_DATA, "bench", "machine", "statistics"},
+    "suite": {*_DATA, "bench", "statistics"},
     "report": {*_DATA, "certificates", "bench", "judge", "studies", "suite", "machine", "statistics", "reference"},
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
     "adapters": {"registry", "store"},

@@ -12,7 +12,6 @@ conjunctions rather than by whole states (width-based search, Lipovetzky & Geffn
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,21 +34,21 @@ Outcome = tuple[float, bool]
 class _Templates:
     """Conjunctions over T sets of factors, numbered by the values of these: one number in each set holds in a code."""
 
-    def __init__(self) -> None:
-        self._first: list[int] = []
-        self._multipliers: list[Floats] = []
+    def __init__(self, sizes: tuple[int, ...]) -> None:
+        self._sizes = sizes
+        self._first, self._multipliers = np.zeros(0, dtype=np.int64), np.zeros((len(sizes), 0))
 
-    def append(self, factors: Sequence[int], sizes: Sequence[int], first: int) -> None:
-        """One more set, of factors of so many values; ``first`` is its first number."""
-        multipliers = np.zeros(len(sizes))
-        multipliers[list(factors)] = strides(tuple(factors), tuple(sizes))
-        self._first.append(first)
-        self._multipliers.append(multipliers)
+    def append(self, factors: tuple[int, ...], first: int) -> None:
+        """One more set; ``first`` is its first number."""
+        multipliers = np.zeros(len(self._sizes))
+        multipliers[list(factors)] = strides(factors, self._sizes)
+        self._first = np.append(self._first, first)
+        self._multipliers = np.column_stack([self._multipliers, multipliers])
 
     def numbers(self, codes: Codes) -> NDArray[np.int64]:
         """Those that hold in codes (N, P). Shape (N, T)."""
-        found = codes.astype(np.float64) @ np.stack(self._multipliers, axis=1)  # fast, and these numbers are exact
-        return np.asarray(found.astype(np.int64) + np.array(self._first))
+        found = codes.astype(np.float64) @ self._multipliers  # fast, and these numbers are exact
+        return np.asarray(found.astype(np.int64) + self._first)
 
 
 class Conjunctions:
@@ -64,18 +63,18 @@ class Conjunctions:
         count = len(sizes)
         orders = sorted({*range(1, min(settings.order, count) + 1), count})
         sets = [factors for order in orders for factors in itertools.combinations(range(count), order)]
-        self._next, self._choice = _Templates(), _Templates()
+        self._next, self._choice = _Templates(sizes), _Templates((*sizes, n_actions))
         members: list[NDArray[np.int64]] = []
         groups: dict[tuple[bool, int], int] = {}
         first = 0
         for templates, with_action, factors in (
             *((self._next, False, each) for each in sets), *((self._choice, True, each) for each in [(), *sets])
         ):  # fmt: skip
-            whole, every = ((*factors, count), (*sizes, n_actions)) if with_action else (factors, sizes)
-            size = table_size(whole, every)
+            whole = (*factors, count) if with_action else factors
+            size = table_size(whole, (*sizes, n_actions))
             if size > _LARGEST_TEMPLATE:
                 continue
-            templates.append(whole, every, first)
+            templates.append(whole, first)
             members.append(np.full(size, groups.setdefault((with_action, len(factors)), len(groups))))
             first += size
         self.group = np.concatenate(members)

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.bench.bench import carry_out, plan
-from imagine_bench.bench.launchers.jobs import Launcher
+from imagine_bench.bench.launchers.jobs import Launcher, processes
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
-from imagine_bench.machine import usable_cores
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders
@@ -109,10 +108,9 @@ def plan_suite(suite: Suite, agents: Sequence[str], workers: int | None) -> dict
     """
     every = [(each, level) for each in suite.experiments for level in each.levels]
     found: list[Planned | None] = [None] * len(every)
-    workers = usable_cores() if workers is None else workers
-    if workers > 1:
+    if (at_once := processes(workers)) > 1:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(at_once, mp_context=multiprocessing.get_context("spawn")) as pool:
             found = list(pool.map(_try_to_plan, repeat(suite), [level for _, level in every], repeat(agents)))
     return {
         (each.name, level.name): known or _plan_all(suite, level, agents)

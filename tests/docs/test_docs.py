@@ -78,7 +78,7 @@ def test_commands_could_be_carried_out() -> None:
         if isinstance(command, Bench) and not (command.dataset or str(command.encoder).endswith(".safetensors")):
             command.planned()
             benches += 1
-    assert benches > 15
+    assert benches > 20
 
 
 @pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
@@ -117,7 +117,7 @@ def test_pages_are_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 100
     read = [page for page in PAGES[1:] if page != thesis_elements.PAGE]  # that one is looked up
     assert not [page for page in read if words(page) > 1200]
-    assert sum(words(page) for page in read) <= 20_400
+    assert sum(words(page) for page in read) <= 20_100
 
 
 def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:

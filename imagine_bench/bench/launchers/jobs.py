@@ -78,7 +78,12 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    return make(usable_cores() if workers is None else workers)
+    return make(processes(workers))
+
+
+def processes(workers: int | None) -> int:
+    """How many processes work at a time: so many, or, of None, one a core."""
+    return usable_cores() if workers is None else workers
 
 
 class Launcher(Protocol):
