@@ -24,6 +24,8 @@ _LARGEST_TABLE = 1 << 16
 """Parent sets whose table would have more rows are not considered."""
 _NEGLIGIBLE = 1e-12
 """Structures of no more posterior probability are left out of predictions."""
+_AT_ONCE = 64
+"""Codes whose counts are read at once: few enough for a cache."""
 EVERY = slice(None)
 """All actions."""
 
@@ -36,19 +38,6 @@ class FactorPrediction:
     unknown: Floats  #: weight of the prior in ``expected``. Shape (N, A).
 
 
-class Table:
-    """A Dirichlet table: counts of a factor's next values for every action and every setting of its parents."""
-
-    def __init__(self, parents: tuple[int, ...], sizes: tuple[int, ...], n_actions: int, values: int) -> None:
-        self.parents = list(parents)
-        self.strides = strides(parents, sizes)
-        self.counts = np.zeros((n_actions, table_size(parents, sizes), values))
-
-    def row(self, codes: Codes) -> NDArray[np.int64]:
-        """The row of each code (N, P). Shape (N,)."""
-        return codes[:, self.parents] @ self.strides
-
-
 class FactorDynamics:
     """How one factor changes; ``sizes`` are the numbers of values of every factor."""
 
@@ -57,7 +46,15 @@ class FactorDynamics:
         others = [other for other in range(len(sizes)) if other != factor]
         sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
         sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
-        self.tables = [Table(parents, sizes, n_actions, self.values) for parents in sets]
+        self.parents = sets
+        """Of each Dirichlet table the factors that the next value depends on."""
+        rows = [table_size(parents, sizes) for parents in sets]
+        self._first, self._strides = np.cumsum(rows) - rows, np.zeros((len(sizes), len(sets)))
+        for index, parents in enumerate(sets):
+            self._strides[list(parents), index] = strides(parents, sizes)
+        self.counts = np.zeros((sum(rows), n_actions, self.values))
+        """Of the next values: a row for every setting of the parents of every table. Shape (R, A, K)."""
+        self._total = np.zeros((sum(rows), n_actions))
         same_size = [sum(len(parents) == len(other) for other in sets) for parents in sets]
         prior = np.array(
             [settings.parent_decay ** (len(parents) - 1) / n for parents, n in zip(sets, same_size, strict=True)]
@@ -73,11 +70,11 @@ class FactorDynamics:
         stayed = value == code[self.factor]
         self._tried[action] = 1.0
         self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / max(1, self.values - 1))
-        for index, table in enumerate(self.tables):
-            counts = table.counts[action, int(table.row(code[None])[0])]
-            probability = (counts[value] + concentration) / (counts.sum() + concentration * self.values)
-            self.evidence[action, 1 + index] += np.log(probability)
-            counts[value] += 1.0
+        rows = self._rows(code[None])[0]
+        counts, total = self.counts[rows, action, value], self._total[rows, action]
+        self.evidence[action, 1:] += np.log((counts + concentration) / (total + concentration * self.values))
+        self.counts[rows, action, value] += 1.0
+        self._total[rows, action] += 1.0
 
     def weights(self) -> Floats:
         """Posterior probability of each structure, an action. Shape (A, 1 + tables)."""
@@ -89,18 +86,18 @@ class FactorDynamics:
         weight, prior = self._weights(actions), self.settings.concentration
         expected = self._stays(weight, codes)
         unknown = np.zeros(expected.shape[:2])
-        for own, counts, at in self._counted(weight, codes, actions):
-            known = counts.sum(axis=2, keepdims=True) + prior * self.values
-            expected = expected + (own * (counts + prior) / known)[at]
-            unknown += (own * prior * self.values / known)[at, :, 0]
+        for some, own, counts, total in self._counted(weight, codes, actions):
+            share = own / (total + prior * self.values)
+            expected[some] += (share[..., None] * (counts + prior)).sum(axis=1)
+            unknown[some] = (share * prior * self.values).sum(axis=1)
         return FactorPrediction(expected, unknown)
 
     def seen(self, codes: Codes) -> Floats:
         """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
         weight = self._weights(EVERY)
         seen = self._stays(weight, codes) * self._tried[:, None]
-        for own, counts, at in self._counted(weight, codes, EVERY):
-            seen = seen + (own * counts / np.maximum(counts.sum(axis=2, keepdims=True), 1.0))[at]
+        for some, own, counts, total in self._counted(weight, codes, EVERY):
+            seen[some] += ((own / np.maximum(total, 1.0))[..., None] * counts).sum(axis=1)
         return seen
 
     def happens(self, codes: Codes, actions: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -123,18 +120,19 @@ class FactorDynamics:
         """The share of structures by which the factor is left alone, at its value. Shape (N, A, K)."""
         return weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]
 
-    def _counted(
-        self, weight: Floats, codes: Codes, actions: slice
-    ) -> Iterator[tuple[Floats, Floats, NDArray[np.int64]]]:
-        """Of each table that matters: its weights (A, 1), counts (R, A, K), and which R is a code's, (N,)."""
-        for index in np.flatnonzero(weight[:, 1:].any(axis=0)).tolist():
-            table = self.tables[index]
-            rows = table.row(codes)
-            if len(rows) > table.counts.shape[1]:  # whole tables are less work
-                counts, at = table.counts[actions].transpose(1, 0, 2), rows
-            else:
-                counts, at = table.counts[actions, rows].transpose(1, 0, 2), np.arange(len(rows))
-            yield weight[:, 1 + index, None], counts, at
+    def _rows(self, codes: Codes) -> NDArray[np.int64]:
+        """The row of each table T that holds for each code (N, P). Shape (N, T)."""
+        return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
+
+    def _counted(self, weight: Floats, codes: Codes, actions: slice) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
+        """A few codes at a time, of T tables that matter: which; weights (T, A), counts (n, T, A, K) and their sums."""
+        matters = np.flatnonzero(weight[:, 1:].any(axis=0))
+        if not len(matters):
+            return
+        rows, own = self._rows(codes)[:, matters], weight[:, 1 + matters].T
+        for first in range(0, len(codes), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            yield some, own, self.counts[rows[some], actions], self._total[rows[some], actions]
 
 
 class Dynamics:

@@ -98,18 +98,17 @@ class FactoredModel:
     def _branches(self, factors: list[Floats]) -> tuple[Floats, Codes]:
         """The likeliest joint values of factors (N, A, K) each: probabilities (N, A, B) and codes (N, A, B, P)."""
         count, actions = factors[0].shape[:2]
-        most = self._planning.branches
-        chance, codes = np.ones((count, actions, 1)), np.zeros((count, actions, 1, 0), dtype=np.int64)
+        most, pairs = self._planning.branches, np.arange(count * actions)[:, None]
+        chance, numbers = np.ones((len(pairs), 1)), np.zeros((len(pairs), 1), dtype=np.int64)
         for factor in factors:
-            values = factor.shape[2]
-            joint = (chance[..., :, None] * factor[:, :, None, :]).reshape(count, actions, -1)
-            order = np.argsort(-joint, axis=2, kind="stable")[:, :, :most]
-            chance = np.take_along_axis(joint, order, axis=2)
-            before, value = np.divmod(order[..., None], values)
-            codes = np.concatenate([np.take_along_axis(codes, before, axis=2), value], axis=3)
-        spare = most - chance.shape[2]
-        chance = np.pad(chance, ((0, 0), (0, 0), (0, spare)))
-        codes = np.pad(codes, ((0, 0), (0, 0), (0, spare), (0, 0)))
-        least = np.minimum(self._planning.least_probability, chance.max(axis=2, keepdims=True))
-        chance = np.where(chance < least, 0.0, chance)
-        return chance / chance.sum(axis=2, keepdims=True), codes
+            values, ways = factor.shape[2], chance.shape[1]
+            joint = (chance[:, :, None] * factor.reshape(-1, 1, values)).reshape(len(pairs), -1)
+            order = np.argsort(-joint, axis=1, kind="stable")[:, :most]
+            chance = joint.ravel()[order + pairs * joint.shape[1]]
+            before, value = np.divmod(order, values)
+            numbers = numbers.ravel()[before + pairs * ways] * values + value
+        spare, shape = ((0, 0), (0, most - chance.shape[1])), (count, actions, most)
+        least = np.minimum(self._planning.least_probability, chance.max(axis=1, keepdims=True))
+        chance = np.pad(np.where(chance < least, 0.0, chance), spare)
+        codes = np.stack(np.unravel_index(np.pad(numbers, spare), self.sizes), axis=-1)
+        return (chance / chance.sum(axis=1, keepdims=True)).reshape(shape), codes.reshape(*shape, -1)

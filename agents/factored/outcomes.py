@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from imagine_bench.interfaces import Floats
 
 from .factors import Code, Codes, CodeTransition, strides, table_size
 from .settings import OutcomeSettings
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _LARGEST_TEMPLATE = 1 << 15
 """Sets of factors with more joint values are no candidates."""
@@ -55,7 +59,8 @@ class Conjunctions:
     """All candidate conjunctions of factors with so many values each, numbered, in groups of one order and kind.
 
     Attributes:
-        group: Group of each, which has one order, with or without the action. Shape (J,).
+        group: Group of each, which has one order, with or without the action, ascending. Shape (J,).
+        of_each: How many there are of each group. Shape (G,).
         prior: Prior probability of being a cause, a group. Shape (G,).
     """
 
@@ -78,6 +83,7 @@ class Conjunctions:
             members.append(np.full(size, groups.setdefault((with_action, len(factors)), len(groups))))
             first += size
         self.group = np.concatenate(members)
+        self.of_each = np.bincount(self.group)
         beyond = np.array([max(0, order + with_action - 2) for with_action, order in groups])
         self.prior: Floats = settings.prior * settings.order_decay**beyond
 
@@ -95,12 +101,60 @@ class Conjunctions:
 
 
 @dataclass(frozen=True, slots=True)
-class _Evidence:
-    """Distinct transitions: active conjunctions (U, T), outcome (U,), how often each was seen (U,)."""
+class _Cases:
+    """Transitions (U,), the conjunctions that hold in any of them (M,), and which hold in which, as ones (U, M)."""
 
-    active: NDArray[np.int64]
-    outcome: NDArray[np.int64]
-    count: Floats
+    met: NDArray[np.int64]
+    holds: csr_array
+    held: csr_array  #: its transpose
+    count: Floats  #: how often each transition was seen
+
+    @classmethod
+    def of(cls, active: NDArray[np.int64], count: Floats, size: int) -> _Cases:
+        """Of those active (U, T), of so many there are."""
+        from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
+
+        held = np.bincount(active.ravel(), minlength=size) > 0
+        first = np.arange(0, active.size + 1, active.shape[1], dtype=np.int32)
+        place = (np.cumsum(held, dtype=np.int32) - 1)[active.ravel()]
+        holds = csr_array((np.ones(active.size), place, first), shape=(len(active), held.sum()))
+        return cls(np.flatnonzero(held), holds, holds.T, count)
+
+    def responsibility(self, strength: Floats, leak: float) -> Floats:
+        """How many of the transitions each of them, so strong (M,), is held to have decided. Shape (M,)."""
+        caused = 1.0 - (1.0 - leak) * np.exp(self.holds @ np.log1p(-strength))
+        return np.asarray(strength * (self.held @ (self.count / caused)))
+
+
+class _Evidence:
+    """All distinct transitions, of which each has an outcome (U,); M conjunctions were met, T hold in each of them."""
+
+    def __init__(self, active: NDArray[np.int64], outcome: NDArray[np.int64], count: Floats, group: NDArray[np.int64],
+                 groups: int, outcomes: int) -> None:  # fmt: skip
+        self.outcome, self.all = outcome, _Cases.of(active, count, len(group))
+        place = np.zeros(len(group), dtype=np.int64)
+        place[self.all.met] = np.arange(len(self.all.met))
+        among = place[active]
+        self.of = [
+            _Cases.of(among[own], count[own], len(self.all.met)) for own in outcome == np.arange(outcomes)[:, None]
+        ]
+        """Those of each outcome; their conjunctions are numbered among those that were met."""
+        self.tried = np.bincount(group[self.all.met], minlength=groups)
+        """How many were met of each group, which are in this order. Shape (G,)."""
+
+    def tests(self, weight: Floats) -> Floats:
+        """Sum of the weights (U,) of the transitions in which each conjunction holds. Shape (M,)."""
+        return np.asarray(self.all.held @ (weight * self.all.count))
+
+
+@dataclass(frozen=True, slots=True)
+class _Explanation:
+    """How all outcomes but a default may come about."""
+
+    default: int
+    strength: Floats  #: of the conjunctions that were met. Shape (O, M).
+    prior: Floats  #: probability that one of each group is a cause. Shape (O, G).
+    log_posterior: float  #: log likelihood less the cost of the causes
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +181,8 @@ class OutcomeModel:
         self._priors: dict[Outcome, Floats] = {}
         self._counts: dict[tuple[Code, int, Code, int], int] = {}
         self.causes: Causes | None = None
-        self._known, self._spared = np.ones(0), np.zeros((0, 0))
-        """Probability that each conjunction is no untested cause, (J,), and log of that it causes nothing, (O, J)."""
+        self._spared = np.zeros((0, 1))
+        """Log probability that each conjunction causes no outcome, and last that it is no untested cause. (J, O + 1)"""
 
     def add(self, row: CodeTransition) -> None:
         """Take in one transition; :meth:`fit` learns from it."""
@@ -144,12 +198,13 @@ class OutcomeModel:
             return
         codes, actions, following, outcome = (np.array(column) for column in zip(*self._counts, strict=True))
         active = self.conjunctions.active(codes, actions, following)
-        evidence = _Evidence(active, outcome, np.array(list(self._counts.values()), dtype=np.float64))
-        candidates = [self._explain(evidence, default) for default in range(len(self.outcomes))]
-        self.causes = causes = max(candidates, key=lambda causes: causes.log_posterior)
+        count, group = np.array(list(self._counts.values()), dtype=np.float64), self.conjunctions.group
+        evidence = _Evidence(active, outcome, count, group, len(self.conjunctions.prior), len(self.outcomes))
+        explanations = [self._explain(evidence, default) for default in range(len(self.outcomes))]
+        self.causes = causes = self._causes(evidence, max(explanations, key=lambda each: each.log_posterior))
         pseudo_tests = self.settings.pseudo_tests
-        self._known = 1.0 - causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)
-        self._spared = np.log1p(-causes.strength)
+        untested = causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)
+        self._spared = np.log1p(-np.vstack([causes.strength, untested])).T.copy()
 
     def reset_for_new_task(self) -> None:
         """Forget all that was seen; earlier causes become priors, until a test of this task refutes them.
@@ -165,10 +220,12 @@ class OutcomeModel:
             self._priors = {causes.outcomes[index]: weight * causes.strength[index] for index in order}
         self._counts, self.causes = {}, None
 
-    def _prior(self, outcome: int, groups: Floats, which: NDArray[np.int64] | slice = slice(None)) -> Floats:
-        """Prior probability of these conjunctions to cause ``outcome``: their groups' (G,), or an earlier task's."""
-        earlier = self._priors.get(self.outcomes[outcome])
-        own = groups[self.conjunctions.group[which]]
+    def _prior(self, outcome: int, groups: Floats, each: NDArray[np.int64], which: NDArray[np.int64] | slice) -> Floats:
+        """Prior probability of ``which`` conjunctions to cause ``outcome``: their groups', or an earlier task's.
+
+        ``groups`` (G,) is that of each group, of which there are ``each`` (G,) many.
+        """
+        earlier, own = self._priors.get(self.outcomes[outcome]), np.repeat(groups, each)
         return own if earlier is None else np.maximum(own, earlier[which])
 
     @property
@@ -185,78 +242,69 @@ class OutcomeModel:
         """Outcome probabilities (N, O) of N transitions, and the probability that something untested decides (N,)."""
         causes = self.causes
         assert causes is not None, "fit before predicting"
-        known, spared = self._known, self._spared
         which, at = _distinct(following, self._strides)
         how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
-        none, tested = np.zeros((len(spared), len(codes))), np.ones(len(codes))
-        for active, back in (
-            (self.conjunctions.of_next(following[which]), at),
-            (self.conjunctions.of_choice(codes[how], actions[how]), at_choice),
-        ):
-            none += spared[:, active].sum(axis=2)[:, back]
-            tested *= known[active].prod(axis=1)[back]
-        probability = _by_causes(np.exp(none), causes.default)  # [O, N]
+        of_next, of_choice = (
+            self.conjunctions.of_next(following[which]),
+            self.conjunctions.of_choice(codes[how], actions[how]),
+        )
+        of_next, of_choice = (self._spared.take(active.T, axis=0).sum(axis=0) for active in (of_next, of_choice))
+        *none, tested = np.exp(of_next[at] + of_choice[at_choice]).T
+        probability = _by_causes(np.array(none), causes.default)  # [O, N]
         return (probability / probability.sum(axis=0)).T, (1.0 - tested) * probability[causes.default]
 
-    def _explain(self, evidence: _Evidence, default: int) -> Causes:
+    def _explain(self, evidence: _Evidence, default: int) -> _Explanation:
         """Causes of every outcome but ``default``."""
-        group, settings = self.conjunctions.group, self.settings
-        size, groups = len(group), len(self.conjunctions.prior)
-        met = np.bincount(evidence.active.ravel(), minlength=size) > 0
-        tried = np.bincount(group[met], minlength=groups)
         others = [outcome for outcome in range(len(self.outcomes)) if outcome != default]
-        strength, cost = np.zeros((len(self.outcomes), size)), 0.0
-        rate = 0.5 * settings.pseudo_conjunctions * self.conjunctions.prior / (settings.pseudo_conjunctions + tried)
+        strength = np.zeros((len(self.outcomes), len(evidence.all.met)))
+        priors, cost = np.zeros((len(self.outcomes), len(evidence.tried))), 0.0
         for outcome in others:
-            strength[outcome], groups_prior = self._causes_of(outcome, evidence, default, met, tried, len(others))
-            prior = self._prior(outcome, groups_prior)
-            extra = np.maximum(strength[outcome] - prior, 0.0)
-            cost -= float((extra * np.log(prior))[met].sum())
-            rate = rate + groups_prior
-        probability = _noisy_or(strength, evidence.active, default, settings.leak)
+            strength[outcome], priors[outcome] = self._causes_of(outcome, evidence, default, len(others))
+            prior = self._prior(outcome, priors[outcome], evidence.tried, evidence.all.met)
+            cost -= float((np.maximum(strength[outcome] - prior, 0.0) * np.log(prior)).sum())
+        none = (1.0 - self.settings.leak) * np.exp(evidence.all.holds @ np.log1p(-strength).T).T
+        probability = _by_causes(none, default)
         likelihood = probability[evidence.outcome, np.arange(len(evidence.outcome))] / probability.sum(axis=0)
-        fit = float((evidence.count * np.log(np.maximum(likelihood, _LEAST))).sum())
-        tests = self._tests(strength, evidence, default)
-        return Causes(tuple(self.outcomes), default, strength, tests, np.minimum(rate, 0.99), fit - cost)
+        fit = float((evidence.all.count * np.log(np.maximum(likelihood, _LEAST))).sum())
+        return _Explanation(default, strength, priors, fit - cost)
 
-    def _causes_of(
-        self, outcome: int, evidence: _Evidence, default: int, met: NDArray[np.bool_], tried: NDArray[np.int64],
-        rivals: int,
-    ) -> tuple[Floats, Floats]:  # fmt: skip
-        """Expectation maximisation for one outcome: strengths (J,) and how likely each group holds causes (G,)."""
-        settings, rows = self.settings, np.flatnonzero(met)
-        group = self.conjunctions.group[rows]
-        positive = evidence.outcome == outcome
-        weight = np.where(positive | (evidence.outcome == default), 1.0, settings.masked_weight) * evidence.count
-        tests = _spread(evidence.active, weight, len(met))[rows]
-        active, count = (np.cumsum(met) - 1)[evidence.active[positive]], evidence.count[positive]  # among those met
+    def _causes_of(self, outcome: int, evidence: _Evidence, default: int, rivals: int) -> tuple[Floats, Floats]:
+        """Expectation maximisation for one outcome: strengths (M,) and how likely each group holds causes (G,)."""
+        settings, tried = self.settings, evidence.tried
+        cases, met = evidence.of[outcome], evidence.all.met
+        seen = (evidence.outcome == outcome) | (evidence.outcome == default)
+        tests = settings.pseudo_tests + evidence.tests(np.where(seen, 1.0, settings.masked_weight))
+        first = np.cumsum(tried) - tried
         base = self.conjunctions.prior / rivals
-        prior, strength = base, self._prior(outcome, base, rows)
+        prior, strength = base, self._prior(outcome, base, tried, met)
         for _ in range(settings.sweeps):
-            responsibility = _responsibility(strength, active, count, settings.leak, len(group))
-            hits = settings.pseudo_tests * self._prior(outcome, prior, rows) + responsibility
-            strength = np.minimum(hits / (settings.pseudo_tests + tests), _CERTAIN)
-            found = np.bincount(group, strength, len(base))
+            responsibility = cases.responsibility(strength.take(cases.met), settings.leak)
+            strength = self._prior(outcome, prior, tried, met)
+            strength *= settings.pseudo_tests
+            strength[cases.met] += responsibility
+            np.minimum(np.divide(strength, tests, out=strength), _CERTAIN, out=strength)
+            found = np.add.reduceat(strength, first)
             prior = (settings.pseudo_conjunctions * base + found) / (settings.pseudo_conjunctions + tried)
-        whole = self._prior(outcome, prior)
-        whole[rows] = strength
-        return whole, prior
+        return strength, prior
 
-    def _tests(self, strength: Floats, evidence: _Evidence, default: int) -> Floats:
-        """Tests of each conjunction: where nothing happened, and where it was itself what decided. Shape (J,)."""
-        size = strength.shape[1]
-        tests = _spread(evidence.active, np.where(evidence.outcome == default, evidence.count, 0.0), size)
-        for outcome in range(len(strength)):
-            own = evidence.outcome == outcome
-            if outcome != default and own.any():
-                active, count = evidence.active[own], evidence.count[own]
-                tests += _responsibility(strength[outcome], active, count, self.settings.leak, size)
-        return tests
+    def _causes(self, evidence: _Evidence, best: _Explanation) -> Causes:
+        """Those of the best explanation, of all conjunctions, and how often each was tested.
 
-
-def _noisy_or(strength: Floats, active: NDArray[np.int64], default: int, leak: float) -> Floats:
-    """Activation of each outcome by noisy-OR; of the default, that no other is active. Shape (O, N)."""
-    return _by_causes((1.0 - leak) * np.exp(np.log1p(-strength)[:, active].sum(axis=2)), default)
+        Tests are where nothing happened, and where a conjunction was itself what decided.
+        """
+        settings, all_of, met = self.settings, self.conjunctions.of_each, evidence.all.met
+        pseudo = settings.pseudo_conjunctions
+        strength, tests = np.zeros((len(self.outcomes), all_of.sum())), np.zeros(all_of.sum())
+        tests[met] = evidence.tests(evidence.outcome == best.default)
+        rate = 0.5 * pseudo * self.conjunctions.prior / (pseudo + evidence.tried)
+        for outcome, cases in enumerate(evidence.of):
+            if outcome == best.default:
+                continue
+            strength[outcome] = self._prior(outcome, best.prior[outcome], all_of, slice(None))
+            strength[outcome, met] = best.strength[outcome]
+            tests[met[cases.met]] += cases.responsibility(best.strength[outcome, cases.met], settings.leak)
+            rate = rate + best.prior[outcome]
+        return Causes(tuple(self.outcomes), best.default, strength, tests, np.minimum(rate, 0.99), best.log_posterior)
 
 
 def _by_causes(inactive: Floats, default: int) -> Floats:
@@ -271,15 +319,3 @@ def _distinct(values: Codes, multipliers: NDArray[np.int64]) -> tuple[NDArray[np
     """Where each distinct row (N, V) comes first, and which of these each row is: (U,) and (N,)."""
     _, first, which = np.unique(values @ multipliers, return_index=True, return_inverse=True)
     return first, which
-
-
-def _responsibility(strength: Floats, active: NDArray[np.int64], count: Floats, leak: float, size: int) -> Floats:
-    """How many of the transitions each conjunction is held to have decided. Shape (J,)."""
-    caused = 1.0 - (1.0 - leak) * np.exp(np.log1p(-strength)[active].sum(axis=1))
-    share = np.minimum(strength[active] / caused[:, None], 1.0) * count[:, None]
-    return np.bincount(active.ravel(), share.ravel(), size)  # type: ignore[return-value]  # weights make it float64
-
-
-def _spread(active: NDArray[np.int64], weight: Floats, size: int) -> Floats:
-    """Sum of the weights (U,) of the transitions in which each conjunction holds. Shape (J,)."""
-    return np.bincount(active.ravel(), np.repeat(weight, active.shape[1]), size)  # type: ignore[return-value]

@@ -115,5 +115,8 @@ class Planner:
                 action = reward + settings.discount * ahead
             if objective == "optimistic":
                 action = (1.0 - unknown) * action + unknown * best
-            state[: self.expanded] = action.max(axis=1)
+            best_of = action.max(axis=1)
+            if np.array_equal(best_of, state[: self.expanded]):
+                break  # every further step would be the same
+            state[: self.expanded] = best_of
         return action

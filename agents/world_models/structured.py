@@ -91,7 +91,7 @@ class StructuredModel:
 
     def parameters(self) -> int:
         """Entries of the tables of the dynamics."""
-        return sum(table.counts.size for factor in self.model.dynamics.factors for table in factor.tables)
+        return sum(factor.counts.size for factor in self.model.dynamics.factors)
 
 
 def make(context: AgentContext) -> StructuredModel:

@@ -32,7 +32,7 @@ def test_parents_are_found_and_factors_left_alone_stay() -> None:
         dynamics.add(code, 0, following)
     turning, still, _ = dynamics.factors
     best = turning.weights()[0].argmax() - 1
-    assert turning.tables[best].parents == [0, 2]
+    assert turning.parents[best] == (0, 2)
     assert still.weights()[0, 0] > 0.95
     predictions = dynamics.predict(np.array([[2, 1, 1]]))
     assert predictions[0].expected[0, 0, 0] > 0.95
@@ -411,7 +411,7 @@ def test_each_further_parent_is_less_probable_beforehand(decay: float) -> None:
     weight = factor.weights()
     assert weight[:, 0] == pytest.approx([0.4, 0.4])
     by_size = [
-        sum(weight[0, 1 + index] for index, table in enumerate(factor.tables) if len(table.parents) == size)
+        sum(weight[0, 1 + index] for index, parents in enumerate(factor.parents) if len(parents) == size)
         for size in (1, 2, 3)
     ]
     assert by_size[1] / by_size[0] == pytest.approx(decay)
