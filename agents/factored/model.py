@@ -48,6 +48,11 @@ class FactoredModel:
         if row.has_reward:
             self.outcomes.add(row)
 
+    def log_evidence(self, factors: int) -> float:
+        """How well it explains what was added: log evidence of the dynamics of the first factors, and of outcomes."""
+        moves = sum(float(np.logaddexp.reduce(each.evidence, axis=1).sum()) for each in self.dynamics.factors[:factors])
+        return moves + (self.outcomes.causes.log_posterior if self.outcomes.causes else 0.0)
+
     def probability(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""
         code, action, following = as_codes(row.code), row.action, as_codes(row.following)

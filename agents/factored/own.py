@@ -2,8 +2,8 @@
 
 All that it sees is remembered, up to a bound. As soon as something has no known value, or much more was seen, factors
 and values are found anew (:mod:`.looks`), remembered transitions get their codes anew, and dynamics and outcomes are
-learned from them once more: nothing that happened is lost. Once as many frames are remembered as may be, perception
-stays as it is.
+learned from them once more: nothing that happened is lost. Then it also decides what it had better remember of an
+episode (:mod:`.memory`). Once as many frames are remembered as may be, perception stays as it is.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ..encoders.perception import prepare_torch
 from . import looks
 from .agent import CodeAgent
 from .factors import Code
+from .memory import Memory, choose, remembering
 from .settings import OWN, OwnPerceptionSettings, OwnSettings
 
 _FIRST, _RECENT = 4, 4
@@ -35,26 +36,48 @@ class OwnPerception:
         self.frames: list[Frame] = []
         self.transitions: list[tuple[int, int]] = []
         """Frames before and after of each transition, as long as all are remembered."""
+        self.begins: list[bool] = []
+        """Whether each of these is the first of an episode."""
         self.found: list[looks.Factor] = []
+        self.memory: Memory | None = None
         self.looked_at = 0
         self.unknown = False
         """Whether anything seen since has no known value."""
+        self._remembered = 0
         self._recent: OrderedDict[bytes, tuple[Code, bool]] = OrderedDict()
 
     @property
-    def sizes(self) -> tuple[int, ...]:
+    def seen_sizes(self) -> tuple[int, ...]:
         """Numbers of values of the factors; before any is found, of one factor of one value."""
         sizes = tuple(len(factor.joint) for factor in self.found) or (1,)
         return sizes if self._factored else (int(np.prod(sizes)),)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The same, and last of what is remembered, if anything is."""
+        sizes = self.seen_sizes
+        return sizes if self.memory is None else (*sizes, sizes[self.memory.factor])
 
     @property
     def full(self) -> bool:
         """Whether as many frames are remembered as may be, so that nothing is found anew."""
         return len(self.frames) >= self._settings.frames
 
+    def begin_episode(self) -> None:
+        """Forget the episode so far."""
+        self._remembered = self.memory.hidden if self.memory else 0
+
+    def recall(self, remembered: int) -> None:
+        """Remember this of the episode so far."""
+        self._remembered = remembered
+
     def code(self, frame: Frame) -> Code:
-        """The code of a frame (64, 64, 3)."""
-        return self._read(frame)[0]
+        """The code of the newest frame (64, 64, 3) of an episode, with what is remembered of those before."""
+        code = self._read(frame)[0]
+        if self.memory is None:
+            return code
+        self._remembered = self.memory.after(self._remembered, code)
+        return (*code, self._remembered)
 
     def _read(self, frame: Frame) -> tuple[Code, bool]:
         """The code of a frame, and whether all of its values are known; the last ones are kept."""
@@ -75,12 +98,13 @@ class OwnPerception:
             codes = np.ravel_multi_index(tuple(codes.T), [len(factor.joint) for factor in self.found])[:, None]
         return [tuple(code) for code in codes.tolist()], known
 
-    def remember(self, before: Frame, after: Frame) -> None:
+    def remember(self, before: Frame, after: Frame, *, begins: bool = False) -> None:
         """Remember a transition's frames; one that begins where the last one ended costs one frame."""
         new = [after] if self.frames and np.array_equal(self.frames[-1], before) else [before, after]
         self.frames += [frame.copy() for frame in new]
         self.unknown |= not all(self._read(frame)[1] for frame in new)
         self.transitions.append((len(self.frames) - 2, len(self.frames) - 1))
+        self.begins.append(begins)
 
     def renew(self) -> bool:
         """Look for factors anew if it is time; whether codes may now be others."""
@@ -94,25 +118,32 @@ class OwnPerception:
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
         self.found, self.looked_at = looks.find(np.stack(self.frames[:count])) if count else [], count
-        self.unknown = False
+        self.memory, self.unknown = None, False
         self._recent.clear()
 
     def arrays(self) -> snapshot.Arrays:
         """The frames that it remembers, and which are those of each transition."""
         seen = np.stack(self.frames) if self.frames else np.zeros((0, 64, 64, 3), dtype=np.uint8)
         pairs: NDArray[np.int64] = np.array(self.transitions, dtype=np.int64).reshape(-1, 2)
-        return {"replay/frames": seen, "replay/frame_pairs": pairs}
+        return {
+            "replay/frames": seen,
+            "replay/frame_pairs": pairs,
+            "replay/begins": np.array(self.begins, dtype=np.bool_),
+        }
 
     def values(self) -> dict[str, Any]:
         """What belongs to :meth:`arrays` in a snapshot."""
-        return {"looked_at": self.looked_at, "unknown": self.unknown}
+        memory = None if self.memory is None else [self.memory.factor, self.memory.hidden]
+        return {"looked_at": self.looked_at, "unknown": self.unknown, "memory": memory}
 
     def load(self, state: AgentState) -> None:
         """Take up what :meth:`arrays` and :meth:`values` gave: find the same factors in the same frames."""
         self.frames = list(state.arrays["replay/frames"])
         self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
+        self.begins = state.arrays["replay/begins"].tolist()
         self.look(state.values["looked_at"])
-        self.unknown = state.values["unknown"]
+        self.unknown, memory = state.values["unknown"], state.values["memory"]
+        self.memory = Memory(*memory) if memory else None
 
     def diagnostics(self) -> dict[str, float]:
         """How many factors and values it sees, in how many frames it found them, and how many it remembers."""
@@ -125,13 +156,20 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
     """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
 
     settings: OwnSettings
+    _begins = True
+
+    def begin_episode(self) -> None:
+        """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
+        self._begins = True
+        self.perception.begin_episode()
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember what was seen, see anew if that is due, and learn as from any codes."""
         eyes = self.perception
         if not eyes.full:
             with self.meters.cpu_time("time/perception_s"):
-                eyes.remember(transition.observation.frame, transition.next_observation.frame)
+                eyes.remember(transition.observation.frame, transition.next_observation.frame, begins=self._begins)
+                self._begins = False
                 if eyes.renew():
                     self._recode()
             self.meters.count("time/perception_s")
@@ -139,10 +177,20 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
 
     def _recode(self) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more."""
-        codes, _ = self.perception.codes(np.stack(self.perception.frames))
-        pairs = [(codes[before], codes[after]) for before, after in self.perception.transitions]
-        self.replay.recode(pairs[: len(self.replay)], len(self.perception.sizes))
-        self._relearn(self.tasks, len(self.replay))
+        eyes = self.perception
+        codes, _ = eyes.codes(np.stack(eyes.frames))
+        rows, count = self.replay.rows(), len(self.replay)
+        rows = [
+            row._replace(code=codes[before], following=codes[after])
+            for row, (before, after) in zip(rows, eyes.transitions, strict=False)
+        ]
+        eyes.memory = choose(rows, eyes.begins[:count], eyes.seen_sizes, self.n_actions, self.settings)
+        rows = remembering(rows, eyes.begins[:count], eyes.memory)
+        self.replay.recode([(row.code, row.following) for row in rows], len(eyes.sizes))
+        self._relearn(self.tasks, count)
+        eyes.begin_episode()
+        if rows and eyes.memory and not eyes.begins[count]:
+            eyes.recall(rows[-1].following[-1])
 
     def diagnostics(self) -> dict[str, float]:
         """Also what it sees."""

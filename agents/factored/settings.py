@@ -83,6 +83,8 @@ class OwnPerceptionSettings:
 class OwnSettings(FactoredSettings):
     """All settings of the agent ``factored_own``."""
 
+    #: Log of how much better a memory must explain what was seen than none; see :mod:`.memory`.
+    memory_evidence: float = setting(10.0, POSITIVE)
     perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
 
 
