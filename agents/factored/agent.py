@@ -69,8 +69,13 @@ class CodeAgent(Generic[PerceptionT]):
         """Whether anything is known of what this task rewards, so that there is something to plan for."""
         return self.model.outcomes.causes is not None
 
+    @property
+    def _left(self) -> int | None:
+        """How many macro-actions an episode has left, where that is known."""
+        return None
+
     def _values(self, code: Code) -> Floats:
-        return self.planner.values(code) if self._ready else np.zeros(self.n_actions)
+        return self.planner.values(code, left=self._left) if self._ready else np.zeros(self.n_actions)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The action of the largest value; exploring, that which leads to the most unknown as long as there is any."""
@@ -85,10 +90,10 @@ class CodeAgent(Generic[PerceptionT]):
     def _exploring_values(self, code: Code) -> Floats:
         planning = self.settings.planning
         if planning.exploration == "optimism":
-            return self.planner.values(code, "optimistic")
+            return self.planner.values(code, "optimistic", self._left)
         if planning.exploration == "random":
             return np.zeros(self.n_actions) if self.rng.random() < planning.epsilon else self._values(code)
-        novelty = self.planner.values(code, "novelty")
+        novelty = self.planner.values(code, "novelty", self._left)
         curious = novelty.max() >= planning.exploration_threshold
         self.meters.add("exploration/share", float(curious))
         self.meters.add("exploration/novelty", float(novelty.max()))

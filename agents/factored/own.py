@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
@@ -156,24 +156,39 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
     """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
 
     settings: OwnSettings
-    _begins = True
+    _acted = 0
+    _longest: int | None = None
+    """Macro-actions of this episode, and after how many an episode was cut, if any was."""
 
     def begin_episode(self) -> None:
         """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
-        self._begins = True
+        self._acted = 0
         self.perception.begin_episode()
+
+    @property
+    def _left(self) -> int | None:
+        return None if self._longest is None else self._longest - self._acted
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act as on any codes, and count."""
+        action = super().act(observation, explore=explore)
+        self._acted += 1
+        return action
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember what was seen, see anew if that is due, and learn as from any codes."""
         eyes = self.perception
+        if transition.truncated:
+            self._longest = max(self._acted, self._longest or 0)
         if not eyes.full:
             with self.meters.cpu_time("time/perception_s"):
-                eyes.remember(transition.observation.frame, transition.next_observation.frame, begins=self._begins)
-                self._begins = False
+                eyes.remember(transition.observation.frame, transition.next_observation.frame, begins=self._acted <= 1)
                 if eyes.renew():
                     self._recode()
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
+        if transition.terminated or transition.truncated:
+            self.begin_episode()
 
     def _recode(self) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more."""
@@ -200,7 +215,9 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         """A snapshot: also the frames that it remembers."""
         eyes, common = self.perception, super().state()
         values = {key: value for key, value in common.values.items() if key != "code_sizes"}
-        return AgentState(arrays={**common.arrays, **eyes.arrays()}, values={**values, **eyes.values()})
+        return AgentState(
+            arrays={**common.arrays, **eyes.arrays()}, values={**values, **eyes.values(), "longest": self._longest}
+        )
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot: find the same factors in the same frames, and learn from all that is replayed.
@@ -209,6 +226,7 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         """
         snapshot.require_fit(_flat(state), _flat(self.state()), equal=("settings", "n_actions"))
         self.perception.load(state)
+        self._longest = state.values["longest"]
         self._take_up(state)
 
 

@@ -51,10 +51,10 @@ class Planner:
     def learned(self, actions: Iterable[int]) -> None:
         """The model has learned something, and of the dynamics of these actions: plan anew."""
         self._predictions.learned(actions)
-        self._known: dict[Objective, dict[int, Floats]] = {"value": {}, "optimistic": {}, "novelty": {}}
+        self._known: dict[tuple[Objective, int], dict[int, Floats]] = {}
 
-    def values(self, code: Code, objective: Objective = "value") -> Floats:
-        """What each action in ``code`` is worth. Shape (A,).
+    def values(self, code: Code, objective: Objective = "value", left: int | None = None) -> Floats:
+        """What each action in ``code`` is worth, with so many macro-actions left, or as many as it plans: (A,).
 
         ``"value"`` is the expected discounted reward; ``"optimistic"`` the same if whatever is unknown brought the
         largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
@@ -62,9 +62,10 @@ class Planner:
         """
         if len(self._predictions) > _KEPT * self._settings.states:
             self._forget()
-        root, known = self._predictions.row(code), self._known[objective]
+        depth = self._settings.depth if left is None else max(1, min(left, self._settings.depth))
+        root, known = self._predictions.row(code), self._known.setdefault((objective, depth), {})
         if root not in known:
-            known.update(self._plan(root, objective))
+            known.update(self._plan(root, objective, depth))
         return known[root].copy()
 
     def outcome(self, code: Code) -> tuple[Floats, Floats, Floats]:
@@ -73,27 +74,27 @@ class Planner:
         predictions.expand(np.array([row]))
         return predictions.reward[row], predictions.ends[row], predictions.unknown[row]
 
-    def _plan(self, root: int, objective: Objective) -> dict[int, Floats]:
+    def _plan(self, root: int, objective: Objective, depth: int) -> dict[int, Floats]:
         """Action values (A,) of every row within reach of ``root``, or of it alone where that is too much."""
         rows = front = np.array([root])
-        self.expanded = 0
-        while len(front) and len(rows) <= self._settings.states:
+        self.expanded = steps = 0
+        while len(front) and len(rows) <= self._settings.states and steps < depth:
             self._predictions.expand(front)
-            self.expanded = len(rows)
+            self.expanded, steps = len(rows), steps + 1
             front = np.setdiff1d(self._predictions.following(front), rows)
             rows = np.concatenate([rows, front])
-            if objective == "novelty" and len(front) and (found := self._discovery(rows)) is not None:
+            if objective == "novelty" and len(front) and (found := self._discovery(rows, depth)) is not None:
                 return {root: found}
-        values = self._back_up(rows, objective)
+        values = self._back_up(rows, objective, depth)
         return {root: values[0].copy()} if len(front) else dict(zip(rows.tolist(), values, strict=True))
 
-    def _discovery(self, rows: Rows) -> Floats | None:
+    def _discovery(self, rows: Rows, depth: int) -> Floats | None:
         """Novelty (A,) of the first of ``rows``; None where what lies beyond them may change the best actions."""
-        near = self._back_up(rows, "novelty")[0]
-        far = self._back_up(rows, "novelty", beyond=1.0)[0]
+        near = self._back_up(rows, "novelty", depth)[0]
+        far = self._back_up(rows, "novelty", depth, beyond=1.0)[0]
         return None if ((far > near) & (far >= near.max() - TIE)).any() else near
 
-    def _back_up(self, rows: Rows, objective: Objective, beyond: float = 0.0) -> Floats:
+    def _back_up(self, rows: Rows, objective: Objective, depth: int, beyond: float = 0.0) -> Floats:
         """Action values of the expanded rows, which come first, (expanded, A); all others are worth ``beyond``."""
         settings, predictions, inside = self._settings, self._predictions, rows[: self.expanded]
         best = self._model.outcomes.rewards.max()
@@ -107,7 +108,7 @@ class Planner:
         following = place[predictions.next[inside]]
         state, action = np.zeros(len(rows)), reward
         state[self.expanded :] = beyond
-        for _ in range(settings.depth):
+        for _ in range(depth):
             ahead = (continues * state[following]).sum(axis=2)
             if objective == "novelty":
                 action = np.maximum(unknown, settings.novelty_discount * ahead)

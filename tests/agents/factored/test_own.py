@@ -12,6 +12,7 @@ from imagine_bench.agents.factored.own import OwnPerception, OwnPerceptionAgent
 from imagine_bench.agents.factored.settings import OWN
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -57,6 +58,7 @@ def live(learner: OwnPerceptionAgent, episodes: range, seed: int) -> list[int]:
     """Train on pictures of the tiny world; each episode is drawn from its own seed. The actions taken."""
     taken = []
     for episode in episodes:
+        begin_episode(learner)
         rng = np.random.default_rng((seed, episode))
         code = starts()[int(rng.integers(len(starts())))]
         seen = Observation(frame=picture(code, rng))
