@@ -1,15 +1,17 @@
 """What a frame hides and an earlier one showed: the value that one factor had when it last told anything.
 
 Which factor is remembered, and which of its values tells nothing, is not told but learned: where the same code and
-action have brought different outcomes, every such *memory* is tried on all transitions, and the one that explains them
-best is kept if it explains them much better than none (model comparison, Kass & Raftery 1995). A code that remembers is
-Markovian where the human asks only once.
+action have brought different outcomes, every such *memory* is tried. What is learned with it from every second episode
+predicts the others, and these the first. The memory that predicts best is kept if it predicts much better than none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
 
 from .factors import Code, CodeTransition
 from .model import FactoredModel
@@ -65,13 +67,17 @@ def choose(
     """The memory that explains transitions between codes best; None unless it does so much better than none."""
     if not contradict(rows):
         return None
-    evidence: dict[Memory | None, float] = {}
+    half = np.cumsum(begins) % 2 == 0  # every second episode
+    likelihood: dict[Memory | None, float] = {}
     for memory in (None, *candidates(sizes)):
         more = () if memory is None else (sizes[memory.factor],)
-        model = FactoredModel((*sizes, *more), n_actions, settings)
-        for row in remembering(rows, begins, memory):
-            model.add(row)
-        model.outcomes.fit()
-        evidence[memory] = model.log_evidence(len(sizes))
-    best = max(evidence, key=lambda memory: evidence[memory])
-    return best if evidence[best] > evidence[None] + settings.memory_evidence else None
+        remembered = remembering(rows, begins, memory)
+        likelihood[memory] = 0.0
+        for learned in (half, ~half):
+            model = FactoredModel((*sizes, *more), n_actions, settings)
+            for row in compress(remembered, learned):
+                model.add(row)
+            model.outcomes.fit()
+            likelihood[memory] += model.log_likelihood(list(compress(remembered, ~learned)), len(sizes))
+    best = max(likelihood, key=lambda memory: likelihood[memory])
+    return best if likelihood[best] > likelihood[None] + settings.memory_evidence else None

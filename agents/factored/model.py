@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from .dynamics import EVERY, Dynamics
 from .factors import Code, Codes, CodeTransition, as_codes
 from .outcomes import OutcomeModel
 from .settings import FactoredSettings
+
+_LEAST = 1e-3
+"""No transition counts as less probable where models are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +52,19 @@ class FactoredModel:
         if row.has_reward:
             self.outcomes.add(row)
 
-    def log_evidence(self, factors: int) -> float:
-        """How well it explains what was added: log evidence of the dynamics of the first factors, and of outcomes."""
-        moves = sum(float(np.logaddexp.reduce(each.evidence, axis=1).sum()) for each in self.dynamics.factors[:factors])
-        return moves + (self.outcomes.causes.log_posterior if self.outcomes.causes else 0.0)
+    def log_likelihood(self, rows: Sequence[CodeTransition], factors: int) -> float:
+        """Log likelihood of transitions, each taken for 0.1 % at least: what the first factors become, what that brings."""
+        causes, each = self.outcomes.causes, np.arange(len(rows))
+        if causes is None or not rows:
+            return len(rows) * float(np.log(_LEAST))
+        codes, actions, following = (np.array([row[column] for row in rows]) for column in range(3))
+        moved = [predicted.expected[each, actions, following[:, factor]]
+                 for factor, predicted in enumerate(self.dynamics.predict(codes)[:factors])]  # fmt: skip
+        known = {outcome: index for index, outcome in enumerate(causes.outcomes)}
+        which = np.array([known.get((row.reward, row.terminated), -1) for row in rows])
+        brought = self.outcomes.predict(codes, actions, following)[0][each, which]
+        chance = np.prod(moved, axis=0) * np.where(which < 0, 0.0, brought)
+        return float(np.log(np.maximum(chance, _LEAST)).sum())
 
     def probability(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""

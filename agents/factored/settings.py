@@ -83,7 +83,7 @@ class OwnPerceptionSettings:
 class OwnSettings(FactoredSettings):
     """All settings of the agent ``factored_own``."""
 
-    #: Log of how much better a memory must explain what was seen than none; see :mod:`.memory`.
+    #: How much more likely, as a logarithm, a memory must make other episodes than none does; see :mod:`.memory`.
     memory_evidence: float = setting(10.0, POSITIVE)
     perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
 

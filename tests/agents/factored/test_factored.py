@@ -150,6 +150,9 @@ def test_values_are_discounted_by_the_step_and_end_at_the_depth(depth: int) -> N
         within = steps < depth
         assert planner.values((place,)) == pytest.approx([10.0 * 0.9**steps if within else 0.0], abs=1e-12)
         assert planner.values((place,), "novelty") == pytest.approx([0.8**steps if within else 0.0], abs=1e-12)
+        for left in (1, 2, 5, 30):
+            worth = 10.0 * 0.9**steps if within and steps < left else 0.0
+            assert planner.values((place,), left=left) == pytest.approx([worth], abs=1e-12)
 
 
 def _backed_up(code: tuple[int, ...], action: int, values: dict[tuple[int, ...], float]) -> float:

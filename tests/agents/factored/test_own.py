@@ -7,33 +7,14 @@ import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, starts
+from fake_pictures import Code, agent, picture, shape
 from imagine_bench.agents.factored import looks
-from imagine_bench.agents.factored.own import OwnPerception, OwnPerceptionAgent
-from imagine_bench.agents.factored.settings import OWN
+from imagine_bench.agents.factored.own import OwnPerceptionAgent
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Frame, Observation, Transition
-from imagine_bench.seeding import SeedTree
-
-Code = tuple[int, ...]
-
-
-def _shape(kind: int) -> NDArray[np.float64]:
-    """One of three marks of a wheel, or the two of the lamp: bars and a ring. Shape (12, 12)."""
-    rows, columns = np.mgrid[:12, :12]
-    ring = (np.hypot(rows - 5.5, columns - 5.5) > 3.5) & (np.hypot(rows - 5.5, columns - 5.5) < 6.0)
-    return np.asarray([abs(rows - 5.5) < 2, abs(columns - 5.5) < 2, ring][kind], dtype=np.float64)
-
-
-def picture(code: Code, rng: np.random.Generator) -> Frame:
-    """Two wheels and a lamp, each moved by up to two pixels, under a tint that is drawn anew."""
-    image = np.full((64, 64, 3), 0.4)
-    for value, (top, left) in zip(code, ((6, 6), (6, 40), (42, 24)), strict=True):
-        down, right = rng.integers(-2, 3, size=2)
-        image[top + down : top + down + 12, left + right : left + right + 12] += 0.5 * _shape(value)[..., None]
-    return (255.0 * image * rng.uniform(0.6, 1.0, size=3)).astype(np.uint8)
 
 
 def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[Code], Frame]:
@@ -45,13 +26,6 @@ def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[
         if rng.random() < 0.2:
             code = starts()[int(rng.integers(len(starts())))]
     return codes, np.stack([picture(code, rng) for code in codes])
-
-
-def agent(seed: int = 0, **overrides: object) -> OwnPerceptionAgent:
-    named = {name.replace("__", "."): value for name, value in overrides.items()}
-    settings = OWN.resolve("fast", named, "chapter_5")
-    perception = OwnPerception(settings.perception, factored=settings.dynamics.factored)
-    return OwnPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
 
 
 def live(learner: OwnPerceptionAgent, episodes: range, seed: int) -> list[int]:
@@ -113,7 +87,7 @@ def test_noise_in_view_is_no_factor_and_hides_none() -> None:
 def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
     """Where most crops of a region have no contour at all."""
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
-    frames[[5, 20, 40], 20:32, 20:32] += (100 * _shape(0))[..., None].astype(np.uint8)
+    frames[[5, 20, 40], 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
     found = looks.find(frames)
     codes, known = looks.read(found, frames)
     assert codes.shape == (60, 1) and known.all()
@@ -125,7 +99,7 @@ def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
     value = np.arange(90) % 3  # nothing, or one of two marks
     frames = np.full((90, 64, 64, 3), 120, dtype=np.uint8)
     for kind in (0, 1):
-        frames[value == kind + 1, 20:32, 20:32] += (100 * _shape(kind))[..., None].astype(np.uint8)
+        frames[value == kind + 1, 20:32, 20:32] += (100 * shape(kind))[..., None].astype(np.uint8)
     frames[(value == 0) & (np.arange(90) % 2 == 0), 20:32, 20:21] += 50
     found = looks.find(frames)
     codes, known = looks.read(found, frames)
@@ -147,7 +121,7 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
 def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int, int], gain: float) -> None:
     def contours(kind: int, at: tuple[int, int], gain: float) -> NDArray[np.float32]:
         image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
-        image[0, 26 + at[0] : 38 + at[0], 26 + at[1] : 38 + at[1]] += _shape(kind)[..., None].astype(np.float32)
+        image[0, 26 + at[0] : 38 + at[0], 26 + at[1] : 38 + at[1]] += shape(kind)[..., None].astype(np.float32)
         return looks.contours(gain * image)
 
     mask = np.zeros((64, 64), dtype=np.bool_)

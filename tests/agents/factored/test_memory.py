@@ -1,0 +1,137 @@
+"""What ``factored_own`` remembers of an episode: chosen by evidence alone, and worth what it should be."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import fake_codes
+import numpy as np
+import pytest
+from fake_codes import starts
+from fake_pictures import Code, agent, picture
+from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.memory import Memory, candidates, choose, contradict, remembering
+from imagine_bench.agents.factored.own import OwnPerceptionAgent
+from imagine_bench.agents.factored.settings import OWN
+
+from imagine_bench.capabilities import begin_episode
+from imagine_bench.interfaces import Observation, Transition
+
+HIDDEN = 2
+"""Value of the lamp where it is covered: in every frame of an episode but its first."""
+SIZES, ACTIONS = (3, 3, 3), fake_codes.ACTIONS
+
+
+def shown(code: Code, step: int) -> Code:
+    return code if step == 0 else (*code[:2], HIDDEN)
+
+
+def lived(episodes: int, rng: np.random.Generator, *, covered: bool) -> tuple[list[CodeTransition], list[bool]]:
+    """Random episodes of the world of two wheels and a lamp, which decides where the goal is."""
+    rows, begins = [], []
+    for _ in range(episodes):
+        code = starts()[int(rng.integers(len(starts())))]
+        for step in range(6):
+            action = int(rng.integers(ACTIONS))
+            after, reward, ended = fake_codes.step(code, action)
+            seen = (shown(code, step), shown(after, step + 1)) if covered else (code, after)
+            rows.append(CodeTransition(seen[0], action, seen[1], reward, ended))
+            begins.append(step == 0)
+            code = after
+            if ended:
+                break
+    return rows, begins
+
+
+def test_the_last_value_that_told_something_is_remembered_for_an_episode() -> None:
+    shown_values = [[2, 0, 2, 1, 2], [2, 2, 1], [0, 2]]
+    rows, begins = [], []
+    for episode in shown_values:
+        for index, (before, after) in enumerate(pairwise(episode)):
+            rows.append(CodeTransition((7, before), 0, (7, after), 0.0, terminated=False))
+            begins.append(index == 0)
+    found = remembering(rows, begins, Memory(factor=1, hidden=2))
+    assert [(row.code[2], row.following[2]) for row in found] == [
+        (2, 0),
+        (0, 0),
+        (0, 1),
+        (1, 1),
+        (2, 2),
+        (2, 1),
+        (0, 0),
+    ]
+    assert [row.code[:2] for row in found] == [row.code for row in rows], "what is seen stays as it is"
+    assert remembering(rows, begins, None) == rows
+
+
+def test_only_factors_that_can_hide_two_values_are_candidates() -> None:
+    assert candidates((2, 3, 4)) == [Memory(1, hidden) for hidden in range(3)] + [
+        Memory(2, hidden) for hidden in range(4)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_covered_is_found_and_nothing_where_nothing_was(seed: int) -> None:
+    settings = OWN.resolve("fast", {}, "chapter_5")
+    rows, begins = lived(150, np.random.default_rng(seed), covered=True)
+    assert contradict(rows)
+    assert choose(rows, begins, SIZES, ACTIONS, settings) == Memory(factor=2, hidden=HIDDEN)
+    sceptical = OWN.resolve("fast", {"memory_evidence": 1e6}, "chapter_5")
+    assert choose(rows, begins, SIZES, ACTIONS, sceptical) is None
+    rows, begins = lived(150, np.random.default_rng(seed), covered=False)
+    assert not contradict(rows) and choose(rows, begins, SIZES, ACTIONS, settings) is None
+
+
+def test_chance_alone_is_no_reason_to_remember() -> None:
+    """Rewards that nothing explains contradict one another, and no memory explains them better."""
+    rng = np.random.default_rng(0)
+    rows, begins = lived(150, rng, covered=False)
+    rows = [row._replace(reward=float(rng.integers(2))) if not row.terminated else row for row in rows]
+    assert contradict(rows)
+    assert choose(rows, begins, SIZES, ACTIONS, OWN.resolve("fast", {}, "chapter_5")) is None
+
+
+def success(learner: OwnPerceptionAgent, episodes: range, *, explore: bool) -> float:
+    """Live in pictures of the world with the covered lamp; the share of episodes that ended well."""
+    solved = 0
+    for episode in episodes:
+        begin_episode(learner)
+        rng = np.random.default_rng((explore, episode))
+        code = starts()[int(rng.integers(len(starts())))]
+        seen = Observation(frame=picture(shown(code, 0), rng))
+        for step in range(6):
+            action = learner.act(seen, explore=explore)
+            code, reward, ended = fake_codes.step(code, action)
+            after = Observation(frame=picture(shown(code, step + 1), rng))
+            if explore:
+                learner.observe(
+                    Transition(
+                        observation=seen, action=action, reward=reward, next_observation=after, terminated=ended,
+                        truncated=not ended and step == 5,
+                    ),
+                    episode=episode,
+                )  # fmt: skip
+            seen = after
+            if ended:
+                solved += reward > 0
+                break
+    return solved / len(episodes)
+
+
+def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing_was_hidden() -> None:
+    learner, forgetful = agent(), agent(memory_evidence=1e6)
+    for each in (learner, forgetful):
+        success(each, range(100), explore=True)
+    assert learner.perception.memory is not None and forgetful.perception.memory is None
+    assert success(learner, range(100), explore=False) >= 0.9
+    assert success(forgetful, range(100), explore=False) <= 0.7, "what is hidden matters"
+    assert learner.replay.rows() == remembering(
+        [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in learner.replay.rows()],
+        learner.perception.begins, learner.perception.memory,
+    ), "codes that are learned from say the same as those that are acted on"  # fmt: skip
+    begin_episode(learner)
+    assert learner._left == 6, "it has seen where episodes are cut"
+    resumed = agent(seed=5)
+    resumed.restore(learner.state())
+    assert success(resumed, range(100, 110), explore=True) == success(learner, range(100, 110), explore=True)
+    assert resumed.replay.rows() == learner.replay.rows()

@@ -1,0 +1,37 @@
+"""Pictures of the tiny world of two wheels and a lamp, and an agent that learns to see them."""
+
+from __future__ import annotations
+
+import numpy as np
+from fake_codes import ACTIONS
+from imagine_bench.agents.factored.own import OwnPerception, OwnPerceptionAgent
+from imagine_bench.agents.factored.settings import OWN
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame
+from imagine_bench.seeding import SeedTree
+
+Code = tuple[int, ...]
+
+
+def shape(kind: int) -> NDArray[np.float64]:
+    """One of three marks of a wheel, or the two of the lamp: bars and a ring. Shape (12, 12)."""
+    rows, columns = np.mgrid[:12, :12]
+    ring = (np.hypot(rows - 5.5, columns - 5.5) > 3.5) & (np.hypot(rows - 5.5, columns - 5.5) < 6.0)
+    return np.asarray([abs(rows - 5.5) < 2, abs(columns - 5.5) < 2, ring][kind], dtype=np.float64)
+
+
+def picture(code: Code, rng: np.random.Generator) -> Frame:
+    """Two wheels and a lamp, each moved by up to two pixels, under a tint that is drawn anew."""
+    image = np.full((64, 64, 3), 0.4)
+    for value, (top, left) in zip(code, ((6, 6), (6, 40), (42, 24)), strict=True):
+        down, right = rng.integers(-2, 3, size=2)
+        image[top + down : top + down + 12, left + right : left + right + 12] += 0.5 * shape(value)[..., None]
+    return (255.0 * image * rng.uniform(0.6, 1.0, size=3)).astype(np.uint8)
+
+
+def agent(seed: int = 0, **overrides: object) -> OwnPerceptionAgent:
+    named = {name.replace("__", "."): value for name, value in overrides.items()}
+    settings = OWN.resolve("fast", named, "chapter_5")
+    perception = OwnPerception(settings.perception, factored=settings.dynamics.factored)
+    return OwnPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
