@@ -53,7 +53,7 @@ class FactoredModel:
             self.outcomes.add(row)
 
     def log_likelihood(self, rows: Sequence[CodeTransition], factors: int) -> float:
-        """Log likelihood of transitions (each has 0.1 % at least): what the first factors become, and what that brings."""
+        """Log likelihood of transitions (each has at least 0.1 %): what the first factors become and what it brings."""
         causes, each = self.outcomes.causes, np.arange(len(rows))
         if causes is None or not rows:
             return len(rows) * float(np.log(_LEAST))
