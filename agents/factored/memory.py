@@ -51,11 +51,11 @@ def remembering(rows: Sequence[CodeTransition], begins: Sequence[bool], memory: 
     return found
 
 
-def contradict(rows: Sequence[CodeTransition]) -> bool:
-    """Whether the same codes and action have brought different outcomes."""
-    seen: dict[tuple[Code, int, Code], tuple[float, bool]] = {}
-    return any(
-        seen.setdefault((row.code, row.action, row.following), outcome) != outcome
+def contradictions(rows: Sequence[CodeTransition]) -> int:
+    """How many transitions brought another outcome than the first of the same codes and action."""
+    first: dict[tuple[Code, int, Code], tuple[float, bool]] = {}
+    return sum(
+        first.setdefault((row.code, row.action, row.following), outcome) != outcome
         for row in rows for outcome in [(row.reward, row.terminated)]
     )  # fmt: skip
 
@@ -65,7 +65,7 @@ def choose(
     settings: OwnSettings,
 ) -> Memory | None:  # fmt: skip
     """The memory that explains transitions between codes best; None unless it does so much better than none."""
-    if not contradict(rows):
+    if not contradictions(rows):
         return None
     half = np.cumsum(begins) % 2 == 0  # every second episode
     likelihood: dict[Memory | None, float] = {}

@@ -20,12 +20,14 @@ from .. import snapshot
 from ..encoders.perception import prepare_torch
 from . import looks
 from .agent import CodeAgent
-from .factors import Code
-from .memory import Memory, choose, remembering
+from .factors import Code, CodeTransition
+from .memory import Memory, choose, contradictions, remembering
 from .settings import OWN, OwnPerceptionSettings, OwnSettings
 
 _FIRST, _RECENT = 4, 4
 """Frames after which it looks for factors first; frames whose codes are kept."""
+_CONTRADICTIONS = 0.01
+"""Share of transitions that may contradict one another by a misread frame."""
 
 
 class OwnPerception:
@@ -40,7 +42,8 @@ class OwnPerception:
         """Whether each of these is the first of an episode."""
         self.found: list[looks.Factor] = []
         self.memory: Memory | None = None
-        self.looked_at = 0
+        self.found_in = self.looked_at = 0
+        """In how many of the first frames factors were found, and looked for."""
         self.unknown = False
         """Whether anything seen since has no known value."""
         self._remembered = 0
@@ -117,8 +120,12 @@ class OwnPerception:
 
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
-        self.found, self.looked_at = looks.find(np.stack(self.frames[:count])) if count else [], count
-        self.memory, self.unknown = None, False
+        self.take(looks.find(np.stack(self.frames[:count])) if count else [], count)
+        self.looked_at, self.unknown = count, False
+
+    def take(self, found: list[looks.Factor], found_in: int) -> None:
+        """See these factors from now on."""
+        self.found, self.found_in, self.memory = found, found_in, None
         self._recent.clear()
 
     def arrays(self) -> snapshot.Arrays:
@@ -134,15 +141,17 @@ class OwnPerception:
     def values(self) -> dict[str, Any]:
         """What belongs to :meth:`arrays` in a snapshot."""
         memory = None if self.memory is None else [self.memory.factor, self.memory.hidden]
-        return {"looked_at": self.looked_at, "unknown": self.unknown, "memory": memory}
+        counts = {"looked_at": self.looked_at, "found_in": self.found_in}
+        return {**counts, "unknown": self.unknown, "memory": memory}
 
     def load(self, state: AgentState) -> None:
         """Take up what :meth:`arrays` and :meth:`values` gave: find the same factors in the same frames."""
         self.frames = list(state.arrays["replay/frames"])
         self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
         self.begins = state.arrays["replay/begins"].tolist()
-        self.look(state.values["looked_at"])
-        self.unknown, memory = state.values["unknown"], state.values["memory"]
+        self.look(state.values["found_in"])
+        self.looked_at, self.unknown = state.values["looked_at"], state.values["unknown"]
+        memory = state.values["memory"]
         self.memory = Memory(*memory) if memory else None
 
     def diagnostics(self) -> dict[str, float]:
@@ -183,22 +192,29 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         if not eyes.full:
             with self.meters.cpu_time("time/perception_s"):
                 eyes.remember(transition.observation.frame, transition.next_observation.frame, begins=self._acted <= 1)
+                before = (eyes.found, eyes.found_in)
                 if eyes.renew():
-                    self._recode()
+                    self._recode(*before)
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
         if transition.terminated or transition.truncated:
             self.begin_episode()
 
-    def _recode(self) -> None:
-        """Give every replayed transition the codes that its frames have now, and learn from all of them once more."""
-        eyes = self.perception
-        codes, _ = eyes.codes(np.stack(eyes.frames))
-        rows, count = self.replay.rows(), len(self.replay)
-        rows = [
-            row._replace(code=codes[before], following=codes[after])
-            for row, (before, after) in zip(rows, eyes.transitions, strict=False)
-        ]
+    def _recode(self, found: list[looks.Factor], found_in: int) -> None:
+        """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
+
+        What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.
+        """
+        eyes, count = self.perception, len(self.replay)
+        rows = self._rows()
+        if found and contradictions(rows) > _CONTRADICTIONS * count:
+            now = (eyes.found, eyes.found_in)
+            eyes.take(found, found_in)
+            earlier = self._rows()
+            if contradictions(earlier) > _CONTRADICTIONS * count:
+                eyes.take(*now)
+            else:
+                rows = earlier
         eyes.memory = choose(rows, eyes.begins[:count], eyes.seen_sizes, self.n_actions, self.settings)
         rows = remembering(rows, eyes.begins[:count], eyes.memory)
         self.replay.recode([(row.code, row.following) for row in rows], len(eyes.sizes))
@@ -206,6 +222,14 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         eyes.begin_episode()
         if rows and eyes.memory and not eyes.begins[count]:
             eyes.recall(rows[-1].following[-1])
+
+    def _rows(self) -> list[CodeTransition]:
+        """What is replayed, with the codes that its frames have now, as far as they are seen."""
+        codes, _ = self.perception.codes(np.stack(self.perception.frames))
+        return [
+            row._replace(code=codes[before], following=codes[after])
+            for row, (before, after) in zip(self.replay.rows(), self.perception.transitions, strict=False)
+        ]
 
     def diagnostics(self) -> dict[str, float]:
         """Also what it sees."""

@@ -10,7 +10,7 @@ import pytest
 from fake_codes import starts
 from fake_pictures import Code, agent, picture
 from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.memory import Memory, candidates, choose, contradict, remembering
+from imagine_bench.agents.factored.memory import Memory, candidates, choose, contradictions, remembering
 from imagine_bench.agents.factored.own import OwnPerceptionAgent
 from imagine_bench.agents.factored.settings import OWN
 
@@ -74,12 +74,12 @@ def test_only_factors_that_can_hide_two_values_are_candidates() -> None:
 def test_what_was_covered_is_found_and_nothing_where_nothing_was(seed: int) -> None:
     settings = OWN.resolve("fast", {}, "chapter_5")
     rows, begins = lived(150, np.random.default_rng(seed), covered=True)
-    assert contradict(rows)
+    assert contradictions(rows)
     assert choose(rows, begins, SIZES, ACTIONS, settings) == Memory(factor=2, hidden=HIDDEN)
     sceptical = OWN.resolve("fast", {"memory_evidence": 1e6}, "chapter_5")
     assert choose(rows, begins, SIZES, ACTIONS, sceptical) is None
     rows, begins = lived(150, np.random.default_rng(seed), covered=False)
-    assert not contradict(rows) and choose(rows, begins, SIZES, ACTIONS, settings) is None
+    assert not contradictions(rows) and choose(rows, begins, SIZES, ACTIONS, settings) is None
 
 
 def test_chance_alone_is_no_reason_to_remember() -> None:
@@ -87,7 +87,7 @@ def test_chance_alone_is_no_reason_to_remember() -> None:
     rng = np.random.default_rng(0)
     rows, begins = lived(150, rng, covered=False)
     rows = [row._replace(reward=float(rng.integers(2))) if not row.terminated else row for row in rows]
-    assert contradict(rows)
+    assert contradictions(rows)
     assert choose(rows, begins, SIZES, ACTIONS, OWN.resolve("fast", {}, "chapter_5")) is None
 
 
