@@ -10,6 +10,7 @@ import argparse
 import importlib.util
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,14 +61,14 @@ def live(agent: OwnPerceptionAgent | None, env: gymnasium.Env[Any, Any], seeds: 
     return solved / len(seeds)
 
 
-def learn(name: str, seed: int, tests: int) -> dict[str, Any]:
+def learn(name: str, seed: int, tests: int, budgets: Sequence[int] = BUDGETS) -> dict[str, Any]:
     """Train on episodes of their own seeds; after each budget, the share of test episodes that are rewarded."""
     env = environment(name)
     agent = make(
         AgentContext(n_actions=int(env.action_space.n), preprocessing="gray", encoder=None, seeds=SeedTree(seed))
     )
     first, done, cpu_s, success = 1_000_000 * (seed + 1), 0, 0.0, {}
-    for budget in BUDGETS:
+    for budget in budgets:
         began = time.process_time()
         live(agent, env, range(first + done, first + budget), explore=True)
         done, cpu_s = budget, cpu_s + time.process_time() - began

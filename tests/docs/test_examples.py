@@ -90,6 +90,14 @@ def test_the_world_model_keeps_the_contract_and_learns(example: ModuleType) -> N
     assert known.any() and away[1][known].mean() < 0.5 * away[0].mean(), "what it has seen it knows"
 
 
+@pytest.mark.parametrize("example", ["elsewhere"], indirect=True)
+def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: ModuleType) -> None:
+    """Gymnasium's frozen lake from pixels, with one seed; blind choice solves it once in fifty times."""
+    assert example.live(None, example.environment("FrozenLake-v1"), range(200), explore=False) < 0.1
+    found = example.learn("FrozenLake-v1", seed=0, tests=5, budgets=(40,))
+    assert found["success"] == {40: 1.0} and found["real_steps"] < 1000
+
+
 def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "how_to" / "add_agent.md").read_text()
     (text,) = re.findall(r"^```toml\n(question.*?)^```", page, re.MULTILINE | re.DOTALL)
