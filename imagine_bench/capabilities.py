@@ -6,7 +6,7 @@ depth, ``A`` actions, ``M`` coordinates of a macrostate. A probe that reads macr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -65,6 +65,23 @@ class MemoryReader(Protocol):
         It is fitted on frames that the agent learned from: what a probe saw last of each coordinate of the macrostate,
         of so many values; -1 of one never seen. No agent acts on it.
         """
+
+
+@dataclass(frozen=True, slots=True)
+class Perceived:
+    """What an agent saw after some training episodes."""
+
+    episodes: int
+    sizes: tuple[int, ...]  #: numbers of values of what it told apart
+    picture: NDArray[np.uint8]  #: for people. Shape (H, W, 3).
+
+
+@runtime_checkable
+class SeeingLearner(Protocol):
+    """An agent that learned to see while it acted, and can show how."""
+
+    def perceived(self) -> Iterable[Perceived]:
+        """What it saw whenever that changed in training, in order; nothing changes in the agent."""
 
 
 @runtime_checkable

@@ -70,7 +70,7 @@ HYPERPARAMETERS = Hyperparameters.everywhere(FactoredSettings())
 
 @dataclass(frozen=True, kw_only=True)
 class OwnPerceptionSettings:
-    """How an agent learns to see; see :mod:`.own`."""
+    """How an agent learns to see; see :mod:`..factored_own`."""
 
     #: Most frames of its own that it remembers, 12 kB each; then perception stays as it is.
     frames: int = setting(1000, between(4, 100_000))
@@ -83,7 +83,7 @@ class OwnPerceptionSettings:
 class OwnSettings(FactoredSettings):
     """All settings of the agent ``factored_own``."""
 
-    #: How much more likely, as a logarithm, a memory must make other episodes than none does; see :mod:`.memory`.
+    #: How much more likely, as a logarithm, a memory must make other episodes than none does; see ``memory``.
     memory_evidence: float = setting(10.0, POSITIVE)
     perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
 

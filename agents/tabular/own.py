@@ -13,7 +13,7 @@ from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
-from ..factored.own import OwnPerception
+from ..factored_own.agent import OwnPerception
 from .count_table import CountTableAgent
 from .settings import OWN, OwnCountTableSettings
 

@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation, ResizeObservation, TransformReward
-from imagine_bench.agents.factored.own import OwnPerceptionAgent, make
+from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent, make
 
 from imagine_bench.interfaces import AgentContext, Observation, Transition
 from imagine_bench.machine import describe_environment

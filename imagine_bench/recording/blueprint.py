@@ -18,10 +18,13 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(origin=ROOT, name=name, eye_controls=eye, background=[214, 222, 230], line_grid=False)
 
 
-def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool) -> rrb.Blueprint:
+def blueprint(
+    *, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool, sees: bool
+) -> rrb.Blueprint:
     """The layout: the scene large, beside it what the agent sees and predicts, below it what it imagines.
 
-    ``target_m`` (3,) is what the 3D view looks at; ``several`` rollouts may be imagined from each frame.
+    ``target_m`` (3,) is what the 3D view looks at; ``several`` rollouts may be imagined from each frame; ``sees``: it
+    shows how it learned to see.
     """
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
     text = rrb.TextDocumentView(origin="/real/text", name="What happens")
@@ -32,6 +35,9 @@ def blueprint(*, target_m: NDArray[np.float64], values: bool, imagines: bool, se
     pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
     if imagines:
         pages = [_imagined_now(), *([_sampled_rollouts()] if several else []), *pages, _by_depth()]
+    if sees:
+        name = "What it has learned to see: a color a factor, and beside it a look of each of its values"
+        pages = [rrb.Spatial2DView(origin="/seen/factors", name=name, background=[255, 255, 255]), *pages]
     bottom = rrb.Tabs(*pages, active_tab=0)
     return playing(rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]))
 

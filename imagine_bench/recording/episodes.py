@@ -16,7 +16,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, MemoryReader, ValueReader, begin_episode
+from imagine_bench.capabilities import Imaginer, MemoryReader, SeeingLearner, ValueReader, begin_episode
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
@@ -64,7 +64,10 @@ def record_run(
     env.reset(seed=episode_seed("recording", seed, 1))
     values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
     several = imagines and is_random(spec.rules)
-    layout = blueprint(target_m=look_target_m(scene), values=values, imagines=imagines, several=several)
+    layout = blueprint(
+        target_m=look_target_m(scene), values=values, imagines=imagines, several=several,
+        sees=isinstance(agent, SeeingLearner),
+    )  # fmt: skip
     with recording_file(path, task, layout) as recording:
         recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
         if isinstance(scene, SceneReader):
@@ -105,6 +108,8 @@ class _EpisodeRecorder:
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
             self._recording.stream.set_time("imagined_depth", sequence=0)
         observation = self._log_frame(env.unwrapped, episode, seen, info)
+        if episode == 1:
+            self._log_learning_to_see()
         self._episode = []
         done, step, heading = False, 0, f"### Episode {episode}: a new start"
         while not done:
@@ -126,6 +131,18 @@ class _EpisodeRecorder:
         self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.", observation.frame)
         self._clear_predictions()
         self._clock_s += _STILL_S
+
+    def _log_learning_to_see(self) -> None:
+        """What it saw whenever that changed in training, a moment each, while the scene stands still."""
+        if not isinstance(self._agent, SeeingLearner):
+            return
+        for seen in self._agent.perceived():
+            values = f"{len(seen.sizes)} things, of {', '.join(map(str, seen.sizes))} values"
+            told = f"After {seen.episodes} training episodes it tells apart {values if seen.sizes else 'nothing yet'}."
+            self._recording.text("/real/text", told)
+            self._recording.sheet("/seen/factors", seen.picture)
+            self._clock_s += _STILL_S
+            self._recording.set_clocks(self._clock_s, env_step=self._env_step, episode=1)
 
     def _log_frame(self, scene: Any, episode: int, seen: Any, info: dict[str, Any]) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""

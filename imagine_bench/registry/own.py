@@ -78,7 +78,7 @@ AGENTS: dict[str, AgentEntry] = {
         "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
     ),
     "factored_own": AgentEntry(
-        make="imagine_bench.agents.factored.own:make", needs_encoder=False, title="factored, own eyes",
+        make="imagine_bench.agents.factored_own.agent:make", needs_encoder=False, title="factored, own eyes",
         settings="imagine_bench.agents.factored.settings:OWN",
         description="Like factored, but it begins with nothing: it learns to see, too, from its own frames as it acts.",
     ),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from fake_codes import ACTIONS
-from imagine_bench.agents.factored.own import OwnPerception, OwnPerceptionAgent
 from imagine_bench.agents.factored.settings import OWN
+from imagine_bench.agents.factored_own.agent import OwnPerception, OwnPerceptionAgent
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame

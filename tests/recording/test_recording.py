@@ -19,7 +19,7 @@ from recordings import contents, rerun, times
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.capabilities import ImaginedRollout, Perceived
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.judge.imagination_quality import compare_rollout
@@ -115,6 +115,24 @@ class _HandsOver(FakeImaginer):
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         return np.arange(4, dtype=np.float32)
+
+
+class _Sees(FakeAgent):
+    """Has learned to see, in two steps."""
+
+    def perceived(self) -> list[Perceived]:
+        return [Perceived(n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]
+
+
+def test_how_it_learned_to_see_is_shown_before_it_acts(imagined: Path, tmp_path: Path) -> None:
+    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0")) as env:
+        path = record_run(
+            "arrow_puzzle", _Sees(), name="random", seed=0, env=env, appearance="clean", episodes=1,
+            path=tmp_path / "sees.rrd",
+        )  # fmt: skip
+    looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
+    assert len(looked) == 2 and max(looked) < min(acted)
+    assert "/seen/factors" not in contents(imagined)
 
 
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:

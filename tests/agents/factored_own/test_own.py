@@ -8,8 +8,8 @@ import pytest
 from agent_states import same
 from fake_codes import ACTIONS, starts
 from fake_pictures import Code, agent, picture, shape
-from imagine_bench.agents.factored import looks
-from imagine_bench.agents.factored.own import OwnPerceptionAgent
+from imagine_bench.agents.factored_own import looks
+from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
@@ -236,3 +236,20 @@ def test_tests_change_nothing() -> None:
         Observation(frame=np.random.default_rng(0).integers(255, size=(64, 64, 3)).astype(np.uint8)), explore=False
     )
     assert same(before, learner.state())
+
+
+def test_it_can_show_how_it_learned_to_see() -> None:
+    """As often as what it saw changed; pictures show each factor where it is, and change nothing in the agent."""
+    learner = agent()
+    live(learner, range(25), seed=0)
+    before = learner.state()
+    shown = list(learner.perceived())
+    assert same(before, learner.state())
+    episodes = [each.episodes for each in shown]
+    assert episodes == sorted(episodes) and len(set(each.sizes for each in shown)) > 1
+    assert shown[-1].sizes == learner.perception.sizes
+    gray, mask = shown[-1].picture[:320:5, :320:5], np.zeros((64, 64), dtype=np.bool_)
+    for factor in learner.perception.found:
+        for part in factor.parts:
+            mask |= part.mask
+    assert np.array_equal(np.ptp(gray, axis=2) > 0, mask), "colored where something is told apart, gray elsewhere"

@@ -9,20 +9,24 @@ episode (:mod:`.memory`). Once as many frames are remembered as may be, percepti
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
+from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.capabilities import Perceived
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
+from ..factored.agent import CodeAgent
+from ..factored.factors import Code, CodeTransition
+from ..factored.settings import OWN, OwnPerceptionSettings, OwnSettings
 from . import looks
-from .agent import CodeAgent
-from .factors import Code, CodeTransition
 from .memory import Memory, choose, contradictions, remembering
-from .settings import OWN, OwnPerceptionSettings, OwnSettings
+from .picture import picture
 
 _FIRST, _RECENT = 4, 4
 """Frames after which it looks for factors first; frames whose codes are kept."""
@@ -44,6 +48,8 @@ class OwnPerception:
         self.memory: Memory | None = None
         self.found_in = self.looked_at = 0
         """In how many of the first frames factors were found, and looked for."""
+        self.history: list[int] = []
+        """The first of these whenever it changed."""
         self.unknown = False
         """Whether anything seen since has no known value."""
         self._remembered = 0
@@ -141,7 +147,7 @@ class OwnPerception:
     def values(self) -> dict[str, Any]:
         """What belongs to :meth:`arrays` in a snapshot."""
         memory = None if self.memory is None else [self.memory.factor, self.memory.hidden]
-        counts = {"looked_at": self.looked_at, "found_in": self.found_in}
+        counts = {"looked_at": self.looked_at, "found_in": self.found_in, "history": list(self.history)}
         return {**counts, "unknown": self.unknown, "memory": memory}
 
     def load(self, state: AgentState) -> None:
@@ -151,7 +157,7 @@ class OwnPerception:
         self.begins = state.arrays["replay/begins"].tolist()
         self.look(state.values["found_in"])
         self.looked_at, self.unknown = state.values["looked_at"], state.values["unknown"]
-        memory = state.values["memory"]
+        memory, self.history = state.values["memory"], list(state.values["history"])
         self.memory = Memory(*memory) if memory else None
 
     def diagnostics(self) -> dict[str, float]:
@@ -195,6 +201,7 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
                 before = (eyes.found, eyes.found_in)
                 if eyes.renew():
                     self._recode(*before)
+                    eyes.history += [eyes.found_in] if eyes.found_in not in eyes.history else []
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
         if transition.terminated or transition.truncated:
@@ -230,6 +237,15 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
             row._replace(code=codes[before], following=codes[after])
             for row, (before, after) in zip(self.replay.rows(), self.perception.transitions, strict=False)
         ]
+
+    def perceived(self) -> Iterator[Perceived]:
+        """What it saw whenever that changed; see :class:`imagine_bench.capabilities.SeeingLearner`."""
+        eyes = self.perception
+        for count in eyes.history:
+            frames = np.stack(eyes.frames[:count])
+            found = looks.find(frames)
+            begun = sum(compress(eyes.begins, [after < count for _, after in eyes.transitions]))
+            yield Perceived(begun, tuple(len(factor.joint) for factor in found), picture(found, frames))
 
     def diagnostics(self) -> dict[str, float]:
         """Also what it sees."""

@@ -13,9 +13,9 @@ from itertools import compress
 
 import numpy as np
 
-from .factors import Code, CodeTransition
-from .model import FactoredModel
-from .settings import OwnSettings
+from ..factored.factors import Code, CodeTransition
+from ..factored.model import FactoredModel
+from ..factored.settings import OwnSettings
 
 _FEWEST = 3
 """Values of a factor worth remembering: one that tells nothing, and two to tell apart."""

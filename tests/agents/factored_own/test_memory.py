@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from fake_codes import starts
 from fake_pictures import Code, agent, picture
-from imagine_bench.agents.factored import own
 from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.memory import Memory, candidates, choose, contradictions, remembering
-from imagine_bench.agents.factored.own import OwnPerceptionAgent
 from imagine_bench.agents.factored.settings import OWN
+from imagine_bench.agents.factored_own import agent as own
+from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
+from imagine_bench.agents.factored_own.memory import Memory, candidates, choose, contradictions, remembering
 
 from imagine_bench.capabilities import begin_episode
 from imagine_bench.interfaces import Frame, Observation, Transition

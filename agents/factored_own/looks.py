@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Frame
 
-from .factors import Codes
+from ..factored.factors import Codes
 
 Images = NDArray[np.float32]
 Mask = NDArray[np.bool_]
