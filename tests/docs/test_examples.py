@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -96,6 +97,25 @@ def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: Mod
     assert example.live(None, example.environment("FrozenLake-v1"), range(200), explore=False) < 0.1
     found = example.learn("FrozenLake-v1", seed=0, tests=5, budgets=(40,))
     assert found["success"] == {40: 1.0} and found["real_steps"] < 1000
+
+
+def test_what_the_page_says_of_elsewhere_was_kept() -> None:
+    page = (ROOT / "docs" / "explanation" / "from_nothing.md").read_text()
+    kept = json.loads((ROOT / "docs" / "results" / "elsewhere" / "elsewhere.json").read_text())["environments"]
+    said = re.findall(r"(frozen lake|[\w-]+-5x5) (\d+)(?: %)? \((?:blind choice )?(\d+)\)", page)
+    found = [
+        (
+            name.removeprefix("MiniGrid-").removesuffix("-v0"),
+            100 * np.mean([run["success"]["20"] for run in each["runs"]]),
+            each["blind"],
+        )
+        for name, each in kept.items()
+    ]
+    assert said == [
+        (name.replace("FrozenLake-v1", "frozen lake"), f"{mean:.0f}", f"{100 * blind:.0f}")
+        for name, mean, blind in found
+    ]
+    assert len(said) == 4
 
 
 def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
