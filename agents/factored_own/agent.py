@@ -213,16 +213,17 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.
         """
         eyes, count = self.perception, len(self.replay)
-        rows = self._rows()
-        if found and contradictions(rows) > _CONTRADICTIONS * count:
+        of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
+        rows, few = self._rows(), _CONTRADICTIONS * (count - of_task.start)
+        if found and contradictions(rows[of_task]) > few:
             now = (eyes.found, eyes.found_in)
             eyes.take(found, found_in)
             earlier = self._rows()
-            if contradictions(earlier) > _CONTRADICTIONS * count:
+            if contradictions(earlier[of_task]) > few:
                 eyes.take(*now)
             else:
                 rows = earlier
-        eyes.memory = choose(rows, eyes.begins[:count], eyes.seen_sizes, self.n_actions, self.settings)
+        eyes.memory = choose(rows[of_task], eyes.begins[of_task], eyes.seen_sizes, self.n_actions, self.settings)
         rows = remembering(rows, eyes.begins[:count], eyes.memory)
         self.replay.recode([(row.code, row.following) for row in rows], len(eyes.sizes))
         self._relearn(self.tasks, count)

@@ -92,8 +92,13 @@ def test_chance_alone_is_no_reason_to_remember() -> None:
     assert choose(rows, begins, SIZES, ACTIONS, OWN.resolve("fast", {}, "chapter_5")) is None
 
 
-def success(learner: OwnPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True) -> float:
-    """Live in pictures of the world, whose lamp may be covered; the share of episodes that ended well."""
+def success(
+    learner: OwnPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True, well: float = 1.0
+) -> float:
+    """Live in pictures of the world, whose lamp may be covered; the share of episodes that ended well.
+
+    Rewards are multiplied by ``well``.
+    """
 
     def seen_of(code: Code, step: int) -> Code:
         return shown(code, step) if covered else code
@@ -107,6 +112,7 @@ def success(learner: OwnPerceptionAgent, episodes: range, *, explore: bool, cove
         for step in range(6):
             action = learner.act(seen, explore=explore)
             code, reward, ended = fake_codes.step(code, action)
+            reward *= well
             after = Observation(frame=picture(seen_of(code, step + 1), rng))
             if explore:
                 learner.observe(
@@ -168,3 +174,16 @@ def test_what_was_seen_is_kept_where_outcomes_contradict_what_is_seen_anew(
         resumed.restore(learner.state())
         assert resumed.perception.sizes == learner.perception.sizes
         assert resumed.perception.found_in < resumed.perception.looked_at
+
+
+def test_another_task_is_no_reason_to_remember(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its goals are elsewhere, so the same code and action bring other outcomes; memories do not see that."""
+    learner = agent(perception__growth_if_known=1.1)
+    success(learner, range(30), explore=True, covered=False)
+    learner.reset_for_new_task()
+    tried: list[int] = []
+    monkeypatch.setattr(own, "choose", lambda rows, *_: tried.append(contradictions(rows)))
+    success(learner, range(30, 50), explore=True, covered=False, well=-1.0)
+    rows = learner.replay.rows()
+    assert contradictions(rows) > 0 == contradictions(rows[learner.tasks[-1] :])
+    assert tried and not any(tried)
