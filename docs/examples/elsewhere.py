@@ -11,6 +11,7 @@ import importlib.util
 import json
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,11 @@ def live(agent: OwnPerceptionAgent | None, env: gymnasium.Env[Any, Any], seeds: 
 
 def learn(name: str, seed: int, tests: int, budgets: Sequence[int] = BUDGETS) -> dict[str, Any]:
     """Train on episodes of their own seeds; after each budget, the share of test episodes that are rewarded."""
-    env = environment(name)
+    with closing(environment(name)) as env:
+        return _learn(env, seed, tests, budgets)
+
+
+def _learn(env: gymnasium.Env[Any, Any], seed: int, tests: int, budgets: Sequence[int]) -> dict[str, Any]:
     agent = make(
         AgentContext(n_actions=int(env.action_space.n), preprocessing="gray", encoder=None, seeds=SeedTree(seed))
     )
@@ -88,7 +93,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     found: dict[str, Any] = {**describe_environment(), "tests": options.tests, "environments": {}}
     for name in options.environments:
-        blind = live(None, environment(name), range(1000, 2000), explore=False)
+        with closing(environment(name)) as env:
+            blind = live(None, env, range(1000, 2000), explore=False)
         runs = [learn(name, seed, options.tests) for seed in options.seeds]
         found["environments"][name] = {"blind": blind, "runs": runs}
         means = {budget: np.mean([run["success"][budget] for run in runs]) for budget in BUDGETS}

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import ModuleType
 
@@ -94,7 +95,8 @@ def test_the_world_model_keeps_the_contract_and_learns(example: ModuleType) -> N
 @pytest.mark.parametrize("example", ["elsewhere"], indirect=True)
 def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: ModuleType) -> None:
     """Gymnasium's frozen lake from pixels, with one seed; blind choice solves it once in fifty times."""
-    assert example.live(None, example.environment("FrozenLake-v1"), range(200), explore=False) < 0.1
+    with closing(example.environment("FrozenLake-v1")) as env:
+        assert example.live(None, env, range(200), explore=False) < 0.1
     found = example.learn("FrozenLake-v1", seed=0, tests=5, budgets=(40,))
     assert found["success"] == {40: 1.0} and found["real_steps"] < 1000
 
