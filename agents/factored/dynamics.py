@@ -25,7 +25,7 @@ _LARGEST_TABLE = 1 << 16
 _NEGLIGIBLE = 1e-12
 """Structures of no more posterior probability are left out of predictions."""
 _AT_ONCE = 64
-"""Codes whose counts are read at once: few enough for a cache."""
+"""Codes whose counts are read at once, so that tables of many values need little memory."""
 EVERY = slice(None)
 """All actions."""
 

@@ -125,11 +125,7 @@ class _Sees(FakeAgent):
 
 
 def test_how_it_learned_to_see_is_shown_before_it_acts(imagined: Path, tmp_path: Path) -> None:
-    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0")) as env:
-        path = record_run(
-            "arrow_puzzle", _Sees(), name="random", seed=0, env=env, appearance="clean", episodes=1,
-            path=tmp_path / "sees.rrd",
-        )  # fmt: skip
+    path = record(_Sees(), tmp_path / "sees.rrd", name="random", episodes=1)
     looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
     assert len(looked) == 2 and max(looked) < min(acted)
     assert "/seen/factors" not in contents(imagined)
