@@ -192,6 +192,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
         self.world.sensing.draw(self.np_random)
+        if self._sight is not None:
+            self.world.aim(self.np_random)
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()

@@ -78,6 +78,7 @@ class World(abc.ABC):
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._people = [model.material(name).id for name in ("skin", "cloth")]
+        self._aims = [[0.0, 0.0, 0.0] for _ in starts]
         self._read_at: tuple[bytes, bytes] | None = None
         self._latest_objects: tuple[tuple[int, ...], str | None] = ((), None)
         self._rest_qpos, self._rest_ctrl = at_rest(model)
@@ -128,6 +129,13 @@ class World(abc.ABC):
         if self._distraction is not None:
             self._distraction.place(self.data, rng)
         self.update()
+
+    def aim(self, rng: np.random.Generator) -> None:
+        """Draw where the next macro-action puts objects down: as far off their places as at a start.
+
+        Then no frame tells what was moved before. Without it, objects come down exactly on their places.
+        """
+        self._aims = rng.uniform(-1.0, 1.0, (len(self._aims), 3)).tolist()
 
     def hide_gesture(self, hidden: bool) -> None:
         """Let no camera see people's hands and arms, or let all; where they are stays as it is."""
@@ -216,6 +224,11 @@ class World(abc.ABC):
         return True
 
     # --- what they all do ----------------------------------------------------------------------------------------
+
+    def _off(self, offset: Sequence[float]) -> tuple[float, float, float]:
+        """Shares of what the appearance allows, in x, y and yaw, as metres and radians."""
+        x, y, yaw = offset
+        return self._level.object_offset_m * x, self._level.object_offset_m * y, self._level.object_yaw_rad * yaw
 
     def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
         (x_m, y_m, z_m), turned = offset_m, orientation.about_vertical(yaw_rad)

@@ -43,10 +43,10 @@ class ArrowWorld(World):
         return TurnExecutor(self.model, self._layout.slots_xy_m, self.sensing)
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
-        """Kinematic execution: a turned cube stands exactly on its slot, as a good turn leaves it."""
+        """Kinematic execution: a turned cube stands where a good turn leaves it."""
         for turn in self._turns[action]:
             if not self._stays(turn.cube, intended):
-                self._put(turn.cube, intended[turn.cube])
+                self._put(turn.cube, intended[turn.cube], self._aims[turn.cube])
         self._gesture(intended[-1])
         self.update()
 
@@ -61,7 +61,7 @@ class ArrowWorld(World):
         for turn in turns:
             results.append((yield from self.executor.turn(
                 self.data, cube=turn.cube, clockwise=turn.clockwise, slips=turn.cube in slipping,
-                capture_motion_hz=capture_motion_hz,
+                off=self._off(self._aims[turn.cube]), capture_motion_hz=capture_motion_hz,
             )))  # fmt: skip
         self.executor.executor.rest(self.data)
         self._gesture(intended[-1])
@@ -76,13 +76,11 @@ class ArrowWorld(World):
         return self._objects()[0][cube] == intended[cube]
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        (x_m, y_m), (right, up, turn) = self._layout.slots_xy_m[index], offset
+        (x_m, y_m), (right_m, up_m, turned_rad) = self._layout.slots_xy_m[index], self._off(offset)
         self.data.qpos[self.object_qpos[index]] = (
-            x_m + self._level.object_offset_m * right,
-            y_m + self._level.object_offset_m * up,
-            c.CUBE_REST_Z_M,
-            *orientation.about_vertical(-(_QUARTER_RAD * value - self._level.object_yaw_rad * turn)),
-        )
+            x_m + right_m, y_m + up_m, c.CUBE_REST_Z_M,
+            *orientation.about_vertical(-(_QUARTER_RAD * value - turned_rad)),
+        )  # fmt: skip
 
     def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
         return {self._hand: self._layout.fingertips_m[gesture]}

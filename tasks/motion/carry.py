@@ -63,10 +63,14 @@ class CarryExecutor:
         result, qpos = yield from self._run(data, waypoints, reach, None, capture_motion_hz)
         return self._unless_missed(spec, result, qpos)
 
-    def place(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> Motion[MacroResult]:
-        """Put the held object ``index`` back on its nominal place, the right way round."""
-        target_m = np.array(standing_m(index)) + _up(_PLACE_DROP_M)
-        return (yield from self._put(data, index, target_m, 0.0, capture_motion_hz))
+    def place(
+        self, data: mujoco.MjData, *, index: int, off: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        capture_motion_hz: float = 0.0,
+    ) -> Motion[MacroResult]:  # fmt: skip
+        """Put the held object ``index`` back on its place, ``off`` it by metres in x and y, and turned by radians."""
+        right_m, up_m, turned_rad = off
+        target_m = np.array(standing_m(index)) + np.array([right_m, up_m, _PLACE_DROP_M])
+        return (yield from self._put(data, index, target_m, turned_rad, capture_motion_hz))
 
     def hand_over(
         self, data: mujoco.MjData, *, index: int, palm_m: Floats, capture_motion_hz: float = 0.0

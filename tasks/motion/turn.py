@@ -57,12 +57,14 @@ class TurnExecutor:
         self._slots_xy_m, self._slots = slots_xy_m, [self._reach(np.array(slot), None) for slot in slots_xy_m]
 
     def turn(
-        self, data: mujoco.MjData, *, cube: int, clockwise: bool, slips: bool = False, capture_motion_hz: float = 0.0
-    ) -> Motion[MacroResult]:
+        self, data: mujoco.MjData, *, cube: int, clockwise: bool, slips: bool = False,
+        off: tuple[float, float, float] = (0.0, 0.0, 0.0), capture_motion_hz: float = 0.0,
+    ) -> Motion[MacroResult]:  # fmt: skip
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
-        One that ``slips`` stays: the fingers grip it, open too early, and turn above it. The outcome is a pure function
-        of the loose objects' positions and the arguments, bit for bit.
+        ``off`` has it come down so far off both: metres in x and y, and radians. One that ``slips`` stays: the fingers
+        grip it, open too early, and turn above it. The outcome is a pure function of the loose objects' positions and
+        the arguments, bit for bit.
 
         Raises:
             InvalidValueError: No such cube.
@@ -73,22 +75,28 @@ class TurnExecutor:
             self._sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
             for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
-        true, slot = poses[cube], self._slots[cube]
+        true, slot, (right_m, up_m, turned_rad) = poses[cube], self._slots[cube], off
         pose = self._sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
+        place_m = np.add(self._slots_xy_m[cube], (right_m, up_m))
         try:
             grip = self._reach(pose.position_m[:2], slot)
+            if any(off):
+                slot = self._reach(place_m, slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
         others = [each for each in poses if each is not true]
-        along_x_m, along_y_m = (
-            min((_room_m(each, pose, axis) for each in others), default=REST_OPENING_M) for axis in (0, 1)
-        )
+        along_x_m, along_y_m = _rooms_m(others, pose)
         skewed = abs(_skew_rad(pose)) > _MAX_SKEW_RAD
         begins_along_x = skewed or along_x_m > along_y_m or (clockwise and along_x_m == along_y_m)
         opening_m = max(along_x_m if begins_along_x else along_y_m, _LEAST_OPENING_M)
-        waypoints = _waypoints(grip, slot, _skew_rad(pose), clockwise, begins_along_x != clockwise, slips, opening_m)
+        leaves_m = REST_OPENING_M
+        if any(off):
+            there = replace(pose, position_m=np.array([*place_m, CUBE_REST_Z_M]), yaw_rad=turned_rad)
+            leaves_m = max(_rooms_m(others, there)[int(begins_along_x)], _LEAST_OPENING_M)
+        skews_rad, openings_m = (_skew_rad(pose), turned_rad), (opening_m, leaves_m)
+        waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
         result, qpos, trajectory = yield from self.executor.perform(
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
@@ -113,6 +121,14 @@ def _skew_rad(pose: ObjectPose) -> float:
     return pose.yaw_rad - round(pose.yaw_rad / _QUARTER_RAD) * _QUARTER_RAD
 
 
+def _rooms_m(others: Sequence[ObjectPose], gripped: ObjectPose) -> tuple[float, float]:
+    """How far fingers along x, and along y, of the gripped cube can open for all the other ones."""
+    along_x_m, along_y_m = (
+        min((_room_m(each, gripped, axis) for each in others), default=REST_OPENING_M) for axis in (0, 1)
+    )
+    return along_x_m, along_y_m
+
+
 def _room_m(other: ObjectPose, gripped: ObjectPose, axis: int) -> float:
     """How far fingers along x (axis 0) or y (1) of the gripped cube can open for another one, if that is that way."""
     offset_m = np.abs(other.position_m[:2] - gripped.position_m[:2])
@@ -124,11 +140,13 @@ def _room_m(other: ObjectPose, gripped: ObjectPose, axis: int) -> float:
 
 
 def _waypoints(
-    grip: Reach, slot: Reach, skew_rad: float, clockwise: bool, other_faces: bool, slips: bool, opening_m: float
-) -> list[Waypoint]:
-    """Down over the cube as it stands, turned to the nominal slot's right angle, and back; or let go too early.
+    grip: Reach, slot: Reach, skews_rad: tuple[float, float], clockwise: bool, other_faces: bool, slips: bool,
+    openings_m: tuple[float, float],
+) -> list[Waypoint]:  # fmt: skip
+    """Down over the cube as it stands, turned to where it shall stand, and back; or let go too early.
 
-    Fingers open as far as ``opening_m`` beside the cube where it stands, and at the nominal slot as at rest.
+    ``skews_rad`` are how far the cube is turned off a right angle, and shall be; ``openings_m`` how far fingers open
+    beside it where it stands, and shall stand.
 
     The wrist's axis points down: a larger last joint is a smaller yaw, that is clockwise from above. A clockwise turn
     begins with the fingers along x, clear of the row, and ends along y; a counter-clockwise one goes the other way,
@@ -136,9 +154,9 @@ def _waypoints(
     """
     sense = 1.0 if clockwise else -1.0
     extra_rad = -_QUARTER_RAD if other_faces else 0.0
-    before, after = np.zeros(7), np.zeros(7)
-    before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skew_rad
-    after[-1] = extra_rad + sense * _QUARTER_RAD / 2
+    (opening_m, leaves_m), before, after = openings_m, np.zeros(7), np.zeros(7)
+    before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skews_rad[0]
+    after[-1] = extra_rad + sense * _QUARTER_RAD / 2 - skews_rad[1]
     if slips:
         turn = [
             Waypoint(name="open", qpos_rad=grip.at_qpos_rad + before, opening_m=opening_m, min_duration_s=_OPEN_S),
@@ -148,8 +166,8 @@ def _waypoints(
     else:
         turn = [
             Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=_SQUEEZED_M),
-            Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=REST_OPENING_M, min_duration_s=_OPEN_S),
-            Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+            Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=leaves_m, min_duration_s=_OPEN_S),
+            Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=leaves_m, blend_s=BLEND_S),
         ]
     return [
         Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=opening_m, blend_s=BLEND_S),

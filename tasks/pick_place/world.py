@@ -65,7 +65,7 @@ class PickWorld(World):
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object on its place, into the gripper or into the palm."""
-        level, spec, (across, along, turn) = self._level, OBJECTS[index], offset
+        spec, (right_m, up_m, turned_rad) = OBJECTS[index], self._off(offset)
         if value == PLACED:
             base_m, share_x, share_y = standing_m(index), 1.0, 1.0
         elif value == PICKED:
@@ -74,10 +74,10 @@ class PickWorld(World):
         else:
             base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
         self.data.qpos[self.object_qpos[index]] = (
-            base_m[0] + share_x * level.object_offset_m * across,
-            base_m[1] + share_y * level.object_offset_m * along,
+            base_m[0] + share_x * right_m,
+            base_m[1] + share_y * up_m,
             base_m[2],
-            *orientation.about_vertical(level.object_yaw_rad * turn * share_x),
+            *orientation.about_vertical(turned_rad * share_x),
         )
 
     def _fingers(self, opening_m: float, command_m: float) -> None:
@@ -99,11 +99,11 @@ class PickWorld(World):
     # --- acting --------------------------------------------------------------------------------------------------
 
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
-        """Kinematic execution: what moved is exactly where a good macro-action leaves it."""
+        """Kinematic execution: what moved is where a good macro-action leaves it."""
         del action
         for index, (now, then) in enumerate(zip(self._objects()[0], intended, strict=False)):
             if now != then:
-                self._put(index, then)
+                self._put(index, then, self._aims[index])
                 if now == PICKED:
                     self._fingers(REST_OPENING_M, REST_OPENING_M)
         self._gesture(intended[N_OBJECTS])
@@ -138,7 +138,8 @@ class PickWorld(World):
                 return executor.hand_over(self.data, index=held, palm_m=palm_m, capture_motion_hz=capture_motion_hz)
             place_m = np.array([*PALM_M[:2], PALM_M[2] + _VAIN_M])
         elif HANDED_OVER not in objects and held == action and not stays:
-            return executor.place(self.data, index=action, capture_motion_hz=capture_motion_hz)
+            off = self._off(self._aims[action])
+            return executor.place(self.data, index=action, off=off, capture_motion_hz=capture_motion_hz)
         elif HANDED_OVER not in objects and held is None and not stays:
             return executor.pick(self.data, index=action, capture_motion_hz=capture_motion_hz)
         else:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -217,33 +216,3 @@ def test_too_many_beliefs_leave_a_bound_and_say_so(monkeypatch):
     monkeypatch.setattr("imagine_bench.certificates.beliefs.MOST", 5)
     found = certificate(spec_of(Wheels(n=2, fickle=0.3), 3, Glimpse(finger="first")))
     assert found.beliefs is None and found.optimum == found.seen_optimum
-
-
-class _Touched:
-    """Rules of two cubes, whose macrostates and frames also tell, where ``told``, which cubes were turned before."""
-
-    lag = 0
-
-    def __init__(self, task: str, *, told: bool) -> None:
-        spec = registry.task(task)
-        assert spec.sight is not None
-        self.rules, self.sight, self.told, self.n_actions = spec.rules, spec.sight, told, spec.rules.n_actions
-        self.start_states = tuple((*state, 0, 0) for state in spec.rules.start_states)
-
-    def outcomes(self, state: tuple[int, ...], action: int) -> list[Outcome]:
-        turned = [value or (self.told and cube == action // 2) for cube, value in enumerate(state[3:])]
-        found = self.rules.outcomes(state[:3], action)
-        return [replace(o, macrostate=(*o.macrostate, *map(int, turned))) for o in found]
-
-    def seen(self, state: tuple[int, ...], step: int) -> list[tuple[float, tuple[int, ...]]]:
-        return [(share, (*shown, *state[3:])) for share, shown in self.sight.seen(state[:3], step)]
-
-
-def test_frames_that_tell_which_cubes_were_turned_would_replace_some_memory() -> None:
-    """What the page on memory says of frames in which a turned cube stands straighter than one that was reset."""
-    values = []
-    for told in (False, True):
-        world = _Touched("arrows:cubes=2,horizon=3,gesture=0.5", told=told)
-        values.append(best_without_memory(world, world, 3, bound=1.0).value)
-    assert values == pytest.approx([15 / 18, 16 / 18])
-    assert "88.9" in (Path(__file__).parents[2] / "docs" / "explanation" / "memory.md").read_text()
