@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -20,6 +21,7 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.bench.bench import bench, plan
+from imagine_bench.certificates.certificate import certificate
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.judge.models.asking import one_step
 from imagine_bench.judge.models.ends import Gallery
@@ -118,6 +120,36 @@ def test_what_the_page_says_of_elsewhere_was_kept() -> None:
         for name, mean, blind in found
     ]
     assert len(said) == 4
+
+
+@pytest.mark.parametrize("example", ["floors"], indirect=True)
+def test_what_an_agent_needs_over_the_floor(
+    example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing, for who knows the way; blind choice is never good enough; and what failed in between does not count."""
+    asked = list(example.worlds(2))
+    assert asked == [("arrow_puzzle_easy", "clean"), ("arrows:cubes=2", "clean")] and len(list(example.worlds(3))) == 27
+    monkeypatch.setattr(example, "BUDGETS", (4, 8))
+    monkeypatch.setattr(example, "worlds", lambda cubes: asked[:cubes])
+    monkeypatch.setattr(example, "launcher", lambda name, workers: Inline())
+    floor = certificate(registry.task("arrow_puzzle_easy")).floor
+    assert floor
+    for agent, needed, ratio in (("oracle", [0, 0], 0.0), ("random", [None, None], np.inf)):
+        words = f"--agent {agent} --cubes 1 --seeds 1000 1001 --tests 20 --runs {tmp_path} --out {tmp_path}/floors.json"
+        example.main(words.split())
+        (row,) = json.loads((tmp_path / "floors.json").read_text())
+        assert (row["transitions"], row["floor"]) == (needed, floor.transitions)
+        assert f"{ratio:8.2f} arrow_puzzle_easy clean" in capsys.readouterr().out
+    found = run(tmp_path, "pick_place", "random", budgets=(2, 3, 5, 8))
+    for successes, first in (([9, 0, 9, 9], 2), ([9, 9, 9, 0], None), ([9, 9, 9, 10], 0), ([8, 9, 10, 10], 1)):
+        (learner,) = found.of("random")
+        rows = tuple(
+            replace(row, successes=n, test_episodes=10, env_steps=10 * index)
+            for index, (row, n) in enumerate(zip(learner.checkpoints, successes, strict=True))
+        )
+        expected = np.inf if first is None else 10 * first
+        assert example.transitions(replace(learner, checkpoints=rows), optimum=0.9) == expected
+    assert example.over_floor({"transitions": [None, 30, 50], "floor": 25.0}) == 2.0
 
 
 def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
