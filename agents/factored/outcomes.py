@@ -178,6 +178,7 @@ class OutcomeModel:
         self._strides = strides(tuple(range(len(sizes))), sizes)
         self._strides_of_choice = strides(tuple(range(len(sizes) + 1)), (*sizes, n_actions))
         self.outcomes: list[Outcome] = []
+        self._earlier: dict[Outcome, Floats] = {}
         self._priors: dict[Outcome, Floats] = {}
         self._counts: dict[tuple[Code, int, Code, int], int] = {}
         self.causes: Causes | None = None
@@ -200,6 +201,7 @@ class OutcomeModel:
         active = self.conjunctions.active(codes, actions, following)
         count, group = np.array(list(self._counts.values()), dtype=np.float64), self.conjunctions.group
         evidence = _Evidence(active, outcome, count, group, len(self.conjunctions.prior), len(self.outcomes))
+        self._priors = {each: self._kept(each, earlier, evidence) for each, earlier in self._earlier.items()}
         explanations = [self._explain(evidence, default) for default in range(len(self.outcomes))]
         self.causes = causes = self._causes(evidence, max(explanations, key=lambda each: each.log_posterior))
         pseudo_tests = self.settings.pseudo_tests
@@ -217,8 +219,22 @@ class OutcomeModel:
             weight = self.settings.transfer_weight
             order = [causes.default, *(index for index in range(len(causes.outcomes)) if index != causes.default)]
             self.outcomes = [causes.outcomes[index] for index in order] if weight else []
-            self._priors = {causes.outcomes[index]: weight * causes.strength[index] for index in order}
+            self._earlier = {causes.outcomes[index]: causes.strength[index] for index in order} if weight else {}
         self._counts, self.causes = {}, None
+
+    def _kept(self, outcome: Outcome, earlier: Floats, evidence: _Evidence) -> Floats:
+        """Priors of an earlier task's causes (J,), believed as far as those that were tested bring it about here, too.
+
+        A test fails where the earlier task's default came instead, which is the first outcome.
+        """
+        causes = earlier[evidence.all.met] > 0.5
+        holds, fails = (
+            evidence.tests((evidence.outcome == each).astype(np.float64))[causes] > 0.0
+            for each in (self.outcomes.index(outcome), 0)
+        )
+        good, tested = holds.sum(), (holds | fails).sum()
+        pseudo = self.settings.pseudo_causes
+        return earlier * (pseudo * self.settings.transfer_weight + good) / (pseudo + tested)
 
     def _prior(self, outcome: int, groups: Floats, each: NDArray[np.int64], which: NDArray[np.int64] | slice) -> Floats:
         """Prior probability of ``which`` conjunctions to cause ``outcome``: their groups', or an earlier task's.

@@ -36,6 +36,7 @@ class OutcomeSettings:
     sweeps: int = setting(25, COUNT)  #: steps of expectation maximisation
     #: Prior probability that a cause of an earlier task is one of the next; 0 forgets it.
     transfer_weight: float = setting(0.5, PROBABILITY)
+    pseudo_causes: float = setting(2.0, POSITIVE)  #: how many tested causes of an earlier task that is worth
 
 
 @dataclass(frozen=True, kw_only=True)

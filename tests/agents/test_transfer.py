@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 
 import fake_codes
 import numpy as np
@@ -15,6 +16,9 @@ from fake_latents import live as live_on_latents
 from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.dynamics import Dynamics
 from imagine_bench.agents.factored.exploration import last_step, likeliest
+from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.outcomes import OutcomeModel
+from imagine_bench.agents.factored.settings import OutcomeSettings
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only as imagination_only
 
@@ -88,6 +92,35 @@ def test_earlier_causes_are_priors_that_one_test_refutes(carried: float) -> None
 
 def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
     learner.observe(fake_codes.transition(code, action), episode=0)
+
+
+def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> None:
+    """Two walls of three still hurt, so the third is believed to; goals that failed speak against the third."""
+    learner = OutcomeModel((4, 4), 1, OutcomeSettings())
+    rewards = {**{(x, 3): -5.0 for x in range(3)}, **{(3, x): 5.0 for x in range(3)}}
+
+    def add(code: tuple[int, int], reward: float) -> None:
+        learner.add(CodeTransition((3, 3), 0, code, reward, reward != -1.0))
+
+    def expected() -> list[float]:
+        learner.fit()
+        codes = np.array([(2, 3), (3, 2)])
+        probability, _ = learner.predict(np.array([(3, 3)] * 2), np.zeros(2, dtype=np.int64), codes)
+        return [float(row @ (learner.rewards == good)) for row, good in zip(probability, (-5.0, 5.0), strict=True)]
+
+    for _ in range(5):
+        for code in itertools.product(range(4), repeat=2):
+            add(code, rewards.get(code, -1.0))
+    assert min(expected()) > 0.9
+    learner.reset_for_new_task()
+    add((3, 3), -1.0)
+    told = expected()
+    for code in ((0, 3), (1, 3)):
+        add(code, -5.0)
+    for code in ((3, 0), (3, 1)):
+        add(code, -1.0)
+    wall, goal = expected()
+    assert wall > 0.65 > told[0] + 0.1 and goal < 0.35 < told[1] - 0.1
 
 
 def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
