@@ -35,7 +35,7 @@ class OutcomeSettings:
     masked_weight: float = setting(0.1, PROBABILITY)  #: weight of a test in which some other cause decided
     sweeps: int = setting(25, COUNT)  #: steps of expectation maximisation
     #: Prior probability that a cause of an earlier task is one of the next; 0 forgets it.
-    transfer_weight: float = setting(0.5, PROBABILITY)
+    transfer_weight: float = setting(0.8, PROBABILITY)
     pseudo_causes: float = setting(2.0, POSITIVE)  #: how many tested causes of an earlier task that is worth
 
 

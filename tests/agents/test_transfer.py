@@ -96,7 +96,7 @@ def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
 
 def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> None:
     """Two walls of three still hurt, so the third is believed to; goals that failed speak against the third."""
-    learner = OutcomeModel((4, 4), 1, OutcomeSettings())
+    learner = OutcomeModel((4, 4), 1, OutcomeSettings(transfer_weight=0.5))
     rewards = {**{(x, 3): -5.0 for x in range(3)}, **{(3, x): 5.0 for x in range(3)}}
 
     def add(code: tuple[int, int], reward: float) -> None:
