@@ -93,7 +93,7 @@ class TurnExecutor:
         opening_m = max(along_x_m if begins_along_x else along_y_m, _LEAST_OPENING_M)
         leaves_m = REST_OPENING_M
         if any(off):
-            there = replace(pose, position_m=np.array([*place_m, CUBE_REST_Z_M]), yaw_rad=turned_rad)
+            there = replace(pose, position_m=np.array([*place_m, CUBE_REST_Z_M]))
             beyond_m = _FINGER_HALF_WIDTH_M * abs(math.sin(turned_rad))  # a finger that is turned reaches further
             leaves_m = max(_rooms_m(others, there)[int(begins_along_x)] - beyond_m, _LEAST_OPENING_M)
         skews_rad, openings_m = (_skew_rad(pose), turned_rad), (opening_m, leaves_m)
