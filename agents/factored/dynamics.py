@@ -3,7 +3,9 @@
 Each factor's next value depends on a few factors only (factored MDPs: Boutilier, Dearden & Goldszmidt 2000; Kearns &
 Koller 1999). Which ones is learned, a factor and an action, by Bayesian averaging over sets of parents that hold the
 factor itself, with Dirichlet tables whose evidence is closed (Cooper & Herskovits 1992; Heckerman et al. 1995), and
-over the hypothesis that the action leaves the factor alone. Stochastic results are tables with several entries.
+over the hypothesis that the action leaves the factor alone. Stochastic results are tables with several entries. Each
+table comes twice: its rows are learned apart, or they are *alike*, and an action that changes the factor fails to do so
+as often in every row: a slip, which all transitions teach (a Dirichlet tree whose first branch is shared; Minka 1999).
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ _LARGEST_TABLE = 1 << 16
 """Parent sets whose table would have more rows are not considered."""
 _NEGLIGIBLE = 1e-12
 """Structures of no more posterior probability are left out of predictions."""
+_GROWTH = 1.1
+"""How often actions fail is pooled anew once so many times the transitions of the last time were seen."""
 _AT_ONCE = 64
 """Codes whose counts are read at once, so that tables of many values need little memory."""
 EVERY = slice(None)
@@ -38,11 +42,25 @@ class FactorPrediction:
     unknown: Floats  #: weight of the prior in ``expected``. Shape (N, A).
 
 
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    """What was counted for n codes of T tables that matter."""
+
+    codes: slice
+    own: tuple[NDArray[np.int64], slice, NDArray[np.int64]]  #: where an array (n, A, K) has the value that they have
+    apart: Floats  #: weight of each table. Shape (T, A).
+    alike: Floats  #: the same if its rows are alike
+    counts: Floats  #: of next values. Shape (n, T, A, K).
+    total: Floats  #: sums of them. Shape (n, T, A).
+    moved: Floats  #: the same without the value that a code has
+
+
 class FactorDynamics:
     """How one factor changes; ``sizes`` are the numbers of values of every factor."""
 
     def __init__(self, factor: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
         self.factor, self.values, self.settings = factor, sizes[factor], settings
+        self._others = max(1, self.values - 1)
         others = [other for other in range(len(sizes)) if other != factor]
         sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
         sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
@@ -60,44 +78,70 @@ class FactorDynamics:
             [settings.parent_decay ** (len(parents) - 1) / n for parents, n in zip(sets, same_size, strict=True)]
         )
         prior *= (1.0 - settings.persistence) / prior.sum()
-        self.evidence = np.tile(np.log([settings.persistence, *prior]), (n_actions, 1))
-        """Log prior plus log evidence that the action leaves the factor alone, then of each table. Shape (A, 1 + T)."""
-        self._tried = np.zeros(n_actions)
+        both = np.concatenate([(1.0 - settings.alike) * prior, settings.alike * prior])
+        self.evidence = np.tile(np.log([settings.persistence, *both]), (n_actions, 1))
+        """Log prior plus log evidence that the action leaves the factor alone, then of each table, then of each whose
+        rows are alike. Shape (A, 1 + 2T)."""
+        self.tried, self.stayed = np.zeros(n_actions), np.zeros(n_actions)
+        """How often each action was tried, and left the factor at its value. Shape (A,)."""
+        self.fails = settings.fails
+        """How often any action that changes the factor is expected to leave it at its value."""
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
-        slip, concentration = self.settings.slip, self.settings.concentration
-        stayed = value == code[self.factor]
-        self._tried[action] = 1.0
-        self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / max(1, self.values - 1))
-        rows = self._rows(code[None])[0]
+        slip, concentration, own = self.settings.slip, self.settings.concentration, code[self.factor]
+        stayed = value == own
+        rows, tables = self._rows(code[None])[0], 1 + len(self.parents)
         counts, total = self.counts[rows, action, value], self._total[rows, action]
-        self.evidence[action, 1:] += np.log((counts + concentration) / (total + concentration * self.values))
+        fails, moved = self._fails()[action], total - self.counts[rows, action, own]
+        goes = (
+            (1.0 - fails)
+            * (counts + concentration * self.values / self._others)
+            / (moved + concentration * self.values)
+        )
+        self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / self._others)
+        self.evidence[action, 1:tables] += np.log((counts + concentration) / (total + concentration * self.values))
+        self.evidence[action, tables:] += np.log(fails if stayed else goes)
+        self.tried[action] += 1.0
+        self.stayed[action] += stayed
         self.counts[rows, action, value] += 1.0
         self._total[rows, action] += 1.0
 
     def weights(self) -> Floats:
-        """Posterior probability of each structure, an action. Shape (A, 1 + tables)."""
+        """Posterior probability of each structure, an action. Shape (A, 1 + 2 tables)."""
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
         return weight / weight.sum(axis=1, keepdims=True)
 
+    def pool(self) -> Floats:
+        """How often actions that change the factor were tried, and left it at its value: (2,)."""
+        changes = 1.0 - self.weights()[:, 0]
+        return np.array([changes @ self.tried, changes @ self.stayed])
+
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
         """What some actions would lead to in ``codes`` (N, P)."""
-        weight, prior = self._weights(actions), self.settings.concentration
-        expected = self._stays(weight, codes)
-        unknown = np.zeros(expected.shape[:2])
-        for some, own, counts, total in self._counted(weight, codes, actions):
-            share = own / (total + prior * self.values)
-            expected[some] += (share[..., None] * (counts + prior)).sum(axis=1)
-            unknown[some] = (share * prior * self.values).sum(axis=1)
+        weight, prior, fails = self._weights(actions), self.settings.concentration, self._fails()[actions]
+        expected, unknown = self._stays(weight, codes), np.zeros((len(codes), len(weight)))
+        unsure = fails * prior / (self.tried[actions] + prior)
+        for each in self._counted(weight, codes, actions):
+            apart = each.apart / (each.total + prior * self.values)
+            alike = each.alike * (1.0 - fails) / (each.moved + prior * self.values)
+            expected[each.codes] += ((apart + alike)[..., None] * each.counts).sum(axis=1)
+            expected[each.codes] += ((apart + alike * self.values / self._others) * prior).sum(axis=1)[..., None]
+            stayed = each.total - each.moved + prior * self.values / self._others
+            expected[each.codes][each.own] += (each.alike * fails).sum(axis=0) - (alike * stayed).sum(axis=1)
+            unknown[each.codes] = ((apart + alike) * prior * self.values + each.alike * unsure).sum(axis=1)
         return FactorPrediction(expected, unknown)
 
     def seen(self, codes: Codes) -> Floats:
         """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
-        weight = self._weights(EVERY)
-        seen = self._stays(weight, codes) * self._tried[:, None]
-        for some, own, counts, total in self._counted(weight, codes, EVERY):
-            seen[some] += ((own / np.maximum(total, 1.0))[..., None] * counts).sum(axis=1)
+        weight, failed = self._weights(EVERY), self.stayed / np.maximum(self.tried, 1.0)
+        seen = self._stays(weight, codes) * (self.tried[:, None] > 0.0)
+        for each in self._counted(weight, codes, EVERY):
+            apart = each.apart / np.maximum(each.total, 1.0)
+            alike = each.alike * (1.0 - failed) / np.maximum(each.moved, 1.0)
+            seen[each.codes] += ((apart + alike)[..., None] * each.counts).sum(axis=1)
+            stays = (each.alike * failed).sum(axis=0) - (alike * (each.total - each.moved)).sum(axis=1)
+            seen[each.codes][each.own] += stays
         return seen
 
     def happens(self, codes: Codes, actions: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -124,15 +168,25 @@ class FactorDynamics:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
         return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
 
-    def _counted(self, weight: Floats, codes: Codes, actions: slice) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
-        """A few codes at a time, of T tables that matter: which; weights (T, A), counts (n, T, A, K) and their sums."""
-        matters = np.flatnonzero(weight[:, 1:].any(axis=0))
+    def _fails(self) -> Floats:
+        """How often each action leaves the factor at its value, where rows are alike. Shape (A,)."""
+        pseudo = self.settings.pseudo_fails
+        return np.asarray((self.stayed + pseudo * self.fails) / (self.tried + pseudo))
+
+    def _counted(self, weight: Floats, codes: Codes, actions: slice) -> Iterator[_Counted]:
+        """What was counted for a few codes at a time."""
+        apart, alike = weight[:, 1:].T.reshape(2, len(self.parents), -1)
+        matters = np.flatnonzero((apart + alike).any(axis=1))
         if not len(matters):
             return
-        rows, own = self._rows(codes)[:, matters], weight[:, 1 + matters].T
+        rows = self._rows(codes)[:, matters]
         for first in range(0, len(codes), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            yield some, own, self.counts[rows[some], actions], self._total[rows[some], actions]
+            counts, total = self.counts[rows[some], actions], self._total[rows[some], actions]
+            value = codes[some, self.factor]
+            own = np.arange(len(value)), EVERY, value
+            stayed = counts[np.arange(len(value)), ..., value]
+            yield _Counted(some, own, apart[matters], alike[matters], counts, total, total - stayed)
 
 
 class Dynamics:
@@ -140,11 +194,24 @@ class Dynamics:
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
         self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in range(len(sizes))]
+        self._settings, self._seen, self.pooled_at = settings, 0, 0
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
         """Learn from one transition between codes (P,)."""
         for factor, value in zip(self.factors, following.tolist(), strict=True):
             factor.add(code, action, value)
+        self._seen += 1
+        if self._seen >= _GROWTH * self.pooled_at:
+            self._pool()
+
+    def _pool(self) -> None:
+        """Learn anew how often actions fail, of each factor and of all."""
+        self.pooled_at, pseudo = self._seen, self._settings.pseudo_fails
+        each = [factor.pool() for factor in self.factors]
+        tried, stayed = np.sum(each, axis=0)
+        fails = (stayed + self._settings.fails) / (tried + 1.0)
+        for factor, (own_tried, own_stayed) in zip(self.factors, each, strict=True):
+            factor.fails = float((own_stayed + pseudo * fails) / (own_tried + pseudo))
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> list[FactorPrediction]:
         """What some actions would make of each factor in ``codes`` (N, P)."""

@@ -1,7 +1,7 @@
 """What the model predicts of each code, kept until it learns otherwise: plans from many codes share it.
 
-What an action does is predicted anew where transitions of that action were learned, what it brings whenever anything
-was.
+What an action does is predicted anew where transitions of that action were learned, or how often actions fail; what it
+brings whenever anything was.
 """
 
 from __future__ import annotations
@@ -41,15 +41,18 @@ class Predictions:
         self.continues, self.next = np.zeros(triples), np.zeros(triples, dtype=np.int64)
         self._chance, self._following = np.zeros(triples), np.zeros(triples, dtype=np.int64)
         self._certain = np.zeros(pairs)
+        self._pooled_at = model.dynamics.pooled_at
         self._moved, self._known = np.zeros(pairs, dtype=np.bool_), np.zeros(0, dtype=np.bool_)
 
     def __len__(self) -> int:
         return len(self._index)
 
     def learned(self, actions: Iterable[int]) -> None:
-        """The model learned something, and of the dynamics of these actions."""
+        """The model learned something, and of the dynamics of these actions; or of all, if failures were pooled."""
+        pooled_at = self._model.dynamics.pooled_at
         self._known[:] = False
-        self._moved[:, list(actions)] = False
+        self._moved[:, list(actions) if pooled_at == self._pooled_at else EVERY] = False
+        self._pooled_at = pooled_at
 
     def row(self, code: Code) -> int:
         """Its row, a new one if it is met for the first time."""
