@@ -6,6 +6,7 @@ factor itself, with Dirichlet tables whose evidence is closed (Cooper & Herskovi
 over the hypothesis that the action leaves the factor alone. Stochastic results are tables with several entries. Each
 table comes twice: its rows are learned apart, or they are *alike*, and an action that changes the factor fails to do so
 as often in every row: a slip, which all transitions teach (a Dirichlet tree whose first branch is shared; Minka 1999).
+Or a factor changes by itself, in the same way whatever the action.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ _LARGEST_TABLE = 1 << 16
 _NEGLIGIBLE = 1e-12
 """Structures of no more posterior probability are left out of predictions."""
 _GROWTH = 1.1
-"""How often actions fail is pooled anew once so many times the transitions of the last time were seen."""
+"""What all actions teach together is learned anew once so many times the transitions of the last time were seen."""
 _AT_ONCE = 64
 """Codes whose counts are read at once, so that tables of many values need little memory."""
+_TABLES = 2
+"""Structures before those of tables."""
 EVERY = slice(None)
 """All actions."""
 
@@ -60,7 +63,7 @@ class FactorDynamics:
 
     def __init__(self, factor: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
         self.factor, self.values, self.settings = factor, sizes[factor], settings
-        self._others = max(1, self.values - 1)
+        self._pseudo, self._others = settings.concentration * self.values, max(1, self.values - 1)
         others = [other for other in range(len(sizes)) if other != factor]
         sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
         sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
@@ -79,63 +82,72 @@ class FactorDynamics:
         )
         prior *= (1.0 - settings.persistence) / prior.sum()
         both = np.concatenate([(1.0 - settings.alike) * prior, settings.alike * prior])
-        self.evidence = np.tile(np.log([settings.persistence, *both]), (n_actions, 1))
-        """Log prior plus log evidence that the action leaves the factor alone, then of each table, then of each whose
-        rows are alike. Shape (A, 1 + 2T)."""
+        both *= 1.0 - settings.by_itself
+        by_itself = (1.0 - settings.persistence) * settings.by_itself
+        self.evidence = np.tile(np.log([settings.persistence, by_itself, *both]), (n_actions, 1))
+        """Log prior plus log evidence that the action leaves the factor alone, that it changes by itself, then of each
+        table, then of each whose rows are alike. Shape (A, 2 + 2T)."""
         self.tried, self.stayed = np.zeros(n_actions), np.zeros(n_actions)
         """How often each action was tried, and left the factor at its value. Shape (A,)."""
         self.fails = settings.fails
         """How often any action that changes the factor is expected to leave it at its value."""
+        self._turns = np.zeros((self.values, self.values))
+        self._by_itself = np.zeros((self.values, self.values))
+        """How often each value came after each; the same when that was learned last, so that actions share it."""
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
-        slip, concentration, own = self.settings.slip, self.settings.concentration, code[self.factor]
+        slip, pseudo, others, own = self.settings.slip, self._pseudo, self._others, code[self.factor]
         stayed = value == own
-        rows, tables = self._rows(code[None])[0], 1 + len(self.parents)
+        rows, tables = self._rows(code[None])[0], _TABLES + len(self.parents)
         counts, total = self.counts[rows, action, value], self._total[rows, action]
         fails, moved = self._fails()[action], total - self.counts[rows, action, own]
-        goes = (
-            (1.0 - fails)
-            * (counts + concentration * self.values / self._others)
-            / (moved + concentration * self.values)
-        )
-        self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / self._others)
-        self.evidence[action, 1:tables] += np.log((counts + concentration) / (total + concentration * self.values))
+        goes = (1.0 - fails) * (counts + pseudo / others) / (moved + pseudo)
+        self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / others)
+        self.evidence[action, 1] += np.log(self._changes()[0][own, value])
+        self.evidence[action, _TABLES:tables] += np.log((counts + self.settings.concentration) / (total + pseudo))
         self.evidence[action, tables:] += np.log(fails if stayed else goes)
         self.tried[action] += 1.0
         self.stayed[action] += stayed
+        self._turns[own, value] += 1.0
         self.counts[rows, action, value] += 1.0
         self._total[rows, action] += 1.0
 
     def weights(self) -> Floats:
-        """Posterior probability of each structure, an action. Shape (A, 1 + 2 tables)."""
+        """Posterior probability of each structure, an action. Shape (A, 2 + 2 tables)."""
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
         return weight / weight.sum(axis=1, keepdims=True)
 
     def pool(self) -> Floats:
-        """How often actions that change the factor were tried, and left it at its value: (2,)."""
-        changes = 1.0 - self.weights()[:, 0]
+        """Learn how it changes by itself. How often actions that change it were tried, and left it at its value: (2,)."""
+        self._by_itself = self._turns.copy()
+        changes = np.where(self.stayed < self.tried, 1.0 - self.weights()[:, 0], 0.0)
         return np.array([changes @ self.tried, changes @ self.stayed])
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
         """What some actions would lead to in ``codes`` (N, P)."""
-        weight, prior, fails = self._weights(actions), self.settings.concentration, self._fails()[actions]
-        expected, unknown = self._stays(weight, codes), np.zeros((len(codes), len(weight)))
-        unsure = fails * prior / (self.tried[actions] + prior)
+        weight, pseudo, fails = self._weights(actions), self._pseudo, self._fails()[actions]
+        changes, unsure_of = self._changes()
+        own = codes[:, self.factor]
+        expected = self._stays(weight, codes) + weight[:, 1, None] * changes[own][:, None]
+        unknown = weight[:, 1] * unsure_of[own][:, None]
+        unsure = fails * pseudo / (self.tried[actions] + pseudo)
         for each in self._counted(weight, codes, actions):
-            apart = each.apart / (each.total + prior * self.values)
-            alike = each.alike * (1.0 - fails) / (each.moved + prior * self.values)
+            apart = each.apart / (each.total + pseudo)
+            alike = each.alike * (1.0 - fails) / (each.moved + pseudo)
             expected[each.codes] += ((apart + alike)[..., None] * each.counts).sum(axis=1)
-            expected[each.codes] += ((apart + alike * self.values / self._others) * prior).sum(axis=1)[..., None]
-            stayed = each.total - each.moved + prior * self.values / self._others
-            expected[each.codes][each.own] += (each.alike * fails).sum(axis=0) - (alike * stayed).sum(axis=1)
-            unknown[each.codes] = ((apart + alike) * prior * self.values + each.alike * unsure).sum(axis=1)
+            expected[each.codes] += pseudo * (apart / self.values + alike / self._others).sum(axis=1)[..., None]
+            goes = (alike * (each.total - each.moved + pseudo / self._others)).sum(axis=1)
+            expected[each.codes][each.own] += (each.alike * fails).sum(axis=0) - goes  # which stays, if rows are alike
+            unknown[each.codes] += ((apart + alike) * pseudo + each.alike * unsure).sum(axis=1)
         return FactorPrediction(expected, unknown)
 
     def seen(self, codes: Codes) -> Floats:
         """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
         weight, failed = self._weights(EVERY), self.stayed / np.maximum(self.tried, 1.0)
-        seen = self._stays(weight, codes) * (self.tried[:, None] > 0.0)
+        turns = self._by_itself[codes[:, self.factor]]
+        turns /= np.maximum(turns.sum(axis=1, keepdims=True), 1.0)
+        seen = self._stays(weight, codes) * (self.tried[:, None] > 0.0) + weight[:, 1, None] * turns[:, None]
         for each in self._counted(weight, codes, EVERY):
             apart = each.apart / np.maximum(each.total, 1.0)
             alike = each.alike * (1.0 - failed) / np.maximum(each.moved, 1.0)
@@ -168,6 +180,11 @@ class FactorDynamics:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
         return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
 
+    def _changes(self) -> tuple[Floats, Floats]:
+        """How it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""
+        total = self._by_itself.sum(axis=1, keepdims=True) + self._pseudo
+        return (self._by_itself + self.settings.concentration) / total, self._pseudo / total[:, 0]
+
     def _fails(self) -> Floats:
         """How often each action leaves the factor at its value, where rows are alike. Shape (A,)."""
         pseudo = self.settings.pseudo_fails
@@ -175,7 +192,7 @@ class FactorDynamics:
 
     def _counted(self, weight: Floats, codes: Codes, actions: slice) -> Iterator[_Counted]:
         """What was counted for a few codes at a time."""
-        apart, alike = weight[:, 1:].T.reshape(2, len(self.parents), -1)
+        apart, alike = weight[:, _TABLES:].T.reshape(2, len(self.parents), -1)
         matters = np.flatnonzero((apart + alike).any(axis=1))
         if not len(matters):
             return
@@ -205,7 +222,7 @@ class Dynamics:
             self._pool()
 
     def _pool(self) -> None:
-        """Learn anew how often actions fail, of each factor and of all."""
+        """Learn anew how factors change by themselves, and how often actions fail, of each factor and of all."""
         self.pooled_at, pseudo = self._seen, self._settings.pseudo_fails
         each = [factor.pool() for factor in self.factors]
         tried, stayed = np.sum(each, axis=0)

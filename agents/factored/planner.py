@@ -105,14 +105,13 @@ class Planner:
             predictions.unknown[inside],
             predictions.continues[inside],
         )
-        last = 1.0 - (1.0 - settings.end_discount) * predictions.ends[inside]
         following = place[predictions.next[inside]]
         state, action = np.zeros(len(rows)), reward
         state[self.expanded :] = beyond
         for _ in range(depth):
             ahead = (continues * state[following]).sum(axis=2)
             if objective == "novelty":
-                action = np.maximum(unknown * last, settings.novelty_discount * ahead)
+                action = np.maximum(unknown, settings.novelty_discount * ahead)
             else:
                 action = reward + settings.discount * ahead
             if objective == "optimistic":

@@ -19,9 +19,10 @@ class DynamicsSettings:
     #: Pseudo-count of each value in a Dirichlet prior (Heckerman et al. 1995).
     concentration: float = setting(0.03, POSITIVE)
     slip: float = setting(0.005, INSIDE)  #: probability with which a factor that is left alone is misread
+    by_itself: float = setting(0.02, INSIDE)  #: prior probability that a factor which changes does so by itself
     alike: float = setting(0.5, INSIDE)  #: prior probability that an action fails as often wherever it changes a factor
     fails: float = setting(0.05, INSIDE)  #: how often that is, beforehand
-    pseudo_fails: float = setting(30.0, POSITIVE)  #: how many tries of an action how often the others fail is worth
+    pseudo_fails: float = setting(100.0, POSITIVE)  #: how many tries of an action how often the others fail is worth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +56,6 @@ class PlanningSettings:
     #: ``"random"`` acts greedily but for random actions (the last two are ablations).
     exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))
     novelty_discount: float = setting(0.95, PROBABILITY)  #: of what is unknown, a macro-action
-    #: Of what is unknown where the episode surely ends, so that nothing else can be found in it.
-    end_discount: float = setting(1.0, PROBABILITY)
     #: Novelty within reach below which the agent acts greedily.
     exploration_threshold: float = setting(0.01, PROBABILITY)
     epsilon: float = setting(0.1, PROBABILITY)  #: probability of a random action where exploration is random

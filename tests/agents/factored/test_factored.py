@@ -31,7 +31,7 @@ def test_parents_are_found_and_factors_left_alone_stay() -> None:
         following = np.array([(code[0] + code[2]) % 3, code[1], code[2]])  # the lamp decides whether the wheel turns
         dynamics.add(code, 0, following)
     turning, still, _ = dynamics.factors
-    best = turning.weights()[0].argmax() - 1
+    best = turning.weights()[0].argmax() - 2
     assert turning.parents[best] == (0, 2)
     assert still.weights()[0, 0] > 0.95
     predictions = dynamics.predict(np.array([[2, 1, 1]]))
@@ -124,6 +124,7 @@ class _Chain:
 
     n_actions = 1
     outcomes = SimpleNamespace(rewards=np.array([10.0]))
+    dynamics = SimpleNamespace(pooled_at=0)
 
     def __init__(self, length: int, branches: int) -> None:
         self.length, self.branches, self.sizes = length, branches, (length,)
@@ -414,7 +415,7 @@ def test_each_further_parent_is_less_probable_beforehand(decay: float) -> None:
     weight = factor.weights()
     assert weight[:, 0] == pytest.approx([0.4, 0.4])
     by_size = [
-        sum(weight[0, 1 + index] for index, parents in enumerate(factor.parents) if len(parents) == size)
+        sum(weight[0, 2 + index] for index, parents in enumerate(factor.parents) if len(parents) == size)
         for size in (1, 2, 3)
     ]
     assert by_size[1] / by_size[0] == pytest.approx(decay)

@@ -21,7 +21,10 @@ from imagine_bench.agents.factored.settings import (
 from imagine_bench.interfaces import Floats
 
 SIZES, ACTIONS = (2, 3), 2
-DYNAMICS = DynamicsSettings(parents=2, persistence=0.4, parent_decay=0.25, concentration=0.5, slip=0.02)
+DYNAMICS = DynamicsSettings(
+    parents=2, persistence=0.4, parent_decay=0.25, concentration=0.5, slip=0.02, by_itself=0.2, alike=0.3,
+    fails=0.2, pseudo_fails=4.0,
+)
 SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1))
 CODES = list(itertools.product(*map(range, SIZES)))
 
@@ -46,32 +49,80 @@ def model() -> FactoredModel:
     return learned
 
 
-def predicted(factor: int, code: Code, action: int) -> tuple[FactorPrediction, Floats]:
-    """What is predicted, and what was seen.
+PARENTS = {0: ((0,), (0, 1)), 1: ((1,), (0, 1))}
 
-    Averages over what a factor may depend on, each weighted by its prior and by how well it told what came next.
+
+def structures(
+    factor: int, code: Code, rows: list[CodeTransition], pooled: list[CodeTransition], fails: float
+) -> list[tuple[Floats, Floats, float]]:
+    """What each would expect of an action after ``rows`` of it, and others that were pooled.
+
+    It stays; changes by itself; tables; tables whose rows are alike. Each is what is expected, what was seen, and the
+    weight of the prior.
     """
-    values, own = SIZES[factor], code[factor]
-    pseudo = DYNAMICS.concentration
-    rows = [row for row in lived() if row.action == action]
-    prior = np.array([0.4, 0.6 / 1.25, 0.6 * 0.25 / 1.25])  # it stays; depends on itself; on both
-    told = [np.prod([0.98 if r.following[factor] == r.code[factor] else 0.02 / (values - 1) for r in rows])]
-    expected, seen, unknown = [np.eye(values)[own]], [np.eye(values)[own] * bool(rows)], [0.0]
-    for parents in ((factor,), (0, 1)):
-        counts: Counter[tuple[Code, int]] = Counter()
-        chance = 1.0
+    values, own, pseudo = SIZES[factor], code[factor], DYNAMICS.concentration * SIZES[factor]
+    stays, others = np.eye(values)[own], 1.0 - np.eye(values)[own]
+    expected = stays * 0.98 + others * 0.02 / (values - 1)
+    found, alike = [(expected, stays * bool(rows), 0.0)], []
+    turns = np.zeros(values)
+    for row in pooled:
+        turns[row.following[factor]] += row.code[factor] == own
+    total = turns.sum() + pseudo
+    found.append(((turns + 0.5) / total, turns / max(turns.sum(), 1), pseudo / total))
+    stayed = sum(row.following[factor] == row.code[factor] for row in rows)
+    rate, frequency = (stayed + 4.0 * fails) / (len(rows) + 4.0), stayed / max(len(rows), 1)
+    for parents in PARENTS[factor]:
+        here = np.zeros(values)
         for row in rows:
-            key = tuple(row.code[parent] for parent in parents)
-            total = sum(counts[key, value] for value in range(values))
-            chance *= (counts[key, row.following[factor]] + pseudo) / (total + pseudo * values)
-            counts[key, row.following[factor]] += 1
-        here = np.array([counts[tuple(code[parent] for parent in parents), value] for value in range(values)])
-        told.append(chance)
-        expected.append((here + pseudo) / (here.sum() + pseudo * values))
-        seen.append(here / max(here.sum(), 1))
-        unknown.append(pseudo * values / (here.sum() + pseudo * values))
-    weight = prior * told / (prior * told).sum()
-    return FactorPrediction(weight @ np.array(expected), weight @ np.array(unknown)), weight @ np.array(seen)
+            if all(row.code[parent] == code[parent] for parent in parents):
+                here[row.following[factor]] += 1
+        total, moves = here.sum(), here * others
+        found.append(((here + 0.5) / (total + pseudo), here / max(total, 1), pseudo / (total + pseudo)))
+        goes = others * (moves + pseudo / (values - 1)) / (moves.sum() + pseudo)
+        unknown = (1 - rate) * pseudo / (moves.sum() + pseudo) + rate * pseudo / (len(rows) + pseudo)
+        went = (1 - frequency) * moves / max(moves.sum(), 1)
+        alike.append((rate * stays + (1 - rate) * goes, frequency * stays + went, unknown))
+    return found + alike
+
+
+def learned_by_hand() -> tuple[Floats, list[float], int]:
+    """How probable each structure of each factor and action is, (2, A, 6), and how often any action fails to change it.
+
+    Priors, and how well each told what came next; what actions teach together is pooled whenever a tenth more was seen.
+    """
+    by_size = np.array([1 / 1.25, 0.25 / 1.25])
+    prior = np.array([0.4, 0.6 * 0.2, *0.6 * 0.8 * 0.7 * by_size, *0.6 * 0.8 * 0.3 * by_size])
+    weight, fails, pooled_at = np.tile(prior, (2, ACTIONS, 1)), [0.2, 0.2], 0
+    for seen, row in enumerate(lived(), start=1):
+        before = [each for each in lived()[: seen - 1] if each.action == row.action]
+        for factor in range(2):
+            every = structures(factor, row.code, before, lived()[:pooled_at], fails[factor])
+            for index, (expected, *_) in enumerate(every):
+                weight[factor, row.action, index] *= expected[row.following[factor]]
+        if seen >= 1.1 * pooled_at:
+            pooled_at = seen
+            tried, stayed = np.zeros(2), np.zeros(2)
+            for factor, each in itertools.product(range(2), lived()[:seen]):
+                same = [row for row in lived()[:seen] if row.action == each.action]
+                if all(row.following[factor] == row.code[factor] for row in same):
+                    continue  # nothing says that this action ever changes it
+                changes = 1.0 - weight[factor, each.action, 0] / weight[factor, each.action].sum()
+                tried[factor] += changes
+                stayed[factor] += changes * (each.following[factor] == each.code[factor])
+            of_all = (stayed.sum() + 0.2) / (tried.sum() + 1.0)
+            fails = [(stayed[factor] + 4.0 * of_all) / (tried[factor] + 4.0) for factor in range(2)]
+    return weight / weight.sum(axis=2, keepdims=True), fails, pooled_at
+
+
+def predicted(factor: int, code: Code, action: int) -> tuple[FactorPrediction, Floats]:
+    """What is predicted, and what was seen: averages over the structures."""
+    weight, fails, pooled_at = learned_by_hand()
+    rows = [row for row in lived() if row.action == action]
+    every = structures(factor, code, rows, lived()[:pooled_at], fails[factor])
+    expected, seen, unknown = zip(*every, strict=True)
+    stays = np.eye(SIZES[factor])[code[factor]]  # where an action leaves a factor alone, only reading it may fail
+    mean = weight[factor, action]
+    return FactorPrediction(mean @ np.array([stays, *expected[1:]]), mean @ np.array(unknown)), mean @ np.array(seen)
 
 
 @pytest.mark.parametrize("factor", [0, 1])

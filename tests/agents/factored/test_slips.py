@@ -1,0 +1,80 @@
+"""Actions that fail by chance: all that do teach how often, and only where that is so."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from imagine_bench.agents.factored.dynamics import Dynamics
+from imagine_bench.agents.factored.settings import DynamicsSettings
+
+WHEELS, SIZES, ACTIONS = 3, (4, 4, 4), 6
+
+
+def turned(code: tuple[int, ...], action: int) -> tuple[int, ...]:
+    """Each wheel is turned on by one action, and back by another."""
+    wheel, back = divmod(action, 2)
+    following = list(code)
+    following[wheel] = (following[wheel] + (-1 if back else 1)) % 4
+    return tuple(following)
+
+
+def away(settings: DynamicsSettings, slip: float, seed: int, transitions: int) -> tuple[float, float]:
+    """Mean total variation between learned and true chances after so many random transitions; how often any slipped."""
+    dynamics, rng = Dynamics(SIZES, ACTIONS, settings), np.random.default_rng(seed)
+    code, slips = (0, 0, 0), 0
+    for _ in range(transitions):
+        action = int(rng.integers(ACTIONS))
+        following = code if rng.random() < slip else turned(code, action)
+        dynamics.add(np.array(code), action, np.array(following))
+        slips += following == code
+        code = following
+    codes = list(itertools.product(range(4), repeat=WHEELS))
+    parts = [part.expected for part in dynamics.predict(np.array(codes))]
+    found = []
+    for (row, code), action in itertools.product(enumerate(codes), range(ACTIONS)):
+        held = np.einsum("i,j,k->ijk", *(part[row, action] for part in parts))
+        exact = np.zeros(SIZES)
+        exact[turned(code, action)], exact[code] = 1.0 - slip, slip
+        found.append(0.5 * np.abs(held - exact).sum())
+    return float(np.mean(found)), slips / transitions
+
+
+@pytest.mark.parametrize(("slip", "transitions"), [(0.1, 120), (0.2, 200)])
+def test_how_often_actions_slip_is_learned_from_all_of_them(slip: float, transitions: int) -> None:
+    apart = dataclasses.replace(DynamicsSettings(), alike=1e-9)
+    pooled, alone = ([away(each, slip, seed, transitions) for seed in range(5)] for each in (DynamicsSettings(), apart))
+    assert all(tv < abs(slipped - slip) + 0.04 for tv, slipped in pooled), "little more than the luck of the draw"
+    assert np.mean([tv for tv, _ in pooled]) < 0.05
+    assert np.mean([tv for tv, _ in alone]) > 0.09, "rows that are learned apart need more"
+
+
+def test_where_nothing_slips_nothing_is_expected_to() -> None:
+    assert max(away(DynamicsSettings(), 0.0, seed, 200)[0] for seed in range(3)) < 0.02
+
+
+def test_an_action_that_fails_at_a_wall_alone_is_not_thought_to_slip() -> None:
+    """Steps to the right in a corridor of five places, whose last is its end."""
+    dynamics, rng = Dynamics((5, 2), 1, DynamicsSettings()), np.random.default_rng(0)
+    for _ in range(40):
+        place, lamp = int(rng.integers(5)), int(rng.integers(2))
+        dynamics.add(np.array([place, lamp]), 0, np.array([min(place + 1, 4), lamp]))
+    expected = dynamics.predict(np.array([[place, 0] for place in range(5)]))[0].expected[:, 0]
+    assert expected[4, 4] > 0.97 and min(expected[place, place + 1] for place in range(4)) > 0.97
+    weight = dynamics.factors[0].weights()[0]
+    assert weight[2 + len(dynamics.factors[0].parents) :].sum() < 0.01
+
+
+def test_predictions_are_chances_and_what_slips_stays_unknown_only_where_it_goes() -> None:
+    dynamics = Dynamics(SIZES, ACTIONS, DynamicsSettings())
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        code, action = tuple(rng.integers(1, 4, size=3).tolist()), int(rng.integers(ACTIONS))
+        following = code if rng.random() < 0.2 else turned(code, action)
+        dynamics.add(np.array(code), action, np.array(following))
+    wheel = dynamics.predict(np.array([(0, 1, 1), (1, 1, 1)]))[0]
+    assert np.allclose(wheel.expected.sum(axis=2), 1.0)
+    assert wheel.expected[0, 0, 0] == pytest.approx(0.2, abs=0.06), "how often it slips is known where it never was"
+    assert wheel.unknown[0, 0] > 0.7 > 0.05 > wheel.unknown[1, 0], "where it leads is not"
