@@ -119,7 +119,7 @@ class FactorDynamics:
         return weight / weight.sum(axis=1, keepdims=True)
 
     def pool(self) -> Floats:
-        """Learn how it changes by itself. How often actions that change it were tried, and left it at its value: (2,)."""
+        """Learn how it changes by itself; how often actions that change it were tried, and left it as it was: (2,)."""
         self._by_itself = self._turns.copy()
         changes = np.where(self.stayed < self.tried, 1.0 - self.weights()[:, 0], 0.0)
         return np.array([changes @ self.tried, changes @ self.stayed])
@@ -147,7 +147,7 @@ class FactorDynamics:
         weight, failed = self._weights(EVERY), self.stayed / np.maximum(self.tried, 1.0)
         turns = self._by_itself[codes[:, self.factor]]
         turns /= np.maximum(turns.sum(axis=1, keepdims=True), 1.0)
-        seen = self._stays(weight, codes) * (self.tried[:, None] > 0.0) + weight[:, 1, None] * turns[:, None]
+        seen = (self._stays(weight, codes) + weight[:, 1, None] * turns[:, None]) * (self.tried[:, None] > 0.0)
         for each in self._counted(weight, codes, EVERY):
             apart = each.apart / np.maximum(each.total, 1.0)
             alike = each.alike * (1.0 - failed) / np.maximum(each.moved, 1.0)

@@ -295,20 +295,19 @@ def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     assert (blank.epistemic == 1.0).all(), "before anything was seen, everything is unknown"
     assert not blank.modal.any() and not blank.rewards.any() and not blank.p_terminated.any()
     live(learner, range(40), np.random.default_rng(0))
-    before, actions = learner.state(), np.array([1, 1, 0])
-    rollout = learner.imagine(frame((0, 2, 1)), actions=actions, depth=3, rng=np.random.default_rng(1))
+    before, actions = learner.state(), np.array([0, 1, 3, 1])
+    rollout = learner.imagine(frame((0, 2, 1)), actions=actions, depth=4, rng=np.random.default_rng(1))
     assert same(before, learner.state())
     assert np.array_equal(rollout.actions, actions)
     assert rollout.accepted.all() and not blank.accepted.any(), "what is unknown is not accepted"
-    assert rollout.frames.shape == (3, 64, 64)
-    assert rollout.q_values.shape == (3, ACTIONS)
+    assert rollout.frames.shape == (4, 64, 64)
+    assert rollout.q_values.shape == (4, ACTIONS)
     code = (0, 2, 1)
     for index, action in enumerate(actions.tolist()):
         code, reward, ended = fake_codes.step(code, action)
         assert tuple(rollout.macrostates[index]) == code
         assert rollout.rewards[index] == pytest.approx(reward, abs=1.6)
-        if ended:
-            break
+        assert ended == (index == 3) == (rollout.p_terminated[index] > 0.5)
     greedy = learner.imagine(frame((0, 2, 1)), actions=None, depth=6, rng=np.random.default_rng(1))
     assert greedy.p_terminated[-1] > 0.5
     assert (greedy.p_terminated[:-1] <= 0.5).all()

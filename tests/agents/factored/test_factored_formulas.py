@@ -22,8 +22,15 @@ from imagine_bench.interfaces import Floats
 
 SIZES, ACTIONS = (2, 3), 2
 DYNAMICS = DynamicsSettings(
-    parents=2, persistence=0.4, parent_decay=0.25, concentration=0.5, slip=0.02, by_itself=0.2, alike=0.3,
-    fails=0.2, pseudo_fails=4.0,
+    parents=2,
+    persistence=0.4,
+    parent_decay=0.25,
+    concentration=0.5,
+    slip=0.02,
+    by_itself=0.2,
+    alike=0.3,
+    fails=0.2,
+    pseudo_fails=4.0,
 )
 SETTINGS = FactoredSettings(dynamics=DYNAMICS, planning=PlanningSettings(least_probability=0.1))
 CODES = list(itertools.product(*map(range, SIZES)))
@@ -68,7 +75,7 @@ def structures(
     for row in pooled:
         turns[row.following[factor]] += row.code[factor] == own
     total = turns.sum() + pseudo
-    found.append(((turns + 0.5) / total, turns / max(turns.sum(), 1), pseudo / total))
+    found.append(((turns + 0.5) / total, turns / max(turns.sum(), 1) * bool(rows), pseudo / total))
     stayed = sum(row.following[factor] == row.code[factor] for row in rows)
     rate, frequency = (stayed + 4.0 * fails) / (len(rows) + 4.0), stayed / max(len(rows), 1)
     for parents in PARENTS[factor]:

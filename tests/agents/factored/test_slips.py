@@ -22,15 +22,14 @@ def turned(code: tuple[int, ...], action: int) -> tuple[int, ...]:
 
 
 def away(settings: DynamicsSettings, slip: float, seed: int, transitions: int) -> tuple[float, float]:
-    """Mean total variation between learned and true chances after so many random transitions; how often any slipped."""
+    """Mean total variation between learned and true chances after so many transitions; how often any slipped."""
     dynamics, rng = Dynamics(SIZES, ACTIONS, settings), np.random.default_rng(seed)
-    code, slips = (0, 0, 0), 0
-    for _ in range(transitions):
-        action = int(rng.integers(ACTIONS))
+    slips = 0
+    for index in range(transitions):
+        code, action = tuple(rng.integers(4, size=WHEELS).tolist()), index % ACTIONS
         following = code if rng.random() < slip else turned(code, action)
         dynamics.add(np.array(code), action, np.array(following))
         slips += following == code
-        code = following
     codes = list(itertools.product(range(4), repeat=WHEELS))
     parts = [part.expected for part in dynamics.predict(np.array(codes))]
     found = []
@@ -46,8 +45,8 @@ def away(settings: DynamicsSettings, slip: float, seed: int, transitions: int) -
 def test_how_often_actions_slip_is_learned_from_all_of_them(slip: float, transitions: int) -> None:
     apart = dataclasses.replace(DynamicsSettings(), alike=1e-9)
     pooled, alone = ([away(each, slip, seed, transitions) for seed in range(5)] for each in (DynamicsSettings(), apart))
-    assert all(tv < abs(slipped - slip) + 0.04 for tv, slipped in pooled), "little more than the luck of the draw"
-    assert np.mean([tv for tv, _ in pooled]) < 0.05
+    luck = np.mean([abs(slipped - slip) for _, slipped in pooled])
+    assert np.mean([tv for tv, _ in pooled]) < luck + 0.03, "little more than the luck of the draw"
     assert np.mean([tv for tv, _ in alone]) > 0.09, "rows that are learned apart need more"
 
 
@@ -77,4 +76,4 @@ def test_predictions_are_chances_and_what_slips_stays_unknown_only_where_it_goes
     wheel = dynamics.predict(np.array([(0, 1, 1), (1, 1, 1)]))[0]
     assert np.allclose(wheel.expected.sum(axis=2), 1.0)
     assert wheel.expected[0, 0, 0] == pytest.approx(0.2, abs=0.06), "how often it slips is known where it never was"
-    assert wheel.unknown[0, 0] > 0.7 > 0.05 > wheel.unknown[1, 0], "where it leads is not"
+    assert wheel.unknown[0, 0] > 0.7 and wheel.unknown[1, 0] < 0.05, "where it leads is not"
