@@ -21,7 +21,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.suite.experiments import LADDER
 
-BUDGETS = (10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 120, 140, 160, 180, 200, 250)
+BUDGETS = (10, 20, 30, 40, 50, 60, 70, 80, 100, 120, 150)
 SHARE = 0.95
 
 
