@@ -152,6 +152,21 @@ def test_what_an_agent_needs_over_the_floor(
     assert example.over_floor({"transitions": [None, 30, 50], "floor": 25.0}) == 2.0
 
 
+@pytest.mark.parametrize("example", ["tables"], indirect=True)
+def test_how_far_learned_tables_are_from_the_rules(
+    example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far after one transition, near after as many as the floor says."""
+    floor = certificate(registry.task("arrows:slip=0.1")).floor
+    assert floor
+    monkeypatch.setattr(example, "FLOORS", (1 / floor.transitions, 1.0))
+    example.main(["slip=0.1", "--seeds", "1000", "--out", str(tmp_path / "tables.json")])
+    world = json.loads((tmp_path / "tables.json").read_text())["worlds"]["slip=0.1"]
+    ((first, learned),) = world["total_variation"]
+    assert world["transitions"] == [1, round(floor.transitions)]
+    assert 1.0 >= first > 0.4 and 0.0 < learned < 0.08
+
+
 def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "how_to" / "add_agent.md").read_text()
     (text,) = re.findall(r"^```toml\n(question.*?)^```", page, re.MULTILINE | re.DOTALL)
