@@ -92,8 +92,8 @@ class FactorDynamics:
         self.fails = settings.fails
         """How often any action that changes the factor is expected to leave it at its value."""
         self._turns = np.zeros((self.values, self.values))
-        self._by_itself = np.zeros((self.values, self.values))
-        """How often each value came after each; the same when that was learned last, so that actions share it."""
+        """How often each value came after each, whatever the action. Shape (K, K)."""
+        self._pool_turns()
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
@@ -104,7 +104,7 @@ class FactorDynamics:
         fails, moved = self._fails()[action], total - self.counts[rows, action, own]
         goes = (1.0 - fails) * (counts + pseudo / others) / (moved + pseudo)
         self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / others)
-        self.evidence[action, 1] += np.log(self._changes()[0][own, value])
+        self.evidence[action, 1] += np.log(self._by_itself[own, value])
         self.evidence[action, _TABLES:tables] += np.log((counts + self.settings.concentration) / (total + pseudo))
         self.evidence[action, tables:] += np.log(fails if stayed else goes)
         self.tried[action] += 1.0
@@ -120,17 +120,16 @@ class FactorDynamics:
 
     def pool(self) -> Floats:
         """Learn how it changes by itself; how often actions that change it were tried, and left it as it was: (2,)."""
-        self._by_itself = self._turns.copy()
+        self._pool_turns()
         changes = np.where(self.stayed < self.tried, 1.0 - self.weights()[:, 0], 0.0)
         return np.array([changes @ self.tried, changes @ self.stayed])
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
         """What some actions would lead to in ``codes`` (N, P)."""
         weight, pseudo, fails = self._weights(actions), self._pseudo, self._fails()[actions]
-        changes, unsure_of = self._changes()
         own = codes[:, self.factor]
-        expected = self._stays(weight, codes) + weight[:, 1, None] * changes[own][:, None]
-        unknown = weight[:, 1] * unsure_of[own][:, None]
+        expected = self._stays(weight, codes) + weight[:, 1, None] * self._by_itself[own][:, None]
+        unknown = weight[:, 1] * self._unsure[own][:, None]
         unsure = fails * pseudo / (self.tried[actions] + pseudo)
         for each in self._counted(weight, codes, actions):
             apart = each.apart / (each.total + pseudo)
@@ -145,7 +144,7 @@ class FactorDynamics:
     def seen(self, codes: Codes) -> Floats:
         """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
         weight, failed = self._weights(EVERY), self.stayed / np.maximum(self.tried, 1.0)
-        turns = self._by_itself[codes[:, self.factor]]
+        turns = self._pooled[codes[:, self.factor]]
         turns /= np.maximum(turns.sum(axis=1, keepdims=True), 1.0)
         seen = (self._stays(weight, codes) + weight[:, 1, None] * turns[:, None]) * (self.tried[:, None] > 0.0)
         for each in self._counted(weight, codes, EVERY):
@@ -180,10 +179,11 @@ class FactorDynamics:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
         return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
 
-    def _changes(self) -> tuple[Floats, Floats]:
-        """How it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""
-        total = self._by_itself.sum(axis=1, keepdims=True) + self._pseudo
-        return (self._by_itself + self.settings.concentration) / total, self._pseudo / total[:, 0]
+    def _pool_turns(self) -> None:
+        """Learn how it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""
+        self._pooled = self._turns.copy()
+        total = self._pooled.sum(axis=1, keepdims=True) + self._pseudo
+        self._by_itself, self._unsure = (self._pooled + self.settings.concentration) / total, self._pseudo / total[:, 0]
 
     def _fails(self) -> Floats:
         """How often each action leaves the factor at its value, where rows are alike. Shape (A,)."""
