@@ -105,9 +105,10 @@ def _ladder() -> Iterator[Variant]:
     yield Variant(
         name=f"{below}, explores longer", factor="exploration", agent=_DQN, against=below, settings={**two, **longer}
     )
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = {"imagination.start_episode": 300}
+    yield Variant(name="the true model", factor="model", agent="imagination_exact", against=below, settings=settings)
     for name, more in (
-        ("imagines from 300: average of 50 samples", {"imagination.start_episode": 300}),
+        ("imagines from 300: average of 50 samples", {}),
         ("whole network", {"imagination.predicts_with": "network"}),
         ("component's mean", {"imagination.temperature": 0.0}),
         ("explores longer", longer),
