@@ -1,6 +1,7 @@
 """What can be registered; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
-The text is an entrant's name in protocols, tables and files; one agent may enter a bench with several settings.
+The text is an entrant's name in protocols, tables and files; one agent, regressor or world model may enter with
+several settings.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ class WorldModelEntry:
     encoder_kind: str | None = None  #: Which of the task's encoders it sees through, ``"latents"`` or ``"codes"``
     privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
     by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
+    settings: str = ""  #: As of :class:`AgentEntry`, read from ``context.overrides``; empty: there are none to give
 
 
 class Entrant(NamedTuple):

@@ -117,7 +117,8 @@ class LatentModel:
 
 
 def _make(context: AgentContext, overrides: Mapping[str, Any]) -> LatentModel:
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, overrides, context.config_group)
+    given = {**overrides, **context.overrides}
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, given, context.config_group)
     prepare_torch(context.device)
     return LatentModel(load_perception(context).encoder, settings, context)
 

@@ -367,8 +367,21 @@ def world_models() -> dict[str, WorldModelEntry]:
 
 
 def world_model_entry(name: str) -> WorldModelEntry:
-    """The registry line of a world model. Raises as :func:`task_entry`."""
-    entry: WorldModelEntry = offered(name, WORLD_MODELS, WORLD_MODEL_GROUP)
+    """The registry line of a world model, as of :func:`agent_entry`.
+
+    Raises:
+        UnknownNameError: No such world model, or no such setting.
+        InvalidValueError: It takes no settings and is given some.
+        SetupError: As :func:`task_entry`.
+    """
+    entry: WorldModelEntry = _entrant_entry(name, WORLD_MODELS, WORLD_MODEL_GROUP)
+    one = entrant(name)
+    if one.settings and not entry.settings:
+        raise InvalidValueError(
+            f"World model {one.agent} takes no settings; leave out {brief(name[len(one.agent) :])}."
+        )
+    for given in one.settings:
+        require_known("setting", given, sorted(load(entry.settings).names()))
     return entry
 
 
@@ -383,6 +396,6 @@ def make_regressor(name: str, context: RegressorContext) -> Regressor:
 def make_world_model(name: str, *given: Any) -> WorldModel:
     """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
     entry = world_model_entry(name)
-    with _guests_faults(f"World model {name} ({entry.make})", own=name in WORLD_MODELS):
+    with _guests_faults(f"World model {name} ({entry.make})", own=entrant(name).agent in WORLD_MODELS):
         model: WorldModel = load(entry.make)(*given)
     return model

@@ -225,6 +225,7 @@ REGRESSORS: dict[str, RegressorEntry] = {
 }  # fmt: skip
 
 _WORLD_MODELS = "imagine_bench.agents.world_models"
+_SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
 WORLD_MODELS: dict[str, WorldModelEntry] = {
     "copy": WorldModelEntry(
         make="imagine_bench.judge.models.ends:make_copy", title="copy the last frame",
@@ -236,14 +237,17 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     ),
     "gaussian": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_gaussian", title="VAE + one Gaussian", encoder_kind="latents",
+        settings=_SETTINGS,
         description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
     ),
     "mdn_dropout": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_dropout", title="VAE + MDN, MC dropout", encoder_kind="latents",
+        settings=_SETTINGS,
         description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
     ),
     "mdn_ensemble": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_ensemble", title="VAE + MDN, ensemble", encoder_kind="latents",
+        settings=_SETTINGS,
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
     "mdn_rnn": WorldModelEntry(
@@ -253,6 +257,7 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     ),
     "mdn_thesis": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_thesis", title="VAE + MDN, thesis' settings", encoder_kind="latents",
+        settings=_SETTINGS,
         description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
         by_default=False,
     ),

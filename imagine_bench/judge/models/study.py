@@ -24,7 +24,7 @@ from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
-from imagine_bench.entrants import file_name
+from imagine_bench.entrants import entrant, file_name
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
 from imagine_bench.judge.models import asking
@@ -238,7 +238,7 @@ def make(
     path = None if entry.encoder_kind is None else encoders.own(spec, appearance, entry.encoder_kind)
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=seeds,
-        config_group=spec.config_group,
+        config_group=spec.config_group, overrides=entrant(name).settings,
     )  # fmt: skip
     card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
     price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}

@@ -14,6 +14,8 @@ from imagine_bench.agents.world_models.structured import StructuredModel
 from imagine_bench import registry
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.episodes import Episodes
+from imagine_bench.entrants import entrant
+from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -30,11 +32,11 @@ def data(task: str = "arrow_puzzle", episodes: int = 80) -> Episodes:
 
 
 def made(name: str, task: str = "arrow_puzzle") -> WorldModel:
-    entry, spec = registry.WORLD_MODELS[name], registry.task(task)
+    entry, spec = registry.world_model_entry(name), registry.task(task)
     path = None if entry.encoder_kind is None else encoders.own(spec, "clean", entry.encoder_kind)
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models"),
-        config_group=spec.config_group,
+        config_group=spec.config_group, overrides=entrant(name).settings,
     )  # fmt: skip
     model: WorldModel = registry.load(entry.make)(context)
     return model
@@ -101,6 +103,21 @@ def test_the_filter_discards_what_its_threshold_says_and_all_that_follows(quick:
     assert kept is not None and kept.dtype == bool
     assert np.array_equal(kept[:, 0], first[:, 0] <= model.imagination.filter.threshold)
     assert not (kept[:, 1:] & ~kept[:, :-1]).any()
+
+
+def test_a_model_has_the_settings_that_its_name_says(quick: Callable[[str], WorldModel]) -> None:
+    mean = "imagination.predicts_with=network,imagination.temperature=0"
+    drawn = imagined(quick("mdn_thesis:model.components=1")).pictures
+    means = imagined(quick(f"mdn_thesis:model.components=1,{mean}")).pictures
+    assert (drawn != drawn[:, :1]).any() and (means == means[:, :1]).all(), "every future of a point is the same"
+    assert registry.world_model_entry(f"mdn_thesis:{mean}").title.endswith("(predicts_with network, temperature 0)")
+
+
+def test_settings_that_a_model_has_not_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"model\.component"):
+        registry.world_model_entry("mdn_thesis:model.component=1")
+    with pytest.raises(InvalidValueError, match=r"copy takes no settings; leave out ':model\.components=1'"):
+        registry.world_model_entry("copy:model.components=1")
 
 
 @pytest.mark.parametrize("name", ["structured", "mdn_ensemble"])
