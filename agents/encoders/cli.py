@@ -12,6 +12,7 @@ import torch
 from tqdm import tqdm
 
 from imagine_bench.appearance import appearance_name
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec, appearance_of_tests, bundled_name
 from imagine_bench.seeding import SeedTree
 
@@ -22,22 +23,28 @@ from .training import draw_frames, train_encoder
 
 
 def retrain(
-    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None
-) -> str:
+    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None,
+    latents: int | None = None,
+) -> str:  # fmt: skip
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
-    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps`` replaces its
-    number of gradient steps. A training that was killed goes on from ``.<name>.unfinished.pt`` in ``out``.
+    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps`` and ``latents``
+    replace its numbers of gradient steps and of latents. A training that was killed goes on from
+    ``.<name>.unfinished.pt`` in ``out``.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
+        InvalidValueError: A recipe of codes was given a number of latents, or found no factor with two values in so
+            few or such like frames.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
-    recipe = recipe if steps is None else replace(recipe, steps=steps)
+    if recipe.kind == "codes" and latents is not None:
+        raise InvalidValueError(f"Recipe {recipe.name} finds its own codes; leave out --latents {latents}.")
+    recipe = replace(recipe, steps=recipe.steps if steps is None else steps)
+    recipe = replace(recipe, latents=recipe.latents if latents is None else latents)
     appearance = appearance_name(appearance)
     name = bundled_name(spec.encoder, appearance, recipe.kind)
     path = out / f"{name}.safetensors"

@@ -214,17 +214,18 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
         cardinalities=classes_of(spec),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
-        f"--recipe {recipe.name} --seed {seed}{_shorter(spec, recipe)}",
+        f"--recipe {recipe.name} --seed {seed}{_changed(spec, recipe)}",
         data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
         versions={name: version(name) for name in _LIBRARIES},
         **measured,
     )
 
 
-def _shorter(spec: TaskSpec, recipe: Recipe) -> str:
-    """The option of the command that changed a recipe's number of gradient steps, if that was so."""
+def _changed(spec: TaskSpec, recipe: Recipe) -> str:
+    """The options of the command that changed a recipe's numbers of gradient steps and latents, where they did."""
     named = RECIPES[spec.config_group].get(recipe.name, recipe)
-    return "" if named.steps == recipe.steps else f" --steps {recipe.steps}"
+    pairs = ((name, getattr(recipe, name)) for name in ("steps", "latents"))
+    return "".join(f" --{name} {value}" for name, value in pairs if value != getattr(named, name))
 
 
 def _laps(clock: dict[str, float]) -> dict[str, float]:

@@ -82,6 +82,8 @@ class Judge:
     """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: str = "random"
     """Who collects the data: random, uniform, oracle or mixed."""
+    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the task's)")] = None
+    """What models see through that read what it gives, latents or codes."""
     workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
     """Processes at a time."""
     out: Path = Path("runs/judge")
@@ -96,7 +98,7 @@ class Judge:
         usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
         judgement = Judgement(
             task=self.task, models=self.models or usual, sizes=self.sizes, seeds=self.seeds,
-            samples=self.samples, appearance=self.appearance, policy=self.policy,
+            samples=self.samples, appearance=self.appearance, policy=self.policy, encoder=self.encoder,
         )  # fmt: skip
         folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
         print(judgement_report(folder, judgement))

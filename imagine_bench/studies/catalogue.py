@@ -202,6 +202,23 @@ _UNCERTAINTY = Study(
     seeds=(1000, 1001, 1002), evaluation_episodes=300, variants=(*_uses("clean"), *_uses("mild")),
 )  # fmt: skip
 
+_REMARKS = Study(
+    name="remarks", question="What do the thesis' remarks on its imagination come to here?", budgets=(250, 500),
+    seeds=(1000, 1001, 1002, 1003, 1004), evaluation_episodes=300, appearance="mild", execution="kinematic",
+    variants=(
+        Variant(name=_FILTERED, factor=BASE, agent=_FILTERED),
+        _variant("model's data", "latents drawn as the encoder says", {"model.spread": 1.0}),
+        Variant(
+            name="latents not drawn", factor="model's data", agent=_FILTERED,
+            against="latents drawn as the encoder says", settings={"model.spread": 0.0},
+        ),
+        _variant("memory", "300 imagined transitions", {"memory.imagined": 300}),
+        _variant("memory", "30,000 imagined transitions", {"memory.imagined": 30_000}),
+        _variant("start of imagination", "I_start 0", {"imagination.start_episode": 0}),
+        _variant("start of imagination", "I_start 250", {"imagination.start_episode": 250}),
+    ),
+)  # fmt: skip
+
 _SMOKE = Study(
     name="smoke", question="Does every part of a study work?", budgets=(5,), seeds=(1000, 1001),
     evaluation_episodes=5, appearance="clean", execution="kinematic",
@@ -223,6 +240,7 @@ STUDIES: dict[str, Study] = {
         _CONTROLLER,
         _CURIOSITY,
         _UNCERTAINTY,
+        _REMARKS,
         _SMOKE,
     )
 }

@@ -61,6 +61,8 @@ class Judgement:
     samples: int = SAMPLES  #: Futures imagined of each question
     appearance: str = "clean"
     policy: str = "random"  #: Who collects the data, as :data:`.data.collect.POLICIES`
+    #: A bundled name or a file, for the models that read what it gives; the others see through the task's own
+    encoder: str | None = None
 
     def __post_init__(self) -> None:
         if not self.models or not self.seeds or min(self.seeds) < 0:
@@ -77,6 +79,10 @@ class Judgement:
                 f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
                 "all of it. Judge a task without the dials gesture and lag."
             )
+        if self.encoder is not None:
+            gives = encoders.kind(encoders.resolve(registry.task(self.task), self.appearance, self.encoder))
+            if gives not in {model_entry(name).encoder_kind for name in self.models}:
+                raise InvalidValueError(f"No model of {self.models} reads {gives}, which {self.encoder} gives.")
 
     @property
     def cells(self) -> list[Cell]:
@@ -87,7 +93,9 @@ class Judgement:
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
-        same = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
+        same: tuple[Any, ...] = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
+        if self.encoder is not None:
+            same += (encoders.identity(encoders.resolve(registry.task(self.task), self.appearance, self.encoder)),)
         digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
         return f"{file_name(self.task)}-{self.appearance}-{digest}"
 
@@ -177,7 +185,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
     world = prepare(judgement, folder)
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     dataset = data_of(judgement, folder, cell.seed)
-    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds)
+    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds, judgement.encoder)
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
@@ -226,7 +234,7 @@ def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
 
 
 def make(
-    name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree
+    name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree, encoder: str | None = None
 ) -> tuple[WorldModel, dict[str, Any]]:
     """A new model, or a trained agent, and what was spent on it beforehand: the encoder's name and frames."""
     if is_run(name):
@@ -235,7 +243,7 @@ def make(
     entry = registry.world_model_entry(name)
     if entry.privileged:
         return registry.make_world_model(name, spec, gallery), {"encoder": "", "encoder_frames": 0}
-    path = None if entry.encoder_kind is None else encoders.own(spec, appearance, entry.encoder_kind)
+    path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=seeds,
         config_group=spec.config_group, overrides=entrant(name).settings,
@@ -243,6 +251,13 @@ def make(
     card = {} if path is None else read_json(path.with_suffix(".json"), "an encoder's card")
     price = {"encoder": "" if path is None else path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
     return registry.make_world_model(name, context), price
+
+
+def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> Path:
+    """What is given, where it gives latents or codes as the model reads them; else the task's own."""
+    if given is not None and encoders.kind(path := encoders.resolve(spec, appearance, given)) == kind:
+        return path
+    return encoders.own(spec, appearance, kind)
 
 
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:

@@ -14,7 +14,7 @@ from imagine_bench.agents.encoders.encoder import Encoder
 from imagine_bench.agents.encoders.training import train_encoder
 from PIL import Image
 
-from imagine_bench.errors import ArtefactError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 
 
 def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path) -> None:
@@ -49,6 +49,15 @@ def test_retrain_with_fewer_steps_says_so(tmp_path: Path, monkeypatch: pytest.Mo
     card = Encoder.load(tmp_path / "drawn_arrows-mild.safetensors").card
     assert card.recipe.steps == 1 and card.command.endswith("--recipe tiny_conv --seed 1 --steps 1")
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_retrain_with_more_latents_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CHAPTER_5, "tiny_conv", TINY_CONV)
+    retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path, steps=1, latents=11)
+    card = Encoder.load(tmp_path / "drawn_arrows-mild.safetensors").card
+    assert card.latent_size == 11 and card.command.endswith(" --steps 1 --latents 11")
+    with pytest.raises(InvalidValueError, match="finds its own codes; leave out --latents 11"):
+        retrain(arrow_spec(), recipe="codes", appearance="mild", seed=1, out=tmp_path, latents=11)
 
 
 def test_comparison_shows_both_cards() -> None:

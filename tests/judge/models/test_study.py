@@ -19,7 +19,9 @@ from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.judge.models import study
+from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.study import Judgement, judge, kept
+from imagine_bench.seeding import SeedTree
 
 _PYPROJECT = """
 [project]
@@ -135,5 +137,18 @@ def test_nonsense_is_refused() -> None:
         Judgement(task="pick_place", models=("copy",), sizes=(30, 20))
     with pytest.raises(InvalidValueError, match=r"hide or delay a part .* without the dials gesture and lag"):
         Judgement(task="arrows:cubes=2,lag=1", models=("copy",))
+    with pytest.raises(
+        InvalidValueError, match=r"No model of \('copy', 'structured'\) reads latents, which pick_place-"
+    ):
+        Judgement(task="pick_place", models=("copy", "structured"), encoder="pick_place-mild")
     with pytest.raises(InvalidValueError, match="samples is 0"):
         Judgement(task="pick_place", models=("copy",), samples=0)
+
+
+def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:
+    judged = Judgement(task="pick_place", models=("gaussian", "structured"), encoder="pick_place-mild")
+    spec, seeds = registry.task("pick_place"), SeedTree(1000)
+    gallery = Gallery(spec, "clean")
+    prices = [study.make(name, spec, gallery, "clean", seeds, judged.encoder)[1] for name in judged.models]
+    assert [price["encoder"] for price in prices] == ["pick_place-mild", "pick_place-clean-codes"]
+    assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
