@@ -111,7 +111,6 @@ def _ladder() -> Iterator[Variant]:
         ("imagines from 300: average of 50 samples", {}),
         ("whole network", {"imagination.predicts_with": "network"}),
         ("component's mean", {"imagination.temperature": 0.0}),
-        ("explores longer", longer),
         ("model of quick", _of_quick("model.")),
         (
             "rollouts of quick",
@@ -119,6 +118,7 @@ def _ladder() -> Iterator[Variant]:
                 "imagination.start_states", "imagination.breadth", "imagination.depth", "imagination.exploration"
             ),
         ),
+        ("explores longer", longer),
         ("updates of quick", _of_quick("imagination.updates_per_step")),
     ):
         settings = {**settings, **more}
