@@ -4,8 +4,9 @@ An *outcome* is a pair (reward, whether the episode ended) that was seen. One of
 causes: conjunctions of a few values of the next code, or of an action and values of the code before it. Any active
 cause brings its outcome about: a noisy-OR (Pearl 1988, 4.3.2), whose causes are learned by expectation maximisation
 with sparse Beta priors. How likely a conjunction of each order is a cause at all is learned too (empirical Bayes), so
-the agent finds out by itself which causes its task has. Learning conjunctions that trigger effects: DOORmax (Diuk,
-Cohen & Littman 2008). What no test has covered is known to be unknown (KWIK, Li et al. 2011), and novelty counts by
+the agent finds out by itself which causes its task has. They are the base measure of a Dirichlet prior: what a
+transition brought when it was seen soon weighs more. Learning conjunctions that trigger effects: DOORmax (Diuk, Cohen &
+Littman 2008). What no test has covered is known to be unknown (KWIK, Li et al. 2011), and novelty counts by
 conjunctions rather than by whole states (width-based search, Lipovetzky & Geffner 2012).
 """
 
@@ -148,6 +149,34 @@ class _Evidence:
 
 
 @dataclass(frozen=True, slots=True)
+class _Seen:
+    """How often each transition that was seen brought each outcome."""
+
+    choices: NDArray[np.int64]  #: numbers of codes and actions, ascending
+    following: NDArray[np.int64]  #: of next codes, ascending
+    both: NDArray[np.int64]  #: of the pairs, by their places in these, ascending. Shape (U,).
+    counts: Floats  #: of outcomes, and zeros at the end. Shape (U + 1, O).
+
+    @classmethod
+    def of(cls, choice: NDArray[np.int64], following: NDArray[np.int64], outcome: NDArray[np.int64], count: Floats,
+           outcomes: int) -> _Seen:  # fmt: skip
+        """Of transitions by the numbers of their choices and next codes, each with an outcome and a count, (N,)."""
+        choices, first = np.unique(choice, return_inverse=True)
+        nexts, second = np.unique(following, return_inverse=True)
+        both, place = np.unique(first * len(nexts) + second, return_inverse=True)
+        counts = np.zeros((len(both) + 1, outcomes))
+        np.add.at(counts, (place, outcome), count)
+        return cls(choices, nexts, both, counts)
+
+    def read(self, choice: NDArray[np.int64], following: NDArray[np.int64], at_choice: NDArray[np.int64],
+             at: NDArray[np.int64]) -> Floats:  # fmt: skip
+        """Those of N transitions, whose choices and next codes stand ``at`` these places of the numbers: (N, O)."""
+        first, second = _places(self.choices, choice)[at_choice], _places(self.following, following)[at]
+        both = np.where((first < 0) | (second < 0), -1, first * len(self.following) + second)
+        return np.asarray(self.counts[_places(self.both, both)])
+
+
+@dataclass(frozen=True, slots=True)
 class _Explanation:
     """How all outcomes but a default may come about."""
 
@@ -207,6 +236,8 @@ class OutcomeModel:
         pseudo_tests = self.settings.pseudo_tests
         untested = causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)
         self._spared = np.log1p(-np.vstack([causes.strength, untested])).T.copy()
+        choice = np.column_stack([codes, actions]) @ self._strides_of_choice
+        self._seen = _Seen.of(choice, following @ self._strides, outcome, count, len(self.outcomes))
 
     def reset_for_new_task(self) -> None:
         """Forget all that was seen; earlier causes become priors, until a test of this task refutes them.
@@ -258,16 +289,19 @@ class OutcomeModel:
         """Outcome probabilities (N, O) of N transitions, and the probability that something untested decides (N,)."""
         causes = self.causes
         assert causes is not None, "fit before predicting"
-        which, at = _distinct(following, self._strides)
-        how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
+        nexts, which, at = _distinct(following, self._strides)
+        choices, how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
         of_next, of_choice = (
             self.conjunctions.of_next(following[which]),
             self.conjunctions.of_choice(codes[how], actions[how]),
         )
         of_next, of_choice = (self._spared.take(active.T, axis=0).sum(axis=0) for active in (of_next, of_choice))
         *none, tested = np.exp(of_next[at] + of_choice[at_choice]).T
-        probability = _by_causes(np.array(none), causes.default)  # [O, N]
-        return (probability / probability.sum(axis=0)).T, (1.0 - tested) * probability[causes.default]
+        probability = _by_causes(np.array(none), causes.default).T  # [N, O]
+        unknown = (1.0 - tested) * probability[:, causes.default]
+        probability *= self.settings.pseudo_seen / probability.sum(axis=1, keepdims=True)
+        probability += self._seen.read(choices, nexts, at_choice, at)
+        return probability / probability.sum(axis=1, keepdims=True), unknown
 
     def _explain(self, evidence: _Evidence, default: int) -> _Explanation:
         """Causes of every outcome but ``default``."""
@@ -331,7 +365,14 @@ def _by_causes(inactive: Floats, default: int) -> Floats:
     return probability
 
 
-def _distinct(values: Codes, multipliers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Where each distinct row (N, V) comes first, and which of these each row is: (U,) and (N,)."""
-    _, first, which = np.unique(values @ multipliers, return_index=True, return_inverse=True)
-    return first, which
+def _distinct(
+    values: Codes, multipliers: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct numbers of rows (N, V), where each comes first, and which each row has: (U,), (U,) and (N,)."""
+    return np.unique(values @ multipliers, return_index=True, return_inverse=True)
+
+
+def _places(among: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each number stands among those, which are ascending; -1 where it does not."""
+    place = np.minimum(np.searchsorted(among, numbers), len(among) - 1)
+    return np.where(among[place] == numbers, place, -1)

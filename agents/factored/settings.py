@@ -36,6 +36,8 @@ class OutcomeSettings:
     pseudo_tests: float = setting(0.2, POSITIVE)  #: how many tests of one conjunction the prior is worth
     pseudo_conjunctions: float = setting(3.0, POSITIVE)  #: how many conjunctions of one order the prior is worth
     leak: float = setting(1e-3, INSIDE)  #: probability of an outcome without a cause
+    #: How many sightings of a transition what its causes say of it is worth.
+    pseudo_seen: float = setting(0.2, POSITIVE)
     masked_weight: float = setting(0.1, PROBABILITY)  #: weight of a test in which some other cause decided
     sweeps: int = setting(25, COUNT)  #: steps of expectation maximisation
     #: Prior probability that a cause of an earlier task is one of the next; 0 forgets it.

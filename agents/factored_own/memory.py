@@ -8,7 +8,7 @@ predicts the others, and these the first. The memory that predicts best is kept 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
@@ -19,6 +19,8 @@ from ..factored.settings import OwnSettings
 
 _FEWEST = 3
 """Values of a factor worth remembering: one that tells nothing, and two to tell apart."""
+_NONE_SEEN = 1e6
+"""Pseudo-count beside which no transition counts that was seen: it would explain a part of what a memory explains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +70,14 @@ def choose(
     if not contradictions(rows):
         return None
     half = np.cumsum(begins) % 2 == 0  # every second episode
+    causes_alone = replace(settings, outcomes=replace(settings.outcomes, pseudo_seen=_NONE_SEEN))
     likelihood: dict[Memory | None, float] = {}
     for memory in (None, *candidates(sizes)):
         more = () if memory is None else (sizes[memory.factor],)
         remembered = remembering(rows, begins, memory)
         likelihood[memory] = 0.0
         for learned in (half, ~half):
-            model = FactoredModel((*sizes, *more), n_actions, settings)
+            model = FactoredModel((*sizes, *more), n_actions, causes_alone)
             for row in compress(remembered, learned):
                 model.add(row)
             model.outcomes.fit()

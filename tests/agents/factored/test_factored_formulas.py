@@ -158,8 +158,17 @@ def test_each_conjunction_has_a_number_of_its_own() -> None:
         assert prior[number] == pytest.approx(0.03 if key[0] == "g" else 0.1), "two values and the action are three"
 
 
+def brought(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
+    """Probability of each outcome, and that something untested decides: by causes, and by what was seen."""
+    chance, untested = by_noisy_or(model, code, action, following)
+    pseudo, same = SETTINGS.outcomes.pseudo_seen, [row for row in lived() if row[:3] == (code, action, following)]
+    seen = Counter(model.outcomes.outcomes.index((row.reward, row.terminated)) for row in same)
+    total = pseudo + len(same)
+    return {each: (pseudo * chance[each] + seen[each]) / total for each in chance}, untested
+
+
 def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
-    """Probability of each outcome, and that something untested decides."""
+    """The same by causes alone."""
     causes, settings = model.outcomes.causes, SETTINGS.outcomes
     assert causes is not None
     (active,) = model.outcomes.conjunctions.active(np.array([code]), np.array([action]), np.array([following])).tolist()
@@ -192,7 +201,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         goes_on = {}
         for after, share in likely.items():
             weight = share / sum(likely.values())
-            chance, unsure = by_noisy_or(model, code, action, after)
+            chance, unsure = brought(model, code, action, after)
             over = sum(share for outcome, share in chance.items() if causes.outcomes[outcome][1])
             reward += weight * sum(share * causes.outcomes[outcome][0] for outcome, share in chance.items())
             ends, untested, goes_on[after] = ends + weight * over, untested + weight * unsure, weight * (1.0 - over)
@@ -206,11 +215,28 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
     for each in lived()[:3]:
         probability, unknown = model.probability(each)
         factors = [predicted(factor, each.code, each.action)[0] for factor in range(2)]
-        chance, untested = by_noisy_or(model, each.code, each.action, each.following)
+        chance, untested = brought(model, each.code, each.action, each.following)
         moved = factors[0].expected[each.following[0]] * factors[1].expected[each.following[1]]
         assert probability == pytest.approx(moved * chance[causes.outcomes.index((each.reward, each.terminated))])
         known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
         assert unknown == pytest.approx(1.0 - known * (1.0 - untested))
+
+
+def test_what_a_transition_brought_outweighs_a_cause_of_something_else() -> None:
+    """Where two causes are active and one of them always wins, only the transition itself can tell which."""
+    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1))
+    both = CodeTransition((0, 0), 1, (1, 1), 3.0, True)
+    neither, other = both._replace(following=(0, 0), reward=0.0, terminated=False), both._replace(reward=-1.0)
+    for row in [neither, both._replace(following=(1, 0)), other._replace(following=(0, 1))] * 5 + [both]:
+        learned.add(row)
+    learned.fit()
+
+    def loses(code: Code) -> float:
+        (chance,), _ = learned.predict(np.array([code]), np.array([1]), np.array([(1, 1)]))
+        return float(chance[learned.outcomes.index((-1.0, True))])
+
+    assert loses((0, 0)) < 0.02, "it was seen"
+    assert loses((1, 2)) > 0.1, "of what was not seen causes alone tell"
 
 
 class ByLoops:

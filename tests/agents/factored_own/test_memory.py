@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from itertools import pairwise
 
 import fake_codes
@@ -93,8 +94,9 @@ def test_chance_alone_is_no_reason_to_remember() -> None:
 
 
 def success(
-    learner: OwnPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True, well: float = 1.0
-) -> float:
+    learner: OwnPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True, well: float = 1.0,
+    steps: int = 6,
+) -> float:  # fmt: skip
     """Live in pictures of the world, whose lamp may be covered; the share of episodes that ended well.
 
     Rewards are multiplied by ``well``.
@@ -109,7 +111,7 @@ def success(
         rng = np.random.default_rng((explore, episode))
         code = starts()[int(rng.integers(len(starts())))]
         seen = Observation(frame=picture(seen_of(code, 0), rng))
-        for step in range(6):
+        for step in range(steps):
             action = learner.act(seen, explore=explore)
             code, reward, ended = fake_codes.step(code, action)
             reward *= well
@@ -118,7 +120,7 @@ def success(
                 learner.observe(
                     Transition(
                         observation=seen, action=action, reward=reward, next_observation=after, terminated=ended,
-                        truncated=not ended and step == 5,
+                        truncated=not ended and step == steps - 1,
                     ),
                     episode=episode,
                 )  # fmt: skip
@@ -129,13 +131,33 @@ def success(
     return solved / len(episodes)
 
 
+def most_without_memory(steps: int) -> float:
+    """Share of starts from which the best policy ends well that sees the lamp in its first step alone: enumerated."""
+    places, best = sorted({code[:2] for code in starts()}), 0.0
+    for chosen in itertools.product(range(ACTIONS), repeat=len(places)):
+        policy = dict(zip(places, chosen, strict=True))
+        best = max(best, np.mean([any(well(code, [a], policy, steps) for a in range(ACTIONS)) for code in starts()]))
+    return float(best)
+
+
+def well(code: Code, first: list[int], policy: dict[Code, int], steps: int) -> bool:
+    """Whether an episode ends well that begins with some macro-actions and follows a policy."""
+    for step in range(steps):
+        code, reward, ended = fake_codes.step(code, first[step] if step < len(first) else policy[code[:2]])
+        if ended:
+            return reward > 0
+    return False
+
+
 def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing_was_hidden() -> None:
-    learner, forgetful = agent(seed=6), agent(seed=6, memory_evidence=1e6)
+    learner, forgetful = agent(seed=8), agent(seed=8, memory_evidence=1e6)
     for each in (learner, forgetful):
         success(each, range(60), explore=True)
     assert learner.perception.memory is not None and forgetful.perception.memory is None
     assert success(learner, range(50), explore=False) >= 0.9
     assert success(forgetful, range(50), explore=False) <= 0.7, "what is hidden matters"
+    assert success(learner, range(50), explore=False, steps=3) >= 0.9, "and in time"
+    assert most_without_memory(3) == 0.8, "which nothing can do that forgets"
     assert learner.replay.rows() == remembering(
         [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in learner.replay.rows()],
         learner.perception.begins, learner.perception.memory,
