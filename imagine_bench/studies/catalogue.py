@@ -109,8 +109,7 @@ def _ladder() -> Iterator[Variant]:
     yield Variant(name="the true model", factor="model", agent="imagination_exact", against=below, settings=settings)
     for name, more in (
         ("imagines from 300: average of 50 samples", {}),
-        ("whole network", {"imagination.predicts_with": "network"}),
-        ("component's mean", {"imagination.temperature": 0.0}),
+        ("component's mean", {"imagination.predicts_with": "network", "imagination.temperature": 0.0}),
         ("model of quick", _of_quick("model.")),
         (
             "rollouts of quick",
