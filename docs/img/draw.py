@@ -128,6 +128,30 @@ def thesis_settings() -> None:
     figure.savefig(HERE / "thesis_settings.png", dpi=150)
 
 
+def rungs() -> None:
+    """From the thesis' settings to those of quick: success of each seed, and what its model imagines rightly."""
+    with (RESULTS / "arrow_puzzle-study-ladder" / "results.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["episodes"] == "1000"]
+    names = list(dict.fromkeys(row["variant"] for row in rows))
+    figure, axes = plt.subplots(figsize=(8, 0.8 + 0.32 * len(names)), layout="constrained")
+    for place, name in enumerate(names):
+        own = [row for row in rows if row["variant"] == name]
+        color = COLORS["dqn" if own[0]["agent"] == "dqn" else "imagination"]
+        solved = [100 * float(row["success"]) for row in own]
+        right = [100 * float(row["imagined_right"]) for row in own if row["imagined_right"]]
+        axes.plot(solved, [place] * len(own), "o", color=color, alpha=0.6, markersize=5)
+        axes.plot([np.mean(solved)], [place], "|", color=color, markersize=16, markeredgewidth=2.5)
+        if right:
+            axes.plot([np.mean(right)], [place], "D", color="#2b2b2f", fillstyle="none", markersize=6)
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlim(-2, 102)
+    axes.set_xlabel("after 1,000 real episodes: tests solved (dots, bar: mean); next macrostate right (diamond), %")
+    axes.grid(axis="x", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(HERE / "rungs.png", dpi=110)
+
+
 def mild() -> None:
     """The ten reported seeds."""
     figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
@@ -232,7 +256,7 @@ def dials() -> None:
 
 
 PICTURES = {
-    each.__name__: each for each in (learning_curves, ladder, thesis_settings, mild, margins, why, radar, dials)
+    each.__name__: each for each in (learning_curves, ladder, thesis_settings, rungs, mild, margins, why, radar, dials)
 }
 
 if __name__ == "__main__":

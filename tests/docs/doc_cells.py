@@ -355,7 +355,7 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    share = score.startswith(("auroc", "total", "counter", "best"))
+    share = score.startswith(("auroc", "total", "tv", "counter", "best"))
     digits = 2 if share or "skill" in score else 1
     numbers = (statistics.iqm(values), *statistics.interval(values, share=share))
     value, *ends = (f"{number:.{digits}f}".replace("-", "−") for number in numbers)

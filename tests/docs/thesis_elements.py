@@ -51,7 +51,12 @@ def page() -> str:
     rows = elements()
     counts = Counter(row["verdict"] for row in rows)
     lines = [
-        "# Every element of the thesis",
+        "# What does the thesis claim, and what holds here?",
+        "",
+        "Mohammad Thabet's thesis (*Imagination-Augmented Deep Reinforcement Learning for Robotic Applications*, "
+        "Manchester, 2022) trains a DQN on transitions that a learned model imagines, and discards those of high "
+        "epistemic uncertainty. Imagination saves real experience here too while it is scarce, [with other "
+        "settings](explanation/imagination.md); what the filter adds is not shown.",
         "",
         f"{len(rows)} elements: " + ", ".join(f"{counts[word]} {word}" for word in VERDICTS if counts[word]) + ".",
         "",
