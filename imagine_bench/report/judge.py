@@ -35,7 +35,7 @@ from imagine_bench.store.files import csv_text, read_json
 
 QUESTIONS = {
     "Which outcomes, how likely?": {
-        "total_variation": "total variation, 1 step", "tv_5": "5 steps", "tv_10": "10 steps",
+        "total_variation": "total variation, 1 step", "tv_3": "3 steps", "tv_5": "5 steps", "tv_10": "10 steps",
         "after_the_end": "after the end", "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
         "outcome_ece": "calibration error", "outcome_brier": "Brier",
     },
@@ -87,7 +87,7 @@ _WORDS = {
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
 _COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100", "#000000")
 _SHARES = {
-    *("total_variation", "tv_5", "tv_10", "after_the_end", "nothing"),
+    *("total_variation", "tv_3", "tv_5", "tv_10", "after_the_end", "nothing"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
     *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
     *(name for name in COLUMNS if name.startswith("auroc")),
