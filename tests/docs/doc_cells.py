@@ -253,6 +253,12 @@ def study(budget: str, folder: str, *variants: str) -> str:
     return "; ".join(percent(statistics.iqm(_success(folder, variant, budget))) for variant in variants)
 
 
+def study_right(budget: str, folder: str, variant: str) -> str:
+    """What a variant's models hold rightly of one macro-action, %: mean."""
+    right = [float(row["imagined_right"]) for row in _study(folder)[variant, int(budget)] if row["imagined_right"]]
+    return percent(float(np.mean(right))) if right else "–"
+
+
 def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]:
     """Against what each is compared with, points [95 %]."""
     found, tests = [], STUDIES["factors"].evaluation_episodes
@@ -466,9 +472,9 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     function.__name__: function
     for function in (
         iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
-        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, answers, first_of,
-        last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged, judged_after,
-        choice,
+        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, study_right, answers,
+        first_of, last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged,
+        judged_after, choice,
         thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
         shortest, price, price_to, raw, coverage, certified,
     )
