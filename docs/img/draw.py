@@ -146,7 +146,7 @@ def rungs() -> None:
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set_xlim(-2, 102)
-    axes.set_xlabel("after 1,000 real episodes: tests solved (dots, bar: mean); next macrostate right (diamond), %")
+    figure.supxlabel("%: tests solved after 1,000 episodes (dots, bar: mean), model right (diamonds)", fontsize=9)
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE / "rungs.png", dpi=110)
