@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -43,8 +44,8 @@ def retrain(
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     if recipe.kind == "codes" and latents is not None:
         raise InvalidValueError(f"Recipe {recipe.name} finds its own codes; leave out --latents {latents}.")
-    recipe = replace(recipe, steps=recipe.steps if steps is None else steps)
-    recipe = replace(recipe, latents=recipe.latents if latents is None else latents)
+    given: dict[str, Any] = {"steps": steps, "latents": latents}
+    recipe = replace(recipe, **{name: value for name, value in given.items() if value is not None})
     appearance = appearance_name(appearance)
     name = bundled_name(spec.encoder, appearance, recipe.kind)
     path = out / f"{name}.safetensors"

@@ -151,17 +151,18 @@ _CONTROLLER = Study(
 )  # fmt: skip
 
 
-def _study(name: str, question: str, variants: tuple[Variant, ...]) -> Study:
-    """At low budgets, where agents differ most."""
+def _study(
+    name: str, question: str, variants: tuple[Variant, ...], *, budgets: tuple[int, ...] = (250, 500), seeds: int = 3
+) -> Study:
+    """At low budgets, where agents differ most, on so many tuning seeds."""
     return Study(
-        name=name, question=question, budgets=(250, 500), seeds=(1000, 1001, 1002), evaluation_episodes=300,
+        name=name, question=question, budgets=budgets, seeds=tuple(range(1000, 1000 + seeds)), evaluation_episodes=300,
         appearance="mild", execution="kinematic", variants=variants,
     )  # fmt: skip
 
 
-_CURIOSITY = Study(
-    name="curiosity", question="Does a reward for epistemic uncertainty explore better?", budgets=(100, 250),
-    seeds=(1000, 1001, 1002, 1003, 1004), evaluation_episodes=300, appearance="mild", execution="kinematic",
+_CURIOSITY = _study(
+    "curiosity", "Does a reward for epistemic uncertainty explore better?", budgets=(100, 250), seeds=5,
     variants=(
         Variant(name=_FILTERED, factor=BASE, agent=_FILTERED),
         _variant("curiosity", "curiosity 1", {"imagination.curiosity": 1.0}),
@@ -201,9 +202,8 @@ _UNCERTAINTY = Study(
     seeds=(1000, 1001, 1002), evaluation_episodes=300, variants=(*_uses("clean"), *_uses("mild")),
 )  # fmt: skip
 
-_REMARKS = Study(
-    name="remarks", question="What do the thesis' remarks on its imagination come to here?", budgets=(250, 500),
-    seeds=(1000, 1001, 1002, 1003, 1004), evaluation_episodes=300, appearance="mild", execution="kinematic",
+_REMARKS = _study(
+    "remarks", "What do the thesis' remarks on its imagination come to here?", seeds=5,
     variants=(
         Variant(name=_FILTERED, factor=BASE, agent=_FILTERED),
         _variant("model's data", "latents drawn as the encoder says", {"model.spread": 1.0}),
