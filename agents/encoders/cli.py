@@ -25,27 +25,29 @@ from .training import draw_frames, train_encoder
 
 def retrain(
     spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None,
-    latents: int | None = None,
+    batch: int | None = None, latents: int | None = None,
 ) -> str:  # fmt: skip
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
-    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps`` and ``latents``
-    replace its numbers of gradient steps and of latents. A training that was killed goes on from
-    ``.<name>.unfinished.pt`` in ``out``.
+    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps``, ``batch`` and
+    ``latents`` replace its numbers of gradient steps, of images a step and of latents. A training that was killed
+    goes on from ``.<name>.unfinished.pt`` in ``out``.
 
     Raises:
         UnknownNameError: An unknown recipe or appearance.
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes was given a number of latents, or found no factor with two values in so
+        InvalidValueError: A recipe of codes was given one of those numbers, or found no factor with two values in so
             few or such like frames.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
-    if recipe.kind == "codes" and latents is not None:
-        raise InvalidValueError(f"Recipe {recipe.name} finds its own codes; leave out --latents {latents}.")
-    given: dict[str, Any] = {"steps": steps, "latents": latents}
-    recipe = replace(recipe, **{name: value for name, value in given.items() if value is not None})
+    numbers = {"steps": steps, "batch": batch, "latents": latents}
+    given: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+    if recipe.kind == "codes" and given:
+        options = " ".join(f"--{name} {value}" for name, value in given.items())
+        raise InvalidValueError(f"Recipe {recipe.name} finds its codes without gradient steps; leave out {options}.")
+    recipe = replace(recipe, **given)
     appearance = appearance_name(appearance)
     name = bundled_name(spec.encoder, appearance, recipe.kind)
     path = out / f"{name}.safetensors"

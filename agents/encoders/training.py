@@ -222,9 +222,9 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
 
 
 def _changed(spec: TaskSpec, recipe: Recipe) -> str:
-    """The options of the command that changed a recipe's numbers of gradient steps and latents, where they did."""
+    """The options of the command that changed a recipe's numbers, where they did."""
     named = RECIPES[spec.config_group].get(recipe.name, recipe)
-    pairs = ((name, getattr(recipe, name)) for name in ("steps", "latents"))
+    pairs = ((name, getattr(recipe, name)) for name in ("steps", "batch", "latents"))
     return "".join(f" --{name} {value}" for name, value in pairs if value != getattr(named, name))
 
 

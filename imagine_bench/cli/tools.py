@@ -53,6 +53,8 @@ class Encoder:
     """Seed of data and training."""
     steps: Annotated[int | None, shown("INT", "(default: the recipe's)")] = None
     """Gradient steps, at least 1."""
+    batch: Annotated[int | None, shown("INT", "(default: the recipe's)")] = None
+    """Images a gradient step, at least 1."""
     latents: Annotated[int | None, shown("INT", "(default: the recipe's)")] = None
     """Latents of the image, or of each strip, at least 1."""
     out: Path = Path("encoders")
@@ -63,7 +65,8 @@ class Encoder:
         retrain = registry.load(_RETRAIN)
         spec = registry.task(self.task)
         require_writable(self.out)
-        choices = {"recipe": self.recipe, "appearance": self.appearance, "steps": self.steps, "latents": self.latents}
+        names = ("recipe", "appearance", "steps", "batch", "latents")
+        choices = {name: getattr(self, name) for name in names}
         print(retrain(spec, **choices, seed=self.seed, out=self.out))
 
 

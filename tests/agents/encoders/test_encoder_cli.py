@@ -51,16 +51,17 @@ def test_retrain_with_fewer_steps_says_so(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_retrain_with_more_latents_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_retrain_with_other_numbers_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(CHAPTER_5, "tiny_conv", TINY_CONV)
-    retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path, steps=1, latents=11)
+    retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path, steps=1, batch=9, latents=11)
     card = Encoder.load(tmp_path / "drawn_arrows-mild.safetensors").card
-    assert card.latent_size == 11 and card.command.endswith(" --steps 1 --latents 11")
-    for nothing in ({"steps": 0}, {"latents": 0}):
+    assert card.latent_size == 11 and card.recipe.batch == 9
+    assert card.command.endswith(" --steps 1 --batch 9 --latents 11")
+    for nothing in ({"steps": 0}, {"batch": 0}, {"latents": 0}):
         with pytest.raises(InvalidValueError, match="has a count below 1"):
             retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path / "none", **nothing)
-    with pytest.raises(InvalidValueError, match="finds its own codes; leave out --latents 11"):
-        retrain(arrow_spec(), recipe="codes", appearance="mild", seed=1, out=tmp_path, latents=11)
+    with pytest.raises(InvalidValueError, match="without gradient steps; leave out --steps 1 --latents 11"):
+        retrain(arrow_spec(), recipe="codes", appearance="mild", seed=1, out=tmp_path, steps=1, latents=11)
 
 
 def test_comparison_shows_both_cards() -> None:
