@@ -42,7 +42,7 @@ class FactorPrediction:
     """What each action would make of one factor in N codes."""
 
     expected: Floats  #: predictive probability of each value. Shape (N, A, K).
-    unknown: Floats  #: weight of the prior in ``expected``. Shape (N, A).
+    unknown: Floats  #: weight of the prior in ``expected``; 0 where it is negligible. Shape (N, A).
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class FactorDynamics:
             goes = (alike * (each.total - each.moved + pseudo / self._others)).sum(axis=1)
             expected[each.codes][each.own] += (each.alike * fails).sum(axis=0) - goes  # which stays, if rows are alike
             unknown[each.codes] += ((apart + alike) * pseudo + each.alike * unsure).sum(axis=1)
-        return FactorPrediction(expected, unknown)
+        return FactorPrediction(expected, np.where(unknown < self.settings.least_unknown, 0.0, unknown))
 
     def seen(self, codes: Codes) -> Floats:
         """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""

@@ -18,6 +18,8 @@ class DynamicsSettings:
     parent_decay: float = setting(0.2, RATE)  #: multiplies the prior for each further parent
     #: Pseudo-count of each value in a Dirichlet prior (Heckerman et al. 1995).
     concentration: float = setting(0.03, POSITIVE)
+    #: Unless the prior weighs so much, what follows counts as known: of chance there is always more to learn.
+    least_unknown: float = setting(0.03, PROBABILITY)
     slip: float = setting(0.005, INSIDE)  #: probability with which a factor that is left alone is misread
     by_itself: float = setting(0.02, INSIDE)  #: prior probability that a factor which changes does so by itself
     alike: float = setting(0.5, INSIDE)  #: prior probability that an action fails as often wherever it changes a factor

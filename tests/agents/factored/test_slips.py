@@ -8,7 +8,10 @@ import itertools
 import numpy as np
 import pytest
 from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.settings import DynamicsSettings
+from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.model import FactoredModel
+from imagine_bench.agents.factored.planner import Planner
+from imagine_bench.agents.factored.settings import DynamicsSettings, FactoredSettings
 
 WHEELS, SIZES, ACTIONS = 3, (4, 4, 4), 6
 
@@ -77,3 +80,23 @@ def test_predictions_are_chances_and_what_slips_stays_unknown_only_where_it_goes
     assert np.allclose(wheel.expected.sum(axis=2), 1.0)
     assert wheel.expected[0, 0, 0] == pytest.approx(0.2, abs=0.06), "how often it slips is known where it never was"
     assert wheel.unknown[0, 0] > 0.7 and wheel.unknown[1, 0] < 0.05, "where it leads is not"
+
+
+def novelty(least_unknown: float, times: int) -> float:
+    """Of a lamp that is drawn anew at every step, after each action was tried so often in each code."""
+    settings = FactoredSettings(dynamics=DynamicsSettings(least_unknown=least_unknown))
+    model, rng = FactoredModel((3, 2), 2, settings), np.random.default_rng(0)
+    codes = list(itertools.product(range(3), range(2)))
+    for _, (lamp, place), action in itertools.product(range(times), codes, range(2)):
+        won = (lamp, place, action) == (2, 1, 0)
+        drawn = (int(rng.integers(3)), place ^ action)
+        model.add(CodeTransition((lamp, place), action, drawn, float(won), won))
+    model.outcomes.fit()
+    planner = Planner(model, settings.planning)
+    return max(planner.values(code, "novelty").max() for code in codes)
+
+
+def test_exploration_rests_once_only_chance_is_left() -> None:
+    default, threshold = DynamicsSettings().least_unknown, FactoredSettings().planning.exploration_threshold
+    assert novelty(default, 2) > threshold, "two draws of a lamp say little"
+    assert novelty(default, 5) < threshold < novelty(0.0, 5), "of chance there is always more to learn"
