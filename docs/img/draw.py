@@ -206,12 +206,13 @@ def why() -> None:
 
 
 def radar() -> None:
-    """Scores of the kept suite."""
+    """Scores of the kept suites."""
     scores: dict[str, dict[str, statistics.Estimate]] = {}
-    with (RESULTS / "suite" / "scores.csv").open() as file:
-        for row in csv.DictReader(file):
-            values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
-            scores.setdefault(row["agent"], {})[row["experiment"]] = statistics.Estimate(*values)
+    for kept in ("suite", "suite-own"):
+        with (RESULTS / kept / "scores.csv").open() as file:
+            for row in csv.DictReader(file):
+                values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
+                scores.setdefault(row["agent"], {})[row["experiment"]] = statistics.Estimate(*values)
     spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
     figure = radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
     figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")
