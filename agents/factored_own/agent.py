@@ -126,8 +126,13 @@ class OwnPerception:
 
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
-        self.take(looks.find(np.stack(self.frames[:count])) if count else [], count)
+        self.take(looks.find(*self.first(count)) if count else [], count)
         self.looked_at, self.unknown = count, False
+
+    def first(self, count: int) -> tuple[Frame, NDArray[np.bool_]]:
+        """The first ``count`` frames (N, 64, 64, 3) remembered, and which are the first of an episode (N,)."""
+        begins = np.isin(np.arange(count), [before for before, _ in compress(self.transitions, self.begins)])
+        return np.stack(self.frames[:count]), begins
 
     def take(self, found: list[looks.Factor], found_in: int) -> None:
         """See these factors from now on."""
@@ -243,8 +248,8 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         """What it saw whenever that changed; see :class:`imagine_bench.capabilities.SeeingLearner`."""
         eyes = self.perception
         for count in eyes.history:
-            frames = np.stack(eyes.frames[:count])
-            found = looks.find(frames)
+            frames, begins = eyes.first(count)
+            found = looks.find(frames, begins)
             begun = sum(compress(eyes.begins, [after < count for _, after in eyes.transitions]))
             yield Perceived(begun, tuple(len(factor.joint) for factor in found), picture(found, frames))
 

@@ -29,7 +29,8 @@ Mask = NDArray[np.bool_]
 SHIFT_PX = 5
 """Crops are compared at all shifts of so many pixels up, down, left and right."""
 _CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no change
-_CHANGES = (2, 0.03)  # times, and share of the frames, that a pixel must change to belong to a factor
+_CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change to belong to a factor
+_STARTS = (3, 0.2)  # the same of the starts of episodes: what no action changes may change there alone
 _LEAST_PX = 36  # pixels of a factor
 _FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
 _SAME, _OTHER = 0.15, 0.2  # distance that jitter makes; the least distance of two values
@@ -39,7 +40,10 @@ _COMPARED = 160  # most crops a factor that are grouped; the others take the val
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
 _TOLD = 8  # times that either of two pixels must change in half of the time for that half to tell
 _TELLING, _NOISE = 20, 0.5  # in so many frames, the share of looks seen once beyond which a region is noise
-_RESTS = 0.5  # share of the steps in which a pixel of noise may change and yet show something else, too
+_USUAL, _COLORS = 0.25, 8  # share of the frames in which a pixel shows a color that is no noise; most such colors
+_RESTS = 0.1  # the same of a color that stays
+_STAYS = 0.2  # how much likelier such a color is where it was a step before: 0 as chance has it, 1 for sure
+_NOTHING = 1.0  # what a pixel shows in place of noise: the median color
 _SEEN = 3  # times that a value must have been seen to tell whether it varies freely
 _MOST = 0.7  # share of the pixels that hang together
 _EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
@@ -61,9 +65,11 @@ class Part(NamedTuple):
     values: NDArray[np.int64]  #: what each shows. Shape (E,).
     flat: float  #: energy that crops without contours count as
     reach: float  #: distance beyond which a crop is like no exemplar
+    rests: Images | None = None  #: where it is in front of noise, what :func:`quiet` needs. Shape (K, 64, 64, 3).
 
-    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
-        """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""
+    def read(self, images: Images, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+        """The value that each of N images, with these contours, shows, and whether it is known. Two arrays (N,)."""
+        shapes = shapes if self.rests is None else contours(quiet(images, self.rests))
         apart = distances(crops(shapes, self.mask), self.exemplars, self.mask, self.flat)
         return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
 
@@ -74,9 +80,9 @@ class Factor(NamedTuple):
     parts: tuple[Part, ...]
     joint: Codes
 
-    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+    def read(self, images: Images, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
         """As of a part; of joint values that were not seen, the one that differs in the fewest parts."""
-        pairs = [part.read(shapes) for part in self.parts]
+        pairs = [part.read(images, shapes) for part in self.parts]
         found, known = np.stack([value for value, _ in pairs], axis=1), np.stack([sure for _, sure in pairs], axis=1)
         wrong = (found[:, None] != self.joint).sum(axis=2)  # [N, K]
         return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
@@ -84,18 +90,22 @@ class Factor(NamedTuple):
 
 def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
     """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
-    shapes = contours(relative(frames))
-    pairs = [factor.read(shapes) for factor in factors]
+    images = relative(frames)
+    shapes = contours(images)
+    pairs = [factor.read(images, shapes) for factor in factors]
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
-def find(frames: Frame) -> list[Factor]:
-    """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes."""
+def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
+    """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes.
+
+    ``begins``: which are the first of an episode, (N,); none if not given.
+    """
     images = relative(frames)
     shapes = contours(images)
-    parts = _parts(changes(images), shapes)
+    parts = _parts(images, shapes, np.zeros(len(frames), dtype=np.bool_) if begins is None else begins)
     factors: list[tuple[tuple[Part, ...], Codes]]
-    factors = [((part,), part.read(shapes)[0][:, None]) for part in parts]
+    factors = [((part,), part.read(images, shapes)[0][:, None]) for part in parts]
     while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
         one, other = pair
         (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
@@ -103,19 +113,53 @@ def find(frames: Frame) -> list[Factor]:
     return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
 
-def _parts(change: Mask, shapes: Images) -> list[Part]:
-    """Regions that have values; of one of which hardly a look is seen twice, those of its pixels that mostly rest."""
-    times, share = _CHANGES
-    often = change.sum(axis=0) >= max(times, share * len(change))
-    parts, noise = [], np.zeros_like(often)
-    for mask in regions(change, often):
-        part, singles = _part(shapes, mask)
+def _parts(images: Images, shapes: Images, begins: Mask) -> list[Part]:
+    """Regions that have values; of one of which hardly a look is seen twice, those that hide its noise."""
+    change = changes(images)
+    parts, noise = [], np.zeros(change.shape[1:], dtype=np.bool_)
+    for mask in regions(change, _often(change, begins)):
+        part, singles = _part(images, shapes, mask)
         noise |= mask & (singles > _NOISE)
         parts += [part] if part is not None and singles <= _NOISE else []
     if noise.any():
-        found = [_part(shapes, mask) for mask in regions(change, noise & (change.mean(axis=0) < _RESTS))]
-        parts += [part for part, singles in found if part is not None and singles <= _NOISE]
+        rests = _resting(images, change, noise)
+        still = quiet(images, rests)
+        change, shapes = changes(still), contours(still)
+        found = [_part(still, shapes, mask) for mask in regions(change, noise & _often(change, begins))]
+        parts += [part._replace(rests=rests) for part, singles in found if part is not None and singles <= _NOISE]
     return parts
+
+
+def _often(change: Mask, begins: Mask) -> Mask:
+    """Pixels (64, 64) that change in enough of the steps (N - 1, 64, 64), or of those to the first of an episode."""
+    of = ((change, _CHANGES), (change[begins[1:]], _STARTS))
+    return np.any([steps.sum(axis=0) >= max(least, share * len(steps)) for steps, (least, share) in of], axis=0)
+
+
+def _resting(images: Images, change: Mask, noise: Mask) -> Images:
+    """Colors that each pixel of ``noise`` (64, 64) shows often, and then mostly for a while; see :func:`quiet`."""
+    colors, left = images[:-1, noise], ~change[:, noise]  # [N - 1, pixels, 3], [N - 1, pixels]
+    rests = np.full((_COLORS, *images.shape[1:]), np.nan, dtype=np.float32)
+    for each in rests:
+        one = np.take_along_axis(colors, left.argmax(axis=0)[None, :, None], axis=0)
+        like = (np.abs(colors - one) <= _CHANGE).all(axis=-1)
+        share, again = like.mean(axis=0), (like[1:] & like[:-1]).sum(axis=0) / np.maximum(like[:-1].sum(axis=0), 1)
+        kept = (share >= _USUAL) | (share >= _RESTS) & (again >= share + _STAYS * (1.0 - share))
+        each[noise] = np.where(kept[:, None], one[0], np.inf)
+        left &= ~like
+    return rests
+
+
+def quiet(images: Images, rests: Images) -> Images:
+    """Images (N, 64, 64, 3) with nothing in place of noise.
+
+    ``rests``: colors (K, 64, 64, 3) that a pixel may keep, infinite where it has fewer, no numbers beside the noise.
+    """
+    noise = ~np.isnan(rests[0, ..., 0])
+    colors, shown = images[:, noise], np.ones(images.shape[:3], dtype=np.bool_)
+    shown[:, noise] = np.any([(np.abs(colors - one[noise]) <= _CHANGE).all(axis=-1) for one in rests], axis=0)
+    shown |= scipy.ndimage.binary_closing(shown, np.ones((1, 3, 3)))
+    return np.where(shown[..., None], images, np.float32(_NOTHING))
 
 
 def _numbers(joint: Codes) -> NDArray[np.int64]:
@@ -200,9 +244,9 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
     pieces = np.full(pixels.shape, -1)
     pieces[pixels] = label
     large = np.flatnonzero(np.bincount(label) >= _LEAST_PX)
-    whole, count = scipy.ndimage.label(pixels, np.ones((3, 3)))
+    whole, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(pixels), np.ones((3, 3)))
     found = []
-    for mask in (whole == index + 1 for index in range(count)):
+    for mask in (pixels & (whole == index + 1) for index in range(count)):
         inside = np.intersect1d(large, pieces[mask])
         parted = [pieces == piece for piece in inside]
         found += parted if sum(map(np.sum, parted)) >= _MOST * mask.sum() else [mask]
@@ -233,7 +277,7 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
-def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
+def _part(images: Images, shapes: Images, mask: Mask) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
     energy = (own**2).sum(axis=1)
@@ -245,7 +289,7 @@ def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
         rows = _exemplars(apart, values)
         part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
         singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
-        strange = np.setdiff1d(np.flatnonzero(~part.read(shapes)[1]), chosen)
+        strange = np.setdiff1d(np.flatnonzero(~part.read(images, shapes)[1]), chosen)
         if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
             return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])
