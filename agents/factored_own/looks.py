@@ -116,17 +116,17 @@ def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
 def _parts(images: Images, shapes: Images, begins: Mask) -> list[Part]:
     """Regions that have values; of one of which hardly a look is seen twice, those that hide its noise."""
     change = changes(images)
-    parts, noise = [], np.zeros(change.shape[1:], dtype=np.bool_)
-    for mask in regions(change, _often(change, begins)):
-        part, singles = _part(images, shapes, mask)
-        noise |= mask & (singles > _NOISE)
-        parts += [part] if part is not None and singles <= _NOISE else []
+    often = _often(change, begins)
+    found = [(mask, *_part(images, shapes, mask)) for mask in regions(change, often)]
+    noise = np.any([mask & (singles > _NOISE) for mask, _, singles in found] or [often & False], axis=0)
+    noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # what hangs together with it, too
+    parts = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
     if noise.any():
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
         change, shapes = changes(still), contours(still)
-        found = [_part(still, shapes, mask) for mask in regions(change, noise & _often(change, begins))]
-        parts += [part._replace(rests=rests) for part, singles in found if part is not None and singles <= _NOISE]
+        seen = [_part(still, shapes, mask) for mask in regions(change, noise & _often(change, begins))]
+        parts += [part._replace(rests=rests) for part, singles in seen if part is not None and singles <= _NOISE]
     return parts
 
 
