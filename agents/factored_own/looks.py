@@ -5,9 +5,12 @@ crops of a factor are alike if the brightness gradients of one, shifted by a few
 are groups of crops (average linkage) below the widest gap among the heights at which groups merge. Tints, brightness
 and the jitter of a pose change neither. A crop that is like no exemplar of its factor has no known value.
 
-Sources: frame differences as motion segments (Jain & Nagel 1979); normalised cross-correlation of gradients (Lewis
-1995; Scharstein 1994); average linkage (Sokal & Michener 1958). Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a
-crop.
+Where hardly a look is seen twice there is noise: of each pixel only colors that are usual or stay are seen, so that
+what stands in front of noise is a factor as any.
+
+Sources: frame differences as motion segments (Jain & Nagel 1979); a few usual colors a pixel (Stauffer & Grimson 1999);
+normalised cross-correlation of gradients (Lewis 1995; Scharstein 1994); average linkage (Sokal & Michener 1958).
+Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a crop.
 """
 
 from __future__ import annotations

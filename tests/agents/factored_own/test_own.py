@@ -84,6 +84,34 @@ def test_noise_in_view_is_no_factor_and_hides_none() -> None:
     assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
 
 
+def test_what_stands_in_front_of_noise_is_seen() -> None:
+    """A bar all in front of a screen of noise, at one of three places in an episode of six frames."""
+    rng = np.random.default_rng(0)
+    places = np.repeat(rng.integers(3, size=40), 6)
+    frames = np.full((240, 64, 64, 3), 120, dtype=np.uint8)
+    frames[:, 4:36, 8:56] = rng.integers(256, size=(240, 8, 12, 3)).repeat(4, axis=1).repeat(4, axis=2)
+    for frame, place in zip(frames, places, strict=True):
+        frame[8:32, 12 + 14 * place : 20 + 14 * place] = (200, 150, 120)
+    found = looks.find(frames[:120])
+    codes, known = looks.read(found, frames)
+    assert codes.shape == (240, 1) and known.mean() > 0.98
+    assert len(set(zip(codes[:, 0].tolist(), places.tolist(), strict=True))) == len(found[0].joint) == 3
+
+
+def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
+    """A mark at one of four places at the start of episodes of 25 frames: seldom in all, but often there."""
+    rng = np.random.default_rng(0)
+    places = np.repeat(rng.permutation(np.arange(24) % 4), 25)
+    frames = np.full((600, 64, 64, 3), 120, dtype=np.uint8)
+    for frame, place in zip(frames, places, strict=True):
+        frame[20:32, 8 + 12 * place : 16 + 12 * place] = 220
+    begins = np.arange(600) % 25 == 0
+    assert looks.find(frames) == [], "no pixel changes in 3 % of all steps"
+    codes, _ = looks.read(looks.find(frames, begins), frames)
+    pairs = set(zip(map(tuple, codes.tolist()), places.tolist(), strict=True))
+    assert len(pairs) == len({code for code, _ in pairs}) == len(set(places.tolist())) == 4
+
+
 def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
     """Where most crops of a region have no contour at all."""
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
