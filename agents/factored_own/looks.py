@@ -70,9 +70,8 @@ class Part(NamedTuple):
     reach: float  #: distance beyond which a crop is like no exemplar
     rests: Images | None = None  #: where it is in front of noise, what :func:`quiet` needs. Shape (K, 64, 64, 3).
 
-    def read(self, images: Images, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
-        """The value that each of N images, with these contours, shows, and whether it is known. Two arrays (N,)."""
-        shapes = shapes if self.rests is None else contours(quiet(images, self.rests))
+    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+        """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""
         apart = distances(crops(shapes, self.mask), self.exemplars, self.mask, self.flat)
         return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
 
@@ -83,9 +82,9 @@ class Factor(NamedTuple):
     parts: tuple[Part, ...]
     joint: Codes
 
-    def read(self, images: Images, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
-        """As of a part; of joint values that were not seen, the one that differs in the fewest parts."""
-        pairs = [part.read(images, shapes) for part in self.parts]
+    def read(self, shapes: Images, still: Images) -> tuple[NDArray[np.int64], Mask]:
+        """As of a part, ``still``: without noise; of joint values not seen the one that differs in the fewest parts."""
+        pairs = [part.read(shapes if part.rests is None else still) for part in self.parts]
         found, known = np.stack([value for value, _ in pairs], axis=1), np.stack([sure for _, sure in pairs], axis=1)
         wrong = (found[:, None] != self.joint).sum(axis=2)  # [N, K]
         return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
@@ -95,7 +94,9 @@ def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
     """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
     images = relative(frames)
     shapes = contours(images)
-    pairs = [factor.read(images, shapes) for factor in factors]
+    rests = next((part.rests for factor in factors for part in factor.parts if part.rests is not None), None)
+    still = shapes if rests is None else contours(quiet(images, rests))
+    pairs = [factor.read(shapes, still) for factor in factors]
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
@@ -108,7 +109,7 @@ def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
     shapes = contours(images)
     parts = _parts(images, shapes, np.zeros(len(frames), dtype=np.bool_) if begins is None else begins)
     factors: list[tuple[tuple[Part, ...], Codes]]
-    factors = [((part,), part.read(images, shapes)[0][:, None]) for part in parts]
+    factors = [((part,), values[:, None]) for part, values in parts]
     while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
         one, other = pair
         (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
@@ -116,20 +117,22 @@ def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
     return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
 
-def _parts(images: Images, shapes: Images, begins: Mask) -> list[Part]:
-    """Regions that have values; of one of which hardly a look is seen twice, those that hide its noise."""
+def _parts(images: Images, shapes: Images, begins: Mask) -> list[tuple[Part, NDArray[np.int64]]]:
+    """Regions that have values, and those (N,); where hardly a look is seen twice, those that hide the noise."""
     change = changes(images)
     often = _often(change, begins)
-    found = [(mask, *_part(images, shapes, mask)) for mask in regions(change, often)]
+    found = [(mask, *_part(shapes, mask)) for mask in regions(change, often)]
     noise = np.any([mask & (singles > _NOISE) for mask, _, singles in found] or [often & False], axis=0)
     noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # what hangs together with it, too
-    parts = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
+    seen = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
+    parts = [(part, part.read(shapes)[0]) for part in seen]
     if noise.any():
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
         change, shapes = changes(still), contours(still)
-        seen = [_part(still, shapes, mask) for mask in regions(change, noise & _often(change, begins))]
-        parts += [part._replace(rests=rests) for part, singles in seen if part is not None and singles <= _NOISE]
+        hiding = [_part(shapes, mask) for mask in regions(change, noise & _often(change, begins))]
+        seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
+        parts += [(part, part.read(shapes)[0]) for part in seen]
     return parts
 
 
@@ -229,7 +232,8 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
 
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does, and
     in each half of the time, too, where it tells. Else a habit of the agent, kept for a while, would bind two things.
-    Pixels that hang together are parted so only if most of them are in a region then; else they are one.
+    Pixels that hang together, up to two pixels apart, are parted so only if most of them are in a region then; else
+    they are one.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
@@ -280,7 +284,7 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
-def _part(images: Images, shapes: Images, mask: Mask) -> tuple[Part | None, float]:
+def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
     energy = (own**2).sum(axis=1)
@@ -292,7 +296,7 @@ def _part(images: Images, shapes: Images, mask: Mask) -> tuple[Part | None, floa
         rows = _exemplars(apart, values)
         part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
         singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
-        strange = np.setdiff1d(np.flatnonzero(~part.read(images, shapes)[1]), chosen)
+        strange = np.setdiff1d(np.flatnonzero(~part.read(shapes)[1]), chosen)
         if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
             return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])

@@ -98,6 +98,15 @@ def test_what_stands_in_front_of_noise_is_seen() -> None:
     assert len(set(zip(codes[:, 0].tolist(), places.tolist(), strict=True))) == len(found[0].joint) == 3
 
 
+def test_pieces_that_hardly_part_are_one_factor() -> None:
+    """Two bars two pixels apart, each too small for a factor, of which never one follows the other at once."""
+    shown = np.where(np.arange(60) % 2, np.random.default_rng(0).integers(1, 3, size=60), 0)
+    frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
+    frames[shown == 1, 20:31, 20:22] = frames[shown == 2, 20:22, 24:35] = 220
+    codes, _ = looks.read(looks.find(frames), frames)
+    assert codes.shape == (60, 1) and len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == 3
+
+
 def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     """A mark at one of four places at the start of episodes of 25 frames: seldom in all, but often there."""
     rng = np.random.default_rng(0)
