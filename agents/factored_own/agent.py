@@ -44,6 +44,8 @@ class OwnPerception:
         """Frames before and after of each transition, as long as all are remembered."""
         self.begins: list[bool] = []
         """Whether each of these is the first of an episode."""
+        self.actions: list[int] = []
+        """The macro-action of each."""
         self.found: list[looks.Factor] = []
         self.memory: Memory | None = None
         self.found_in = self.looked_at = 0
@@ -107,13 +109,14 @@ class OwnPerception:
             codes = np.ravel_multi_index(tuple(codes.T), [len(factor.joint) for factor in self.found])[:, None]
         return [tuple(code) for code in codes.tolist()], known
 
-    def remember(self, before: Frame, after: Frame, *, begins: bool = False) -> None:
-        """Remember a transition's frames; one that begins where the last one ended costs one frame."""
+    def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
+        """Remember a transition; one that begins where the last one ended costs one frame."""
         new = [after] if self.frames and np.array_equal(self.frames[-1], before) else [before, after]
         self.frames += [frame.copy() for frame in new]
         self.unknown |= not all(self._read(frame)[1] for frame in new)
         self.transitions.append((len(self.frames) - 2, len(self.frames) - 1))
         self.begins.append(begins)
+        self.actions.append(action)
 
     def renew(self) -> bool:
         """Look for factors anew if it is time; whether codes may now be others."""
@@ -129,10 +132,14 @@ class OwnPerception:
         self.take(looks.find(*self.first(count)) if count else [], count)
         self.looked_at, self.unknown = count, False
 
-    def first(self, count: int) -> tuple[Frame, NDArray[np.bool_]]:
-        """The first ``count`` frames (N, 64, 64, 3) remembered, and which are the first of an episode (N,)."""
+    def first(self, count: int) -> tuple[Frame, NDArray[np.bool_], NDArray[np.int64]]:
+        """The first ``count`` frames remembered, which begin an episode, and what was done then: as ``find`` asks."""
         begins = np.isin(np.arange(count), [before for before, _ in compress(self.transitions, self.begins)])
-        return np.stack(self.frames[:count]), begins
+        actions = np.full(count, -1)
+        for (before, after), action in zip(self.transitions, self.actions, strict=True):
+            if after < count:
+                actions[before] = action
+        return np.stack(self.frames[:count]), begins, actions
 
     def take(self, found: list[looks.Factor], found_in: int) -> None:
         """See these factors from now on."""
@@ -147,6 +154,7 @@ class OwnPerception:
             "replay/frames": seen,
             "replay/frame_pairs": pairs,
             "replay/begins": np.array(self.begins, dtype=np.bool_),
+            "replay/done": np.array(self.actions, dtype=np.int64),
         }
 
     def values(self) -> dict[str, Any]:
@@ -159,7 +167,7 @@ class OwnPerception:
         """Take up what :meth:`arrays` and :meth:`values` gave: find the same factors in the same frames."""
         self.frames = list(state.arrays["replay/frames"])
         self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
-        self.begins = state.arrays["replay/begins"].tolist()
+        self.begins, self.actions = (state.arrays[f"replay/{name}"].tolist() for name in ("begins", "done"))
         self.look(state.values["found_in"])
         self.looked_at, self.unknown = state.values["looked_at"], state.values["unknown"]
         memory, self.history = state.values["memory"], list(state.values["history"])
@@ -202,10 +210,11 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
             self._longest = max(self._acted, self._longest or 0)
         if not eyes.full:
             with self.meters.cpu_time("time/perception_s"):
-                eyes.remember(transition.observation.frame, transition.next_observation.frame, begins=self._acted <= 1)
-                before = (eyes.found, eyes.found_in)
+                before, after = transition.observation.frame, transition.next_observation.frame
+                eyes.remember(before, transition.action, after, begins=self._acted <= 1)
+                found = (eyes.found, eyes.found_in)
                 if eyes.renew():
-                    self._recode(*before)
+                    self._recode(*found)
                     eyes.history += [eyes.found_in] if eyes.found_in not in eyes.history else []
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
@@ -248,10 +257,10 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         """What it saw whenever that changed; see :class:`imagine_bench.capabilities.SeeingLearner`."""
         eyes = self.perception
         for count in eyes.history:
-            frames, begins = eyes.first(count)
-            found = looks.find(frames, begins)
+            seen = eyes.first(count)
+            found = looks.find(*seen)
             begun = sum(compress(eyes.begins, [after < count for _, after in eyes.transitions]))
-            yield Perceived(begun, tuple(len(factor.joint) for factor in found), picture(found, frames))
+            yield Perceived(begun, tuple(len(factor.joint) for factor in found), picture(found, seen[0]))
 
     def diagnostics(self) -> dict[str, float]:
         """Also what it sees."""

@@ -2,13 +2,15 @@
 
 *Where*: pixels that change from one frame to the next, again and again, and hang together are one factor. *What*: two
 crops of a factor are alike if the brightness gradients of one, shifted by a few pixels, are those of the other; values
-are groups of crops (average linkage) below the widest gap among the heights at which groups merge. Tints, brightness
-and the jitter of a pose change neither. A crop that is like no exemplar of its factor has no known value.
+are groups of crops (average linkage) below the widest gap among the heights at which groups merge, or below the next
+one if that tells much better what follows an action. Tints, brightness and the jitter of a pose change neither. A crop
+that is like no exemplar of its factor has no known value.
 
 Where hardly a look is seen twice there is noise: of each pixel only colors that are usual or stay are seen, so that
 what stands in front of noise is a factor as any.
 
 Sources: frame differences as motion segments (Jain & Nagel 1979); a few usual colors a pixel (Stauffer & Grimson 1999);
+states split where that predicts better (McCallum 1996); a table's marginal likelihood (Cooper & Herskovits 1992);
 normalised cross-correlation of gradients (Lewis 1995; Scharstein 1994); average linkage (Sokal & Michener 1958).
 Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a crop.
 """
@@ -35,9 +37,11 @@ _CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no
 _CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change to belong to a factor
 _STARTS = (3, 0.2)  # the same of the starts of episodes: what no action changes may change there alone
 _LEAST_PX = 36  # pixels of a factor
+_LEAST_INNER_PX = 16  # the same of what is all in the inner of the picture: at its border, slivers come into view
 _FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
 _SAME, _OTHER = 0.15, 0.2  # distance that jitter makes; the least distance of two values
 _ROUND = 0.05  # added to heights where gaps are compared by their ratio
+_EVIDENCE = 10.0  # how much more likely, as a logarithm, finer values must make what follows
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
@@ -56,6 +60,7 @@ _NEIGHBOURS = (
     ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
 )  # fmt: skip
 """Pairs of neighbouring pixels: to the right, below, and both diagonals."""
+_INNER = (slice(2, -2), slice(2, -2))
 _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
@@ -100,14 +105,17 @@ def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
-def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
+def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] | None = None) -> list[Factor]:
     """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes.
 
-    ``begins``: which are the first of an episode, (N,); none if not given.
+    ``begins``: which are the first of an episode, (N,); none if not given. ``actions``: which led from each frame to
+    the next, (N,), negative where none did; unknown if not given.
     """
     images = relative(frames)
     shapes = contours(images)
-    parts = _parts(images, shapes, np.zeros(len(frames), dtype=np.bool_) if begins is None else begins)
+    begins = np.zeros(len(frames), dtype=np.bool_) if begins is None else begins
+    actions = np.full(len(frames), -1) if actions is None else actions
+    parts = _parts(images, shapes, begins, actions)
     factors: list[tuple[tuple[Part, ...], Codes]]
     factors = [((part,), values[:, None]) for part, values in parts]
     while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
@@ -117,11 +125,13 @@ def find(frames: Frame, begins: Mask | None = None) -> list[Factor]:
     return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
 
-def _parts(images: Images, shapes: Images, begins: Mask) -> list[tuple[Part, NDArray[np.int64]]]:
+def _parts(
+    images: Images, shapes: Images, begins: Mask, actions: NDArray[np.int64]
+) -> list[tuple[Part, NDArray[np.int64]]]:
     """Regions that have values, and those (N,); where hardly a look is seen twice, those that hide the noise."""
     change = changes(images)
     often = _often(change, begins)
-    found = [(mask, *_part(shapes, mask)) for mask in regions(change, often)]
+    found = [(mask, *_part(shapes, mask, actions)) for mask in regions(change, often)]
     noise = np.any([mask & (singles > _NOISE) for mask, _, singles in found] or [often & False], axis=0)
     noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # what hangs together with it, too
     seen = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
@@ -130,7 +140,7 @@ def _parts(images: Images, shapes: Images, begins: Mask) -> list[tuple[Part, NDA
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
         change, shapes = changes(still), contours(still)
-        hiding = [_part(shapes, mask) for mask in regions(change, noise & _often(change, begins))]
+        hiding = [_part(shapes, mask, actions) for mask in regions(change, noise & _often(change, begins))]
         seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
         parts += [(part, part.read(shapes)[0]) for part in seen]
     return parts
@@ -257,7 +267,8 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
         inside = np.intersect1d(large, pieces[mask])
         parted = [pieces == piece for piece in inside]
         found += parted if sum(map(np.sum, parted)) >= _MOST * mask.sum() else [mask]
-    return sorted((mask for mask in found if mask.sum() >= _LEAST_PX), key=np.sum, reverse=True)
+    least = [_LEAST_PX if mask[_INNER].sum() < mask.sum() else _LEAST_INNER_PX for mask in found]
+    return sorted((mask for mask, few in zip(found, least, strict=True) if mask.sum() >= few), key=np.sum, reverse=True)
 
 
 def crops(shapes: Images, mask: Mask) -> Images:
@@ -284,7 +295,7 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
-def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
+def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
     energy = (own**2).sum(axis=1)
@@ -292,24 +303,45 @@ def _part(shapes: Images, mask: Mask) -> tuple[Part | None, float]:
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
     while True:
         apart = distances(own[chosen], own[chosen], mask, flat)
+        acted = actions[chosen] >= 0
         values, reach = groups(np.minimum(apart, apart.T))
-        rows = _exemplars(apart, values)
-        part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
+        while True:
+            rows = _exemplars(apart, values)
+            part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
+            found, known = part.read(shapes)
+            finer, below = groups(np.minimum(apart, apart.T), reach)
+            after = (actions[chosen[acted]], found[chosen[acted] + 1])
+            if below >= reach or follows(finer[acted], *after) < follows(values[acted], *after) + _EVIDENCE:
+                break
+            values, reach = finer, below
         singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
-        strange = np.setdiff1d(np.flatnonzero(~part.read(shapes)[1]), chosen)
+        strange = np.setdiff1d(np.flatnonzero(~known), chosen)
         if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
             return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])
 
 
-def groups(apart: Floats) -> tuple[NDArray[np.int64], float]:
-    """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them."""
+def follows(values: NDArray[np.int64], actions: NDArray[np.int64], following: NDArray[np.int64]) -> float:
+    """Logarithm of how likely values and actions (N,) make the values after them, all tables being alike before."""
+    contexts = np.unique(np.stack([values, actions]), axis=1, return_inverse=True)[1].ravel()
+    table = np.zeros((contexts.max(initial=-1) + 1, following.max(initial=0) + 1))
+    np.add.at(table, (contexts, following), 1.0)
+    log = scipy.special.gammaln
+    width = table.shape[1]
+    return float(log(table + 1.0).sum() + (log(width) - log(width + table.sum(axis=1))).sum())
+
+
+def groups(apart: Floats, below: float = np.inf) -> tuple[NDArray[np.int64], float]:
+    """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them.
+
+    Gaps ``below`` a distance count alone; where none does, all crops that may be alike are.
+    """
     if len(apart) < 2:
         return np.zeros(len(apart), dtype=np.int64), _OTHER
     tree = scipy.cluster.hierarchy.linkage(apart[np.triu_indices(len(apart), 1)], "average")
     heights = np.concatenate([[_SAME], np.maximum(tree[:, 2], _SAME)])
     ratio = (heights[1:] + _ROUND) / (heights[:-1] + _ROUND)
-    ratio[heights[1:] < _OTHER] = 0.0
+    ratio[(heights[1:] < _OTHER) | (heights[1:] >= below)] = 0.0
     gap = int(ratio.argmax())
     cut = float(np.sqrt(heights[gap] * heights[gap + 1])) if ratio[gap] > 0.0 else max(_OTHER, float(heights[-1]))
     label = scipy.cluster.hierarchy.fcluster(tree, cut, "distance")

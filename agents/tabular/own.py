@@ -26,8 +26,8 @@ class OwnCountTableAgent(CountTableAgent):
     def __init__(self, n_actions: int, settings: OwnCountTableSettings, seeds: SeedTree) -> None:
         self.eyes = OwnPerception(settings.perception, factored=False)
         super().__init__(self._see, n_actions, settings, seeds, directed=True)
-        self._happened: list[tuple[int, float, bool]] = []
-        """Action, reward and end of every remembered transition."""
+        self._happened: list[tuple[float, bool]] = []
+        """Reward and end of every remembered transition."""
 
     def _see(self, observation: Observation) -> int:
         return self.eyes.code(observation.frame)[0]
@@ -36,18 +36,20 @@ class OwnCountTableAgent(CountTableAgent):
         """Remember what was seen, see anew if that is due, and count."""
         eyes = self.eyes
         if not eyes.full:
-            eyes.remember(transition.observation.frame, transition.next_observation.frame)
+            eyes.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
             if eyes.renew():
                 self._recount()
-            self._happened.append((transition.action, transition.reward, transition.terminated))
+            self._happened.append((transition.reward, transition.terminated))
         super().observe(transition, episode=episode)
 
     def _recount(self) -> None:
         """Count every remembered transition by the codes that its frames have now."""
         self.table.clear()
         self._plans.clear()
-        codes, _ = self.eyes.codes(np.stack(self.eyes.frames))
-        for (before, after), (action, reward, terminated) in zip(self.eyes.transitions, self._happened, strict=False):
+        eyes = self.eyes
+        codes, _ = eyes.codes(np.stack(eyes.frames))
+        happened = zip(eyes.transitions, eyes.actions, self._happened, strict=False)
+        for (before, after), action, (reward, terminated) in happened:
             self.table.add(codes[before][0], action, codes[after][0], reward, terminated)
 
     def diagnostics(self) -> dict[str, float]:
@@ -56,8 +58,8 @@ class OwnCountTableAgent(CountTableAgent):
 
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
-        common, columns = super().state(), zip(*self._happened, strict=True) if self._happened else [()] * 3
-        kinds = {"action": np.int64, "reward": np.float64, "terminated": np.bool_}
+        common, columns = super().state(), zip(*self._happened, strict=True) if self._happened else [()] * 2
+        kinds = {"reward": np.float64, "terminated": np.bool_}
         happened: snapshot.Arrays = {
             f"replay/{name}": np.array(column, dtype=kind)
             for (name, kind), column in zip(kinds.items(), columns, strict=True)
@@ -69,7 +71,7 @@ class OwnCountTableAgent(CountTableAgent):
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
         self.eyes.load(state)
-        columns = (state.arrays[f"replay/{name}"].tolist() for name in ("action", "reward", "terminated"))
+        columns = (state.arrays[f"replay/{name}"].tolist() for name in ("reward", "terminated"))
         self._happened = list(zip(*columns, strict=True))
 
 

@@ -182,9 +182,9 @@ def test_what_was_seen_is_kept_where_outcomes_contradict_what_is_seen_anew(
     assert learner.perception.sizes == (3, 3, 2)
     found, find = [], own.looks.find
 
-    def blind(frames: Frame, begins: NDArray[np.bool_]) -> list[own.looks.Factor]:
+    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.looks.Factor]:
         found.append(len(frames))
-        return [factor for factor in find(frames, begins) if len(factor.joint) == 3]
+        return [factor for factor in find(frames, begins, actions) if len(factor.joint) == 3]
 
     monkeypatch.setattr(own.looks, "find", blind)
     monkeypatch.setattr(own, "_CONTRADICTIONS", allowed)

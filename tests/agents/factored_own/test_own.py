@@ -107,6 +107,44 @@ def test_pieces_that_hardly_part_are_one_factor() -> None:
     assert codes.shape == (60, 1) and len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == 3
 
 
+@pytest.mark.parametrize(("top", "found"), [(30, 1), (0, 0), (59, 0)])
+def test_a_small_thing_is_a_factor_unless_the_border_cuts_it(top: int, found: int) -> None:
+    """Five by five pixels; what comes into view at the border is as small, and no thing."""
+    frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
+    frames[np.random.default_rng(0).random(60) < 0.5, top : top + 5, 30:35] = 220
+    assert len(looks.find(frames)) == found
+
+
+@pytest.mark.parametrize(("matters", "told"), [(True, True), (True, False), (False, True)])
+def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: bool, told: bool) -> None:
+    """Three marks in a ring, of which macro-actions show the next or the last; two are nearly alike.
+
+    They are one value if no action is known, or if it is chance which of them is shown (then there are two in truth).
+    """
+    rng = np.random.default_rng(0)
+    actions = rng.integers(2, size=120)
+    place = np.concatenate([[0], np.where(actions[:-1] > 0, 1, -1).cumsum()]) % (3 if matters else 2)
+    shown = place if matters else np.where(place == 1, 2, rng.integers(2, size=120))
+    frames = np.full((120, 64, 64, 3), 120, dtype=np.uint8)
+    frames[shown < 2, 20:40, 27:33] = frames[shown == 1, 20:29, 33:41] = frames[shown == 2, 28:34, 20:40] = 220
+    actions[-1] = -1
+    found = looks.find(frames, None, actions if told else None)
+    codes, _ = looks.read(found, frames)
+    parted = len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == len(found[0].joint) == 3
+    assert parted == (matters and told)
+
+
+def test_how_likely_values_make_what_follows_is_a_product_of_predictions() -> None:
+    """Laplace's rule, one after the other: (1 + times seen so far) / (values + times of that context so far)."""
+    rng = np.random.default_rng(0)
+    values, actions, following = rng.integers(3, size=(3, 40))
+    product, seen = 1.0, np.zeros((3, 3, 3))
+    for value, action, after in zip(values, actions, following, strict=True):
+        product *= (1.0 + seen[value, action, after]) / (3.0 + seen[value, action].sum())
+        seen[value, action, after] += 1.0
+    assert looks.follows(values, actions, following) == pytest.approx(np.log(product))
+
+
 def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     """A mark at one of four places at the start of episodes of 25 frames: seldom in all, but often there."""
     rng = np.random.default_rng(0)
@@ -290,3 +328,16 @@ def test_it_can_show_how_it_learned_to_see() -> None:
         for part in factor.parts:
             mask |= part.mask
     assert np.array_equal(np.ptp(gray, axis=2) > 0, mask), "colored where something is told apart, gray elsewhere"
+
+
+def test_what_was_done_is_remembered_with_its_frames() -> None:
+    learner, episodes = agent(), 6
+    taken = live(learner, range(episodes), seed=0)
+    resumed = agent(seed=5)
+    resumed.restore(learner.state())
+    for eyes in (learner.perception, resumed.perception):
+        _, begins, actions = eyes.first(len(eyes.frames))
+        assert actions[actions >= 0].tolist() == taken
+        assert begins.sum() == (actions < 0).sum() == episodes, "nothing was done in an episode's last frame"
+        assert (actions[:-1][begins[1:]] < 0).all() and actions[-1] < 0
+        assert eyes.first(8)[2][-1] < 0, "what leads to a later frame is none of the first"
