@@ -302,14 +302,14 @@ def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part 
     flat = _FLAT * float(np.quantile(energy, 0.9) or energy.max() or 1.0)
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
     while True:
-        apart = distances(own[chosen], own[chosen], mask, flat)
-        acted = actions[chosen] >= 0
-        values, reach = groups(np.minimum(apart, apart.T))
+        apart, acted = distances(own[chosen], own[chosen], mask, flat), actions[chosen] >= 0
+        either_way = np.minimum(apart, apart.T)
+        values, reach = groups(either_way)
         while True:
             rows = _exemplars(apart, values)
             part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
             found, known = part.read(shapes)
-            finer, below = groups(np.minimum(apart, apart.T), reach)
+            finer, below = groups(either_way, reach)
             after = (actions[chosen[acted]], found[chosen[acted] + 1])
             if below >= reach or follows(finer[acted], *after) < follows(values[acted], *after) + _EVIDENCE:
                 break
@@ -334,7 +334,7 @@ def follows(values: NDArray[np.int64], actions: NDArray[np.int64], following: ND
 def groups(apart: Floats, below: float = np.inf) -> tuple[NDArray[np.int64], float]:
     """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them.
 
-    Gaps ``below`` a distance count alone; where none does, all crops that may be alike are.
+    Only gaps ``below`` a distance count; where there is none, all are one group.
     """
     if len(apart) < 2:
         return np.zeros(len(apart), dtype=np.int64), _OTHER
