@@ -69,9 +69,9 @@ class MemoryReader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """What an agent saw after some training episodes."""
+    """What an agent saw at some time of its training."""
 
-    episodes: int
+    episodes: int  #: training episodes that had begun
     sizes: tuple[int, ...]  #: numbers of values of what it told apart
     picture: NDArray[np.uint8]  #: for people. Shape (H, W, 3).
 

@@ -60,7 +60,7 @@ _NEIGHBOURS = (
     ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
 )  # fmt: skip
 """Pairs of neighbouring pixels: to the right, below, and both diagonals."""
-_INNER = (slice(2, -2), slice(2, -2))
+_INNER = (slice(2, -2), slice(2, -2))  # rows and columns that are not the border's
 _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 

@@ -138,7 +138,7 @@ class _EpisodeRecorder:
             return
         for seen in self._agent.perceived():
             values = f"{len(seen.sizes)} things, of {', '.join(map(str, seen.sizes))} values"
-            told = f"After {seen.episodes} training episodes it tells apart {values if seen.sizes else 'nothing yet'}."
+            told = f"In training episode {seen.episodes} it tells apart {values if seen.sizes else 'nothing yet'}."
             self._recording.text("/real/text", told)
             self._recording.sheet("/seen/factors", seen.picture)
             self._clock_s += _STILL_S
