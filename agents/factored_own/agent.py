@@ -154,7 +154,6 @@ class OwnPerception:
             "replay/frames": seen,
             "replay/frame_pairs": pairs,
             "replay/begins": np.array(self.begins, dtype=np.bool_),
-            "replay/done": np.array(self.actions, dtype=np.int64),
         }
 
     def values(self) -> dict[str, Any]:
@@ -164,10 +163,11 @@ class OwnPerception:
         return {**counts, "unknown": self.unknown, "memory": memory}
 
     def load(self, state: AgentState) -> None:
-        """Take up what :meth:`arrays` and :meth:`values` gave: find the same factors in the same frames."""
+        """Take up what :meth:`arrays` and :meth:`values` gave, and the agent's ``replay/action``: find the same."""
         self.frames = list(state.arrays["replay/frames"])
         self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
-        self.begins, self.actions = (state.arrays[f"replay/{name}"].tolist() for name in ("begins", "done"))
+        self.begins = state.arrays["replay/begins"].tolist()
+        self.actions = state.arrays["replay/action"][: len(self.transitions)].tolist()
         self.look(state.values["found_in"])
         self.looked_at, self.unknown = state.values["looked_at"], state.values["unknown"]
         memory, self.history = state.values["memory"], list(state.values["history"])

@@ -58,11 +58,11 @@ class OwnCountTableAgent(CountTableAgent):
 
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
-        common, columns = super().state(), zip(*self._happened, strict=True) if self._happened else [()] * 2
-        kinds = {"reward": np.float64, "terminated": np.bool_}
+        common = super().state()
         happened: snapshot.Arrays = {
-            f"replay/{name}": np.array(column, dtype=kind)
-            for (name, kind), column in zip(kinds.items(), columns, strict=True)
+            "replay/action": np.array(self.eyes.actions, dtype=np.int64),
+            "replay/reward": np.array([reward for reward, _ in self._happened], dtype=np.float64),
+            "replay/terminated": np.array([ended for _, ended in self._happened], dtype=np.bool_),
         }
         arrays: snapshot.Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
         return AgentState(arrays=arrays, values={**common.values, **self.eyes.values()})

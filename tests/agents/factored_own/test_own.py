@@ -102,7 +102,7 @@ def test_pieces_that_hardly_part_are_one_factor() -> None:
     """Two bars two pixels apart, each too small for a factor, of which never one follows the other at once."""
     shown = np.where(np.arange(60) % 2, np.random.default_rng(0).integers(1, 3, size=60), 0)
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
-    frames[shown == 1, 20:31, 20:22] = frames[shown == 2, 20:22, 24:35] = 220
+    frames[shown == 1, 20:27, 20:22] = frames[shown == 2, 20:22, 24:31] = 220
     codes, _ = looks.read(looks.find(frames), frames)
     assert codes.shape == (60, 1) and len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == 3
 
