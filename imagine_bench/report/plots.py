@@ -136,7 +136,8 @@ def ladder_figure(reached: Mapping[str, Sequence[int | None]], last: int, floor:
             axes.plot(values, height + shifts, marker, color=color(agent), markersize=4.5, linestyle="none")
     if floor is not None:
         axes.axvline(floor, **_REFERENCE_LINE)
-        axes.annotate(f"information floor, {floor:.0f}", (floor, len(rungs) - 0.45), fontsize=9, ha="center")
+        name, top = f"information floor, {floor:.0f}", (floor, len(rungs) - 0.45)
+        axes.annotate(name, top, xytext=(4, 0), textcoords="offset points", fontsize=9)
     ticks = [each for each in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000) if each <= last]
     axes.set_xscale("log")
     axes.set_xticks([*ticks, beyond], [*(f"{each:,}" for each in ticks), "never"])
@@ -155,6 +156,7 @@ def plan_lengths_figure(lengths: Sequence[tuple[int, int]]) -> Figure:
     names = ["none" if length < 0 else str(length) for length, _ in lengths]
     axes.bar_label(axes.bar(names, [count for _, count in lengths], color=_COLORS[2], width=0.5), fmt="{:,.0f}")
     axes.margins(y=0.2)
+    axes.locator_params(axis="y", integer=True)
     axes.grid(visible=False, axis="x")
     axes.set(xlabel="macro-actions of the shortest plan", ylabel="starts")
     return figure
