@@ -198,8 +198,9 @@ def _uses(appearance: str) -> Iterator[Variant]:
 
 
 _UNCERTAINTY = Study(
-    name="uncertainty", question="Which use of the model's uncertainty is worth it?", budgets=(250,),
-    seeds=(1000, 1001, 1002), evaluation_episodes=300, variants=(*_uses("clean"), *_uses("mild")),
+    name="uncertainty", question="Which use of the model's uncertainty is worth it?", budgets=(250, 500),
+    seeds=tuple(range(1000, 1010)), evaluation_episodes=300, execution="kinematic",
+    variants=(*_uses("clean"), *_uses("mild")),
 )  # fmt: skip
 
 _REMARKS = _study(
