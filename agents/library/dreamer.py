@@ -1,8 +1,8 @@
 """DreamerV3 (Hafner et al. 2023) of sheeprl: its networks, losses, replay and player, an episode at a time.
 
-It sees the environment's frames and nothing else: no frame beforehand, no encoder. The library's own loop counts
-macro-actions; here its parts are called one real transition at a time, in the order of that loop, so that the bench
-counts episodes, tests greedily and takes a run up again to the bit.
+It sees the environment's frames and nothing else, or the latents that an encoder makes of them. The library's own
+loop counts macro-actions; here its parts are called one real transition at a time, in the order of that loop, so that
+the bench counts episodes, tests greedily and takes a run up again to the bit.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ from sheeprl.algos.dreamer_v3.agent import build_agent
 from sheeprl.algos.dreamer_v3.utils import Moments, prepare_obs
 from sheeprl.utils.utils import dotdict
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .. import snapshot
-from ..encoders.perception import prepare_torch
+from ..encoders.encoder import Encoder
+from ..encoders.perception import load_perception, prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .dreamer_settings import HYPERPARAMETERS, DreamerSettings
 
+_PIXELS, _LATENTS = "rgb", "latents"
 _CHANNELS_FIRST = (2, 0, 1)
 _LOSSES = {f"Loss/{name}_loss": f"loss/{name}" for name in ("world_model", "observation", "reward", "policy", "value")}
 
@@ -44,17 +47,21 @@ class Dreamer:
         n_actions: Number of macro-actions A.
         seed: Of the library's draws, which come from torch's global generator: it is lent to it, call by call.
         device: ``"cpu"`` or ``"cuda"``.
+        encoder: Whose latents it sees, or None: pixels.
     """
 
-    def __init__(self, settings: DreamerSettings, n_actions: int, seed: int, device: str) -> None:
-        self.settings, self.n_actions = settings, n_actions
-        self._config = _config(settings)
+    def __init__(
+        self, settings: DreamerSettings, n_actions: int, seed: int, device: str, encoder: Encoder | None = None
+    ) -> None:
+        self.settings, self.n_actions, self._encoder = settings, n_actions, encoder
+        self._config = _config(settings, pixels=encoder is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
+        self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
         self._random = torch.Generator().manual_seed(seed).get_state()
         self._rng = np.random.default_rng([seed, 1])
         with self._drawing():
-            seen = spaces.Dict({"rgb": spaces.Box(0, 255, (3, 64, 64), np.uint8)})
-            *learners, self._player = build_agent(self._fabric, (n_actions,), False, self._config, seen)
+            shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
+            *learners, self._player = build_agent(self._fabric, (n_actions,), False, self._config, shown)
         self._world, self._actor, self._critic, self._target = learners
         rates = settings.model_learning_rate, settings.actor_learning_rate, settings.critic_learning_rate
         self._optimisers = [
@@ -83,12 +90,13 @@ class Dreamer:
         The recurrent state takes in the frame. A test's latents are drawn from a generator of their own.
         """
         with self._drawing(test=not explore):
-            seen = prepare_obs(self._fabric, {"rgb": _picture(observation.frame)[None]}, cnn_keys=["rgb"])
+            shown = {name: array[None] for name, array in self._shown(observation.frame).items()}
+            seen = prepare_obs(self._fabric, shown, cnn_keys=[_PIXELS])
             chosen = self._player.get_actions(seen, greedy=not explore)
         if not explore or self.steps >= self.settings.learning_starts:
             return int(chosen[0].argmax())
         action = int(self._rng.integers(self.n_actions))
-        self._player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).float()
+        self._player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).to(chosen[0])
         return action
 
     def observe(self, transition: Transition, *, episode: int) -> None:
@@ -113,7 +121,13 @@ class Dreamer:
         reward, terminated, truncated = self._arrived
         scalars = {"rewards": reward, "terminated": terminated, "truncated": truncated, "is_first": self._first}
         row = {name: np.array([value], dtype=np.float32) for name, value in scalars.items()}
-        self._memory.add({"rgb": _picture(frame), "actions": action, **row})
+        self._memory.add({**self._shown(frame), "actions": action, **row})
+
+    def _shown(self, frame: Frame) -> dict[str, NDArray[Any]]:
+        """What the library sees of a frame (64, 64, 3): it with its channels first, or its latents (Z,)."""
+        if self._encoder is None:
+            return {_PIXELS: frame.transpose(_CHANNELS_FIRST)}
+        return {_LATENTS: self._encoder.latents(frame)}
 
     def _update(self) -> None:
         settings = self.settings
@@ -131,9 +145,15 @@ class Dreamer:
 
     @contextmanager
     def _drawing(self, *, test: bool = False) -> Iterator[None]:
-        """Lend torch's global generator to the library: a test's, or this learner's own."""
+        """Lend torch's global generator to the library: a test's, or this learner's own.
+
+        A graphics card's is seeded from it. Distributions are not validated, as where the library runs by itself.
+        """
         before = torch.get_rng_state()
+        Distribution.set_default_validate_args(False)
         torch.set_rng_state(self._test_random if test else self._random)
+        if self._fabric.device.type == "cuda":
+            torch.cuda.manual_seed(int(torch.randint(2**62, ())))
         try:
             yield
         finally:
@@ -143,6 +163,7 @@ class Dreamer:
             else:
                 self._random = after
             torch.set_rng_state(before)
+            Distribution.set_default_validate_args(__debug__)
 
     def diagnostics(self) -> dict[str, float]:
         """Mean losses and CPU seconds of updates a macro-action since the last call, and the counters now."""
@@ -155,7 +176,7 @@ class Dreamer:
             arrays |= snapshot.prefixed(name, snapshot.training_arrays(module, optimiser))
         for name, module in (("target", self._target), ("returns", self._moments)):
             arrays |= snapshot.prefixed(name, {k: v.cpu().numpy().copy() for k, v in module.state_dict().items()})
-        arrays |= snapshot.prefixed("replay", self._memory.arrays(self.n_actions))
+        arrays |= snapshot.prefixed("replay", self._memory.arrays(self._blank, self.n_actions))
         values = {
             "steps": self.steps, "updates": self.updates, "owed": self._owed, "meters": self.meters.state(),
             "exploration": self._rng.bit_generator.state, "settings": snapshot.jsonable(flatten(self.settings)),
@@ -219,15 +240,11 @@ class Sequences:
             for name in self._rows[0]
         }
 
-    def blank(self, n_actions: int) -> dict[str, NDArray[Any]]:
-        """Arrays of no rows, for an agent of ``n_actions`` macro-actions."""
-        scalars = {name: np.zeros((0, 1), np.float32) for name in ("rewards", "terminated", "truncated", "is_first")}
-        return {"rgb": np.zeros((0, 3, 64, 64), np.uint8), "actions": np.zeros((0, n_actions), np.float32), **scalars}
-
-    def arrays(self, n_actions: int) -> dict[str, NDArray[Any]]:
-        """All rows, by name."""
-        blank = self.blank(n_actions)
-        return {name: np.array([row[name] for row in self._rows] or none) for name, none in blank.items()}
+    def arrays(self, shown: dict[str, NDArray[Any]], n_actions: int) -> dict[str, NDArray[Any]]:
+        """All rows, by name, also where there are none: things like what is ``shown``, ``n_actions`` macro-actions."""
+        row = {**shown, "actions": np.zeros(n_actions, np.float32)}
+        row |= {name: np.zeros(1, np.float32) for name in ("rewards", "terminated", "truncated", "is_first")}
+        return {name: np.array([each[name] for each in self._rows] or array[None][:0]) for name, array in row.items()}
 
     def load(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take up the result of :meth:`arrays`."""
@@ -235,12 +252,7 @@ class Sequences:
         self._rows = [dict(zip(names, row, strict=True)) for row in zip(*(arrays[name] for name in names), strict=True)]
 
 
-def _picture(frame: Frame) -> NDArray[np.uint8]:
-    """A frame (64, 64, 3) with its channels first, as the library has them."""
-    return frame.transpose(_CHANNELS_FIRST)
-
-
-def _config(settings: DreamerSettings) -> Any:
+def _config(settings: DreamerSettings, *, pixels: bool) -> Any:
     """The library's configuration of its smallest model, with our settings in it."""
     model = settings.model
     values = {
@@ -252,6 +264,8 @@ def _config(settings: DreamerSettings) -> Any:
         "dense_units": model.units, "mlp_layers": model.layers, "horizon": settings.horizon,
         "gamma": settings.discount, "lmbda": settings.return_decay, "actor.ent_coef": settings.entropy,
         "per_rank_batch_size": settings.batch_size, "per_rank_sequence_length": settings.sequence_length,
+        **{f"cnn_keys.{part}": [_PIXELS] if pixels else [] for part in ("encoder", "decoder")},
+        **{f"mlp_keys.{part}": [] if pixels else [_LATENTS] for part in ("encoder", "decoder")},
     }  # fmt: skip
     chosen = ["exp=dreamer_v3", "algo=dreamer_v3_XS", "env=gym", "env.id=any", "env.num_envs=1", "run_name=any"]
     with initialize_config_module("sheeprl.configs", version_base="1.3"):
@@ -260,7 +274,8 @@ def _config(settings: DreamerSettings) -> Any:
 
 
 def make(context: AgentContext) -> Dreamer:
-    """The ``dreamer_v3`` agent."""
+    """The ``dreamer_v3`` agents: on pixels, or on latents where there is an encoder."""
     prepare_torch(context.device)
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
-    return Dreamer(settings, context.n_actions, context.seeds.child("library").integer(), context.device)
+    encoder = None if context.encoder is None else load_perception(context).encoder
+    return Dreamer(settings, context.n_actions, context.seeds.child("library").integer(), context.device, encoder)

@@ -144,6 +144,11 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
         description="sheeprl's DreamerV3: a recurrent world model of pixels, and a policy trained in its imagination.",
     ),
+    "dreamer_v3_latents": AgentEntry(
+        make="imagine_bench.agents.library.dreamer:make", title="DreamerV3 (latents)",
+        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
+        description="The same on the latents that the suite's own DQN sees.",
+    ),
     "sb3_ppo_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
         title="SB3 PPO (latents)",
