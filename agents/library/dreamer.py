@@ -28,8 +28,7 @@ from torch.distributions import Distribution
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .. import snapshot
-from ..encoders.encoder import Encoder
-from ..encoders.perception import load_perception, prepare_torch
+from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .dreamer_settings import HYPERPARAMETERS, DreamerSettings
@@ -47,14 +46,14 @@ class Dreamer:
         n_actions: Number of macro-actions A.
         seed: Of the library's draws, which come from torch's global generator: it is lent to it, call by call.
         device: ``"cpu"`` or ``"cuda"``.
-        encoder: Whose latents it sees, or None: pixels.
+        perception: Whose latents it sees, or None: pixels.
     """
 
     def __init__(
-        self, settings: DreamerSettings, n_actions: int, seed: int, device: str, encoder: Encoder | None = None
+        self, settings: DreamerSettings, n_actions: int, seed: int, device: str, perception: Perception | None = None
     ) -> None:
-        self.settings, self.n_actions, self._encoder = settings, n_actions, encoder
-        self._config = _config(settings, pixels=encoder is None)
+        self.settings, self.n_actions, self._perception = settings, n_actions, perception
+        self._config = _config(settings, pixels=perception is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
         self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
         self._random = torch.Generator().manual_seed(seed).get_state()
@@ -125,9 +124,9 @@ class Dreamer:
 
     def _shown(self, frame: Frame) -> dict[str, NDArray[Any]]:
         """What the library sees of a frame (64, 64, 3): it with its channels first, or its latents (Z,)."""
-        if self._encoder is None:
+        if self._perception is None:
             return {_PIXELS: frame.transpose(_CHANNELS_FIRST)}
-        return {_LATENTS: self._encoder.latents(frame)}
+        return {_LATENTS: self._perception.posterior(frame)[0].cpu().numpy()}
 
     def _update(self) -> None:
         settings = self.settings
@@ -153,7 +152,7 @@ class Dreamer:
         Distribution.set_default_validate_args(False)
         torch.set_rng_state(self._test_random if test else self._random)
         if self._fabric.device.type == "cuda":
-            torch.cuda.manual_seed(int(torch.randint(2**62, ())))
+            torch.cuda.manual_seed(int(torch.randint(2**62, (), generator=torch.default_generator)))
         try:
             yield
         finally:
@@ -277,5 +276,5 @@ def make(context: AgentContext) -> Dreamer:
     """The ``dreamer_v3`` agents: on pixels, or on latents where there is an encoder."""
     prepare_torch(context.device)
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
-    encoder = None if context.encoder is None else load_perception(context).encoder
-    return Dreamer(settings, context.n_actions, context.seeds.child("library").integer(), context.device, encoder)
+    perception = None if context.encoder is None else load_perception(context)
+    return Dreamer(settings, context.n_actions, context.seeds.child("library").integer(), context.device, perception)
