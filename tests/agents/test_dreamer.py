@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,14 @@ pytest.importorskip("sheeprl")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import torch
+    from imagine_bench.agents.encoders.encoder import Encoder, bundled_encoder
     from imagine_bench.agents.library.dreamer import Dreamer, Sequences, make
 
 
-def learner(seed: int = 0, **overrides: Any) -> Dreamer:
+def learner(seed: int = 0, encoder: Path | None = None, **overrides: Any) -> Dreamer:
     return make(
         AgentContext(
-            n_actions=3, preprocessing="gray_strips", encoder=None, seeds=SeedTree(seed).child("agent"),
+            n_actions=3, preprocessing="gray_strips", encoder=encoder, seeds=SeedTree(seed).child("agent"),
             hyperparameters="minimal", overrides=overrides,
         )
     )  # fmt: skip
@@ -71,6 +73,19 @@ def test_sequences_are_whole_and_begin_anywhere() -> None:
     assert memory.sample(2, 9, np.random.default_rng(0))["n"].shape == (5, 2, 1), "as many as there are"
 
 
+def test_it_sees_latents_where_there_is_an_encoder() -> None:
+    file = bundled_encoder("arrow_puzzle-clean")
+    agent = learner(encoder=file, learning_starts=2)
+    episode(agent, 0)
+    rows = agent.state().arrays
+    assert "replay/rgb" not in rows and not any("conv" in name for name in rows)
+    wanted = Encoder.load(file).latents(seen(2).frame)
+    assert np.array_equal(rows["replay/latents"][2], wanted) and agent.updates == 1
+    twin = learner(seed=1, encoder=file, learning_starts=2)
+    twin.restore(agent.state())
+    assert episode(agent, 1) == episode(twin, 1)
+
+
 def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
     agent = learner(learning_starts=2, replay_ratio=1.0)
     before = torch.get_rng_state()
@@ -84,6 +99,8 @@ def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
     assert acted[0] == acted[1]
     assert all(np.array_equal(state.arrays[name], after.arrays[name]) for name in state.arrays)
     assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2
+    with pytest.raises(ValueError, match="probs"):
+        torch.distributions.Categorical(probs=torch.tensor([-1.0, 2.0]))  # validated as before
 
 
 def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
