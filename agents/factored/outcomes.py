@@ -67,7 +67,8 @@ class Conjunctions:
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: OutcomeSettings) -> None:
         count = len(sizes)
-        orders = sorted({*range(1, min(settings.order, count) + 1), count})
+        most = min(settings.order, count)
+        orders = sorted({*range(1, most + 1), *([count - 1] if most > 1 else []), count})
         sets = [factors for order in orders for factors in itertools.combinations(range(count), order)]
         self._next, self._choice = _Templates(sizes), _Templates((*sizes, n_actions))
         members: list[NDArray[np.int64]] = []

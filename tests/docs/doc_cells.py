@@ -168,11 +168,11 @@ def price(budget: str, where: str, what: str) -> str:
     return "–" if np.isnan(mean) else f"{mean:,.0f}"
 
 
-def raw(budget: str, folder: str, column: str) -> str:
-    """A column of the one run of a folder."""
+def raw(run: str, budget: str, folder: str, column: str) -> str:
+    """A column of one run of a folder, at a budget that it may not have reached."""
     with (RESULTS / folder / "results.csv").open() as file:
-        (row,) = (row for row in csv.DictReader(file) if row["episodes"] == budget)
-    return f"{float(row[column]):,.0f}"
+        rows = [row for row in csv.DictReader(file) if (row["agent"], row["episodes"]) == (run, budget)]
+    return f"{float(rows[0][column]):,.0f}" if rows else "–"
 
 
 def price_to(where: str, level: str, what: str) -> str:
