@@ -31,8 +31,8 @@ class DynamicsSettings:
 class OutcomeSettings:
     """What is rewarded and what ends an episode; see :mod:`.outcomes`."""
 
-    #: Most values in a conjunction that may be a cause. The whole code may always be one, and, where conjunctions of two
-    #: may, it less any one value.
+    #: Most values in a conjunction that may be a cause. The whole code may always be one and, unless this is below 2,
+    #: the whole code less any one value.
     order: int = setting(3, between(0, 10))
     prior: float = setting(0.1, INSIDE)  #: prior probability that one value, or a pair, is a cause
     order_decay: float = setting(0.3, RATE)  #: multiplies it for each value beyond two

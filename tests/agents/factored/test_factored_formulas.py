@@ -239,6 +239,21 @@ def test_what_a_transition_brought_outweighs_a_cause_of_something_else() -> None
     assert loses((1, 2)) > 0.1, "of what was not seen causes alone tell"
 
 
+def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None:
+    """Four values of five are the goal; it was met with one value of the fifth alone, and each smaller part in vain."""
+    goal = (1, 1, 1, 1)
+    learned = OutcomeModel((2, 2, 2, 2, 3), ACTIONS, OutcomeSettings())
+    for four in itertools.product(range(2), repeat=4):
+        for fifth in range(1 if four == goal else 3):
+            reached = four == goal
+            learned.add(CodeTransition((0,) * 5, 0, (*four, fifth), 50.0 if reached else -1.0, reached))
+    learned.fit()
+    codes = np.array([(*goal, 2), (1, 1, 1, 0, 2)])
+    chance, _ = learned.predict(np.zeros((2, 5), dtype=np.int64), np.zeros(2, dtype=np.int64), codes)
+    met, missed = chance[:, learned.outcomes.index((50.0, True))]
+    assert met > 0.5 and missed < 0.05
+
+
 class ByLoops:
     """Expectation maximisation over three outcomes; of conjunctions that were met alone."""
 
