@@ -18,6 +18,7 @@ Shapes: ``N`` frames, ``P`` factors, ``D`` numbers of a crop.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -301,24 +302,34 @@ def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part 
     energy = (own**2).sum(axis=1)
     flat = _FLAT * float(np.quantile(energy, 0.9) or energy.max() or 1.0)
     chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
+    before = np.flatnonzero(actions >= 0)
     while True:
-        apart, acted = distances(own[chosen], own[chosen], mask, flat), actions[chosen] >= 0
-        either_way = np.minimum(apart, apart.T)
-        values, reach = groups(either_way)
-        while True:
+        apart = distances(own[chosen], own[chosen], mask, flat)
+        tried: list[tuple[Part, NDArray[np.int64], NDArray[np.int64], Mask]] = []
+        for values, reach in _finer(np.minimum(apart, apart.T)):
             rows = _exemplars(apart, values)
             part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
             found, known = part.read(shapes)
-            finer, below = groups(either_way, reach)
-            after = (actions[chosen[acted]], found[chosen[acted] + 1])
-            if below >= reach or follows(finer[acted], *after) < follows(values[acted], *after) + _EVIDENCE:
-                break
-            values, reach = finer, below
+            if tried:
+                coarser = tried[-1][2]
+                after = actions[before], coarser[before + 1]
+                if follows(found[before], *after) < follows(coarser[before], *after) + _EVIDENCE:
+                    break
+            tried.append((part, values, found, known))
+        part, values, _, known = tried[-1]
         singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
         strange = np.setdiff1d(np.flatnonzero(~known), chosen)
         if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
             return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])
+
+
+def _finer(apart: Floats) -> Iterator[tuple[NDArray[np.int64], float]]:
+    """Groups of crops as :func:`groups` gives them: below the widest gap, then each time below the next one."""
+    below = np.inf
+    while (found := groups(apart, below))[1] < below:
+        yield found
+        below = found[1]
 
 
 def follows(values: NDArray[np.int64], actions: NDArray[np.int64], following: NDArray[np.int64]) -> float:

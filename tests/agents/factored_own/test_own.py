@@ -115,17 +115,21 @@ def test_a_small_thing_is_a_factor_unless_the_border_cuts_it(top: int, found: in
     assert len(looks.find(frames)) == found
 
 
-@pytest.mark.parametrize(("matters", "told"), [(True, True), (True, False), (False, True)])
-def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: bool, told: bool) -> None:
+@pytest.mark.parametrize(
+    ("matters", "told", "rare"), [(True, True, 1), (True, False, 1), (False, True, 1), (True, True, 8)]
+)
+def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: bool, told: bool, rare: int) -> None:
     """Three marks in a ring, of which macro-actions show the next or the last; two are nearly alike.
 
     They are one value if no action is known, or if it is chance which of them is shown (then there are two in truth).
+    ``rare``: of so many macro-actions one does something; all frames tell, not only those that are grouped.
     """
     rng = np.random.default_rng(0)
-    actions = rng.integers(2, size=120)
-    place = np.concatenate([[0], np.where(actions[:-1] > 0, 1, -1).cumsum()]) % (3 if matters else 2)
-    shown = place if matters else np.where(place == 1, 2, rng.integers(2, size=120))
-    frames = np.full((120, 64, 64, 3), 120, dtype=np.uint8)
+    count = 120 * rare
+    actions = np.where(np.arange(count) % rare == 0, rng.integers(2, size=count), 2)
+    place = np.concatenate([[0], np.array([-1, 1, 0])[actions[:-1]].cumsum()]) % (3 if matters else 2)
+    shown = place if matters else np.where(place == 1, 2, rng.integers(2, size=count))
+    frames = np.full((count, 64, 64, 3), 120, dtype=np.uint8)
     frames[shown < 2, 20:40, 27:33] = frames[shown == 1, 20:29, 33:41] = frames[shown == 2, 28:34, 20:40] = 220
     actions[-1] = -1
     found = looks.find(frames, None, actions if told else None)
