@@ -144,11 +144,6 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
         description="sheeprl's DreamerV3: a recurrent world model of pixels, and a policy trained in its imagination.",
     ),
-    "dreamer_v3_latents": AgentEntry(
-        make="imagine_bench.agents.library.dreamer:make", title="DreamerV3 (latents)",
-        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
-        description="The same on the latents that the suite's own DQN sees.",
-    ),
     "sb3_ppo_latents": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_ppo", settings=_LIBRARY_SETTINGS, external_training_loop=True,
         title="SB3 PPO (latents)",
@@ -206,6 +201,11 @@ AGENTS: dict[str, AgentEntry] = {
         )
         for twin in ("", "_macrostate")
     },
+    "dreamer_v3_latents": AgentEntry(
+        make="imagine_bench.agents.library.dreamer:make", title="DreamerV3 (latents)",
+        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
+        description="DreamerV3 on the latents that the suite's own DQN sees.",
+    ),
 }  # fmt: skip
 
 DEMONSTRATOR = "oracle"
