@@ -148,7 +148,7 @@ class Dreamer:
 
         A graphics card's is seeded from it. Distributions are not validated, as where the library runs by itself.
         """
-        before = torch.get_rng_state()
+        before, validated = torch.get_rng_state(), Distribution._validate_args
         Distribution.set_default_validate_args(False)
         torch.set_rng_state(self._test_random if test else self._random)
         if self._fabric.device.type == "cuda":
@@ -162,7 +162,7 @@ class Dreamer:
             else:
                 self._random = after
             torch.set_rng_state(before)
-            Distribution.set_default_validate_args(__debug__)
+            Distribution.set_default_validate_args(validated)
 
     def diagnostics(self) -> dict[str, float]:
         """Mean losses and CPU seconds of updates a macro-action since the last call, and the counters now."""

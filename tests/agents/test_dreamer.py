@@ -99,8 +99,17 @@ def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
     assert acted[0] == acted[1]
     assert all(np.array_equal(state.arrays[name], after.arrays[name]) for name in state.arrays)
     assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2
-    with pytest.raises(ValueError, match="probs"):
-        torch.distributions.Categorical(probs=torch.tensor([-1.0, 2.0]))  # validated as before
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_distributions_of_others_are_validated_as_before(validated: bool) -> None:
+    agent, default = learner(), torch.distributions.Distribution._validate_args
+    torch.distributions.Distribution.set_default_validate_args(validated)
+    try:
+        episode(agent, 0)
+        assert torch.distributions.Distribution._validate_args is validated
+    finally:
+        torch.distributions.Distribution.set_default_validate_args(default)
 
 
 def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
