@@ -19,7 +19,7 @@ from ..encoders.perception import prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .exploration import last_step, query
-from .factors import Code, CodeReplay, CodeTransition
+from .factors import Code, CodeReplay, CodeTransition, Memory
 from .model import FactoredModel
 from .perception import CodePerception, ImaginedStep, load_code_perception
 from .planner import TIE, Planner
@@ -58,7 +58,7 @@ class CodeAgent(Generic[PerceptionT]):
 
     def _reset_model(self) -> None:
         """An empty model; the first ``learned`` of the replayed transitions are in it."""
-        self.model = FactoredModel(self.perception.sizes, self.n_actions, self.settings)
+        self.model = FactoredModel(self.perception.sizes, self.n_actions, self.settings, self._memory)
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
         self.tasks: list[int] = []
@@ -68,6 +68,11 @@ class CodeAgent(Generic[PerceptionT]):
     def _ready(self) -> bool:
         """Whether anything is known of what this task rewards, so that there is something to plan for."""
         return self.model.outcomes.causes is not None
+
+    @property
+    def _memory(self) -> Memory | None:
+        """Of which factor the last value of a code is a memory; None where it is seen as all are."""
+        return None
 
     @property
     def _left(self) -> int | None:

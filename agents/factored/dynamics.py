@@ -207,14 +207,17 @@ class FactorDynamics:
 
 
 class Dynamics:
-    """How every factor changes; ``sizes`` are their numbers of values."""
+    """How every factor changes, or the first ``moving``; ``sizes`` are the numbers of values of all."""
 
-    def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
-        self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in range(len(sizes))]
+    def __init__(
+        self, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings, moving: int | None = None
+    ) -> None:
+        factors = range(len(sizes) if moving is None else moving)
+        self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in factors]
         self._settings, self._seen, self.pooled_at = settings, 0, 0
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
-        """Learn from one transition between codes (P,)."""
+        """Learn from one transition from a code (P,) to values of those that move."""
         for factor, value in zip(self.factors, following.tolist(), strict=True):
             factor.add(code, action, value)
         self._seen += 1

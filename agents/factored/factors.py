@@ -7,6 +7,7 @@ Shapes: ``N`` codes, ``P`` factors, ``A`` macro-actions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,26 @@ def table_size(factors: tuple[int, ...], sizes: tuple[int, ...]) -> int:
 def strides(factors: tuple[int, ...], sizes: tuple[int, ...]) -> NDArray[np.int64]:
     """Multipliers that number the joint values of ``factors``, the last one fastest."""
     return np.array([table_size(factors[i + 1 :], sizes) for i in range(len(factors))], dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """The last value of a factor in an episode but one, which tells nothing and stands for never.
+
+    A code with a memory ends with what is remembered.
+    """
+
+    factor: int
+    hidden: int
+
+    def after(self, remembered: int, code: Code) -> int:
+        """What is remembered once a code was seen."""
+        return int(self.all_after(np.array(remembered), as_codes(code)))
+
+    def all_after(self, remembered: Codes, codes: Codes) -> Codes:
+        """The same of many: ``remembered`` (...) and codes (..., P)."""
+        values = codes[..., self.factor]
+        return np.where(values == self.hidden, remembered, values)
 
 
 class CodeTransition(NamedTuple):

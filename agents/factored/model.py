@@ -10,7 +10,7 @@ import numpy as np
 from imagine_bench.interfaces import Floats
 
 from .dynamics import EVERY, Dynamics
-from .factors import Code, Codes, CodeTransition, as_codes
+from .factors import Code, Codes, CodeTransition, Memory, as_codes
 from .outcomes import OutcomeModel
 from .settings import FactoredSettings
 
@@ -38,28 +38,34 @@ class Results:
 
 
 class FactoredModel:
-    """Learns from transitions between codes and predicts them; ``sizes`` are the numbers of values of the P factors."""
+    """Learns from transitions between codes and predicts them; ``sizes`` are the numbers of values of the P factors.
 
-    def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings) -> None:
-        self.n_actions, self.sizes, self._planning = n_actions, sizes, settings.planning
-        self.dynamics = Dynamics(sizes, n_actions, settings.dynamics)
+    With a ``memory`` the last factor is what it remembers of the others, which follows from what they become.
+    """
+
+    def __init__(
+        self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings, memory: Memory | None = None
+    ) -> None:
+        self.n_actions, self.sizes, self._planning, self._memory = n_actions, sizes, settings.planning, memory
+        self._moving = len(sizes) - (memory is not None)
+        self.dynamics = Dynamics(sizes, n_actions, settings.dynamics, self._moving)
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
 
     def add(self, row: CodeTransition) -> None:
         """Take in one transition, as far as it shows what follows what and what it brings."""
         if row.has_dynamics:
-            self.dynamics.add(as_codes(row.code), row.action, as_codes(row.following))
+            self.dynamics.add(as_codes(row.code), row.action, as_codes(row.following[: self._moving]))
         if row.has_reward:
             self.outcomes.add(row)
 
-    def log_likelihood(self, rows: Sequence[CodeTransition], factors: int) -> float:
-        """Log likelihood of transitions (each has at least 0.1 %): what the first factors become and what it brings."""
+    def log_likelihood(self, rows: Sequence[CodeTransition]) -> float:
+        """Log likelihood of transitions (each has at least 0.1 %): what is seen next and what it brings."""
         causes, each = self.outcomes.causes, np.arange(len(rows))
         if causes is None or not rows:
             return len(rows) * float(np.log(_LEAST))
         codes, actions, following = (np.array([row[column] for row in rows]) for column in range(3))
         moved = [predicted.expected[each, actions, following[:, factor]]
-                 for factor, predicted in enumerate(self.dynamics.predict(codes)[:factors])]  # fmt: skip
+                 for factor, predicted in enumerate(self.dynamics.predict(codes))]  # fmt: skip
         known = {outcome: index for index, outcome in enumerate(causes.outcomes)}
         which = np.array([known.get((row.reward, row.terminated), -1) for row in rows])
         brought = self.outcomes.predict(codes, actions, following)[0][each, which]
@@ -74,7 +80,7 @@ class FactoredModel:
         if causes is None or outcome not in causes.outcomes:
             return 0.0, 1.0
         factors = self.dynamics.predict(code[None])
-        moved = np.prod([each.expected[0, action, value] for each, value in zip(factors, following, strict=True)])
+        moved = np.prod([each.expected[0, action, value] for each, value in zip(factors, following, strict=False)])
         outcomes, untested = self.outcomes.predict(code[None], np.array([action]), following[None])
         unknown = 1.0 - (1.0 - untested[0]) * np.prod([1.0 - each.unknown[0, action] for each in factors])
         return float(moved) * float(outcomes[0, causes.outcomes.index(outcome)]), float(unknown)
@@ -83,6 +89,9 @@ class FactoredModel:
         """Where some actions would lead from ``codes`` (N, P)."""
         factors = self.dynamics.predict(codes, actions)
         chance, following = self._branches([factor.expected for factor in factors])
+        if self._memory is not None:
+            before = np.broadcast_to(codes[:, None, None, -1], chance.shape)
+            following = np.concatenate([following, self._memory.all_after(before, following)[..., None]], axis=-1)
         known = np.prod([1.0 - factor.unknown for factor in factors], axis=0)
         return Moves(following, chance, known)
 
@@ -111,6 +120,8 @@ class FactoredModel:
             (chance,), _ = factor.happens(as_codes(code)[None], np.array([action]))
             following.append(int(rng.choice(len(chance), p=chance)))
             p_likeliest *= float(chance.max())
+        if self._memory is not None:
+            following.append(self._memory.after(code[-1], tuple(following)))
         return tuple(following), p_likeliest
 
     def _branches(self, factors: list[Floats]) -> tuple[Floats, Codes]:
@@ -128,5 +139,5 @@ class FactoredModel:
         spare, shape = ((0, 0), (0, most - chance.shape[1])), (count, actions, most)
         least = np.minimum(self._planning.least_probability, chance.max(axis=1, keepdims=True))
         chance = np.pad(np.where(chance < least, 0.0, chance), spare)
-        codes = np.stack(np.unravel_index(np.pad(numbers, spare), self.sizes), axis=-1)
+        codes = np.stack(np.unravel_index(np.pad(numbers, spare), self.sizes[: self._moving]), axis=-1)
         return (chance / chance.sum(axis=1, keepdims=True)).reshape(shape), codes.reshape(*shape, -1)

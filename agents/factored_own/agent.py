@@ -22,10 +22,10 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observatio
 from .. import snapshot
 from ..encoders.perception import prepare_torch
 from ..factored.agent import CodeAgent
-from ..factored.factors import Code, CodeTransition
+from ..factored.factors import Code, CodeTransition, Memory
 from ..factored.settings import OWN, OwnPerceptionSettings, OwnSettings
 from . import looks
-from .memory import Memory, choose, contradictions, remembering
+from .memory import choose, contradictions, remembering
 from .picture import picture
 
 _FIRST, _RECENT = 4, 4
@@ -192,6 +192,10 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
         """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
         self._acted = 0
         self.perception.begin_episode()
+
+    @property
+    def _memory(self) -> Memory | None:
+        return self.perception.memory
 
     @property
     def _left(self) -> int | None:

@@ -8,12 +8,12 @@ predicts the others, and these the first. The memory that predicts best is kept 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
 
-from ..factored.factors import Code, CodeTransition
+from ..factored.factors import Code, CodeTransition, Memory
 from ..factored.model import FactoredModel
 from ..factored.settings import OwnSettings
 
@@ -21,19 +21,6 @@ _FEWEST = 3
 """Values of a factor worth remembering: one that tells nothing, and two to tell apart."""
 _NONE_SEEN = 1e6
 """Pseudo-count beside which no transition counts that was seen: it would explain a part of what a memory explains."""
-
-
-@dataclass(frozen=True, slots=True)
-class Memory:
-    """The last value of a factor in an episode but one, which tells nothing and stands for never."""
-
-    factor: int
-    hidden: int
-
-    def after(self, remembered: int, code: Code) -> int:
-        """What is remembered once a code was seen."""
-        value = code[self.factor]
-        return remembered if value == self.hidden else value
 
 
 def candidates(sizes: Sequence[int]) -> list[Memory]:
@@ -77,10 +64,10 @@ def choose(
         remembered = remembering(rows, begins, memory)
         likelihood[memory] = 0.0
         for learned in (half, ~half):
-            model = FactoredModel((*sizes, *more), n_actions, causes_alone)
+            model = FactoredModel((*sizes, *more), n_actions, causes_alone, memory)
             for row in compress(remembered, learned):
                 model.add(row)
             model.outcomes.fit()
-            likelihood[memory] += model.log_likelihood(list(compress(remembered, ~learned)), len(sizes))
+            likelihood[memory] += model.log_likelihood(list(compress(remembered, ~learned)))
     best = max(likelihood, key=lambda memory: likelihood[memory])
     return best if likelihood[best] > likelihood[None] + settings.memory_evidence else None

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from fake_codes import starts
 from fake_pictures import Code, agent, picture
-from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.factors import CodeTransition, Memory
+from imagine_bench.agents.factored.model import FactoredModel
 from imagine_bench.agents.factored.settings import OWN
 from imagine_bench.agents.factored_own import agent as own
 from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
-from imagine_bench.agents.factored_own.memory import Memory, candidates, choose, contradictions, remembering
+from imagine_bench.agents.factored_own.memory import candidates, choose, contradictions, remembering
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
@@ -65,6 +66,46 @@ def test_the_last_value_that_told_something_is_remembered_for_an_episode() -> No
     ]
     assert [row.code[:2] for row in found] == [row.code for row in rows], "what is seen stays as it is"
     assert remembering(rows, begins, None) == rows
+
+
+def flickering(episodes: int, rng: np.random.Generator) -> tuple[list[CodeTransition], list[bool]]:
+    """A wheel that action 0 turns, and a lamp of one color an episode, which every second frame hides, by chance."""
+    rows, begins = [], []
+    for _ in range(episodes):
+        color, wheels = int(rng.integers(2)), [0]
+        actions = rng.integers(2, size=4).tolist()
+        for action in actions:
+            wheels.append(wheels[-1] ^ (action == 0))
+        codes = [(wheel, color if rng.random() < 0.5 else HIDDEN) for wheel in wheels]
+        rows += [CodeTransition(*row, 0.0, terminated=False) for row in zip(codes, actions, codes[1:], strict=False)]
+        begins += [True, False, False, False]
+    return rows, begins
+
+
+def test_what_is_remembered_follows_from_what_is_seen() -> None:
+    """A model of both apart would have a color shown and another one remembered."""
+    memory, rng = Memory(1, HIDDEN), np.random.default_rng(0)
+    rows, settings = remembering(*flickering(400, rng), memory), OWN.resolve("fast", {}, "chapter_5")
+    found = {}
+    for known in (memory, None):
+        model = FactoredModel((2, 3, 3), 2, settings, known)
+        for row in rows:
+            model.add(row)
+        model.outcomes.fit()
+        for before in ((0, HIDDEN, HIDDEN), (1, HIDDEN, 0)):
+            moves = model.moves(np.array([before]))
+            pairs = zip(moves.following[0, 0].tolist(), moves.chance[0, 0].tolist(), strict=True)
+            found[known, before] = {tuple(code): chance for code, chance in pairs if chance > 0.0}
+        code = (0, HIDDEN, HIDDEN)
+        drawn = {model.sample(code, 0, rng)[0] for _ in range(200)}
+        assert (drawn == set(found[memory, code])) == (known is not None)
+        probability, unknown = model.probability(CodeTransition(code, 0, (1, 0, 0), 0.0, terminated=False))
+        assert probability == pytest.approx(0.25 if known else 0.0625, abs=0.05) and unknown < 0.05
+    assert found[memory, (0, HIDDEN, HIDDEN)] == pytest.approx(
+        {(1, HIDDEN, HIDDEN): 0.5, (1, 0, 0): 0.25, (1, 1, 1): 0.25}, abs=0.08
+    )
+    assert found[memory, (1, HIDDEN, 0)] == pytest.approx({(0, HIDDEN, 0): 0.5, (0, 0, 0): 0.5}, abs=0.08)
+    assert found[None, (0, HIDDEN, HIDDEN)][1, 0, 1] > 0.03, "apart, they would contradict each other"
 
 
 def test_only_factors_that_can_hide_two_values_are_candidates() -> None:
