@@ -61,6 +61,7 @@ _NEIGHBOURS = (
     ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
 )  # fmt: skip
 """Pairs of neighbouring pixels: to the right, below, and both diagonals."""
+_THICK = np.ones((2, 2))  # what fits into no part of a region is rim there
 _INNER = (slice(2, -2), slice(2, -2))  # rows and columns that are not the border's
 _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
@@ -141,7 +142,8 @@ def _parts(
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
         change, shapes = changes(still), contours(still)
-        hiding = [_part(shapes, mask, actions) for mask in regions(change, noise & _often(change, begins))]
+        hides = noise & _often(change, begins)
+        hiding = [_part(shapes, mask, actions) for mask in regions(change, hides, rest=False)]
         seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
         parts += [(part, part.read(shapes)[0]) for part in seen]
     return parts
@@ -238,13 +240,13 @@ def changes(images: Images) -> Mask:
     return np.asarray(scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2])
 
 
-def regions(change: Mask, pixels: Mask) -> list[Mask]:
+def regions(change: Mask, pixels: Mask, *, rest: bool = True) -> list[Mask]:
     """Regions (64, 64) of ``pixels``, of which each changes at the same times (N, 64, 64), the largest first.
 
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does, and
     in each half of the time, too, where it tells. Else a habit of the agent, kept for a while, would bind two things.
-    Pixels that hang together, up to two pixels apart, are parted so only if most of them are in a region then; else
-    they are one.
+    Pixels that hang together are parted so only if most of them are in a region then; else they are one. The
+    ``rest`` is a region where much of it hangs together and is no thin rim: a small thing that a large one touches.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
@@ -262,14 +264,24 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
     pieces = np.full(pixels.shape, -1)
     pieces[pixels] = label
     large = np.flatnonzero(np.bincount(label) >= _LEAST_PX)
-    whole, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(pixels), np.ones((3, 3)))
     found = []
-    for mask in (pixels & (whole == index + 1) for index in range(count)):
+    for mask in _hanging(pixels):
         inside = np.intersect1d(large, pieces[mask])
         parted = [pieces == piece for piece in inside]
-        found += parted if sum(map(np.sum, parted)) >= _MOST * mask.sum() else [mask]
+        if sum(map(np.sum, parted)) < _MOST * mask.sum():
+            parted = [mask]
+        elif rest:
+            left = _hanging(mask & ~np.isin(pieces, inside))
+            parted += [each for each in left if scipy.ndimage.binary_opening(each, _THICK).sum() >= _LEAST_PX]
+        found += parted
     least = [_LEAST_PX if mask[_INNER].sum() < mask.sum() else _LEAST_INNER_PX for mask in found]
     return sorted((mask for mask, few in zip(found, least, strict=True) if mask.sum() >= few), key=np.sum, reverse=True)
+
+
+def _hanging(pixels: Mask) -> list[Mask]:
+    """Groups of pixels (64, 64) that hang together, up to two pixels apart."""
+    label, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(pixels), np.ones((3, 3)))
+    return [pixels & (label == index + 1) for index in range(count)]
 
 
 def crops(shapes: Images, mask: Mask) -> Images:

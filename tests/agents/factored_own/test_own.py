@@ -253,6 +253,19 @@ def test_what_falls_into_crumbs_stays_whole() -> None:
     assert found.sum() == 100 and found[20:30, 20:30].all()
 
 
+def test_a_small_thing_that_a_large_one_touches_is_not_lost() -> None:
+    """It falls into crumbs, and most of what hangs together with it does not; beside it are a crumb and a thin rim."""
+    change, rng = np.zeros((400, 64, 64), dtype=np.bool_), np.random.default_rng(0)
+    large, small, crumbs = np.zeros((3, 64, 64), dtype=np.bool_)
+    large[10:30, 20:50] = small[30:37, 30:37] = crumbs[30:33, 45:48] = crumbs[9, :60] = True
+    change[:, large] = (rng.random(400) < 0.2)[:, None]
+    change[:, small | crumbs] = rng.random((400, int((small | crumbs).sum()))) < 0.2
+    found = looks.regions(change, change.any(axis=0))
+    assert len(found) == 2 and (found[0] == large).all() and (found[1] == small).all()
+    (alone,) = looks.regions(change, change.any(axis=0), rest=False)
+    assert (alone == large).all()
+
+
 def test_what_does_not_vary_freely_is_one_factor() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.integers(3, size=(2, 200))
