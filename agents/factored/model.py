@@ -46,7 +46,7 @@ class FactoredModel:
     def __init__(
         self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings, memory: Memory | None = None
     ) -> None:
-        self.n_actions, self.sizes, self._planning, self._memory = n_actions, sizes, settings.planning, memory
+        self.n_actions, self.sizes, self._planning, self.memory = n_actions, sizes, settings.planning, memory
         self._moving = len(sizes) - (memory is not None)
         self.dynamics = Dynamics(sizes, n_actions, settings.dynamics, self._moving)
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
@@ -89,9 +89,9 @@ class FactoredModel:
         """Where some actions would lead from ``codes`` (N, P)."""
         factors = self.dynamics.predict(codes, actions)
         chance, following = self._branches([factor.expected for factor in factors])
-        if self._memory is not None:
+        if self.memory is not None:
             before = np.broadcast_to(codes[:, None, None, -1], chance.shape)
-            following = np.concatenate([following, self._memory.all_after(before, following)[..., None]], axis=-1)
+            following = np.concatenate([following, self.memory.all_after(before, following)[..., None]], axis=-1)
         known = np.prod([1.0 - factor.unknown for factor in factors], axis=0)
         return Moves(following, chance, known)
 
@@ -120,8 +120,8 @@ class FactoredModel:
             (chance,), _ = factor.happens(as_codes(code)[None], np.array([action]))
             following.append(int(rng.choice(len(chance), p=chance)))
             p_likeliest *= float(chance.max())
-        if self._memory is not None:
-            following.append(self._memory.after(code[-1], tuple(following)))
+        if self.memory is not None:
+            following.append(self.memory.after(code[-1], tuple(following)))
         return tuple(following), p_likeliest
 
     def _branches(self, factors: list[Floats]) -> tuple[Floats, Codes]:

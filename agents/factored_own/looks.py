@@ -61,7 +61,7 @@ _NEIGHBOURS = (
     ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
 )  # fmt: skip
 """Pairs of neighbouring pixels: to the right, below, and both diagonals."""
-_THICK = np.ones((2, 2))  # what fits into no part of a region is rim there
+_COMPACT = 0.5  # share of a thing's pixels that are no thin rim
 _INNER = (slice(2, -2), slice(2, -2))  # rows and columns that are not the border's
 _DARK = 2.5  # of 255
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
@@ -142,8 +142,7 @@ def _parts(
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
         change, shapes = changes(still), contours(still)
-        hides = noise & _often(change, begins)
-        hiding = [_part(shapes, mask, actions) for mask in regions(change, hides, rest=False)]
+        hiding = [_part(shapes, mask, actions) for mask in regions(change, noise & _often(change, begins))]
         seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
         parts += [(part, part.read(shapes)[0]) for part in seen]
     return parts
@@ -240,13 +239,13 @@ def changes(images: Images) -> Mask:
     return np.asarray(scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2])
 
 
-def regions(change: Mask, pixels: Mask, *, rest: bool = True) -> list[Mask]:
+def regions(change: Mask, pixels: Mask) -> list[Mask]:
     """Regions (64, 64) of ``pixels``, of which each changes at the same times (N, 64, 64), the largest first.
 
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does, and
     in each half of the time, too, where it tells. Else a habit of the agent, kept for a while, would bind two things.
-    Pixels that hang together are parted so only if most of them are in a region then; else they are one. The
-    ``rest`` is a region where much of it hangs together and is no thin rim: a small thing that a large one touches.
+    Pixels that hang together, up to two pixels apart, are parted so only if most of them are in a region then; else
+    they are one. Much of what is left that hangs together and is no thin rim is a small thing that a large one touches.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
@@ -269,11 +268,11 @@ def regions(change: Mask, pixels: Mask, *, rest: bool = True) -> list[Mask]:
         inside = np.intersect1d(large, pieces[mask])
         parted = [pieces == piece for piece in inside]
         if sum(map(np.sum, parted)) < _MOST * mask.sum():
-            parted = [mask]
-        elif rest:
-            left = _hanging(mask & ~np.isin(pieces, inside))
-            parted += [each for each in left if scipy.ndimage.binary_opening(each, _THICK).sum() >= _LEAST_PX]
-        found += parted
+            found.append(mask)
+        else:
+            rest = _hanging(mask & ~np.isin(pieces, inside))
+            found += parted
+            found += [each for each in rest if each.sum() >= _LEAST_PX and _thick(each) >= _COMPACT]
     least = [_LEAST_PX if mask[_INNER].sum() < mask.sum() else _LEAST_INNER_PX for mask in found]
     return sorted((mask for mask, few in zip(found, least, strict=True) if mask.sum() >= few), key=np.sum, reverse=True)
 
@@ -282,6 +281,11 @@ def _hanging(pixels: Mask) -> list[Mask]:
     """Groups of pixels (64, 64) that hang together, up to two pixels apart."""
     label, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(pixels), np.ones((3, 3)))
     return [pixels & (label == index + 1) for index in range(count)]
+
+
+def _thick(pixels: Mask) -> float:
+    """Share of pixels (64, 64) that are in a square of two by two of them."""
+    return float(scipy.ndimage.binary_opening(pixels, np.ones((2, 2))).sum() / pixels.sum())
 
 
 def crops(shapes: Images, mask: Mask) -> Images:

@@ -204,6 +204,7 @@ def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing
         [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in learner.replay.rows()],
         learner.perception.begins, learner.perception.memory,
     ), "codes that are learned from say the same as those that are acted on"  # fmt: skip
+    assert learner.model.memory == learner.perception.memory and forgetful.model.memory is None
     begin_episode(learner)
     assert learner._left == 6, "it has seen where episodes are cut"
     resumed = agent(seed=5)
