@@ -46,7 +46,8 @@ class Memory:
 
     def after(self, remembered: int, code: Code) -> int:
         """What is remembered once a code was seen."""
-        return int(self.all_after(np.array(remembered), as_codes(code)))
+        value = code[self.factor]
+        return remembered if value == self.hidden else value
 
     def all_after(self, remembered: Codes, codes: Codes) -> Codes:
         """The same of many: ``remembered`` (...) and codes (..., P)."""

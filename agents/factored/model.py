@@ -75,12 +75,13 @@ class FactoredModel:
     def probability(self, row: CodeTransition) -> tuple[float, float]:
         """How probable a transition is held to be, and how much about it is unknown."""
         code, action, following = as_codes(row.code), row.action, as_codes(row.following)
+        moving = following[: self._moving]
         outcome = (row.reward, row.terminated)
         causes = self.outcomes.causes
         if causes is None or outcome not in causes.outcomes:
             return 0.0, 1.0
         factors = self.dynamics.predict(code[None])
-        moved = np.prod([each.expected[0, action, value] for each, value in zip(factors, following, strict=False)])
+        moved = np.prod([each.expected[0, action, value] for each, value in zip(factors, moving, strict=True)])
         outcomes, untested = self.outcomes.predict(code[None], np.array([action]), following[None])
         unknown = 1.0 - (1.0 - untested[0]) * np.prod([1.0 - each.unknown[0, action] for each in factors])
         return float(moved) * float(outcomes[0, causes.outcomes.index(outcome)]), float(unknown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -341,9 +342,8 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     low, high = axes.get_ylim()
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     names = sorted(last, key=lambda agent: last[agent])
-    titles = {agent: agent_words(agent).title for agent in names}
-    words = {agent: title if len(title) <= _LONG else title.replace(" (", "\n(") for agent, title in titles.items()}
-    step *= 2 if any("\n" in each for each in words.values()) else 1
+    words = {agent: _in_lines(agent_words(agent).title) for agent in names}
+    step *= max(1 + each.count("\n") for each in words.values())
     places = spread_labels([last[agent] for agent in names], step, top=high)
     for agent, y in zip(names, places, strict=True):
         axes.annotate(
@@ -352,6 +352,12 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
             arrowprops=_LEADER,
         )  # fmt: skip
     axes.set_xlim(right=to_x * 1.04)
+
+
+def _in_lines(title: str) -> str:
+    """A long title in lines; what is in brackets begins one."""
+    parts = [title] if len(title) <= _LONG else title.replace(" (", "\n(").splitlines()
+    return "\n".join(line for part in parts for line in textwrap.wrap(part, _LONG))
 
 
 def spread_labels(values: Sequence[float], step: float, *, top: float) -> list[float]:

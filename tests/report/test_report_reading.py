@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from fake_results import LEVELS, bench_result
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from report_pages import check_report, narrowest_px, read_tables
 
 from imagine_bench.protocols.control import Protocol
@@ -109,6 +112,20 @@ def test_leader_lines_stay_in_the_margin(tmp_path: Path) -> None:
         for label in axes.texts:
             assert label.xy[0] > 1.0 and label.get_position()[0] > 1.0, "right of the axes"
             assert label.arrow_patch.get_edgecolor() not in colors and label.arrow_patch.get_linestyle() == "solid"
+
+
+def test_a_name_with_many_settings_stays_in_the_picture() -> None:
+    agent = "dreamer_v3:actor_learning_rate=0.001,critic_learning_rate=0.001,model_learning_rate=0.001,replay_ratio=4"
+    with mpl.rc_context(plots.STYLE):
+        figure = Figure(figsize=(9.2, 4.9), layout="constrained")
+        axes = figure.add_subplot()
+        axes.set_ylim(-2, 108)
+        plots._end_labels(axes, {agent: 50.0}, 1.0)
+        FigureCanvasAgg(figure).draw()
+    (label,) = axes.texts
+    written = label.get_window_extent()
+    assert written.x1 <= figure.bbox.x1 and axes.bbox.width > 0.5 * figure.bbox.width
+    assert label.get_text().replace("\n", " ").endswith("replay_ratio 4)"), "all of it"
 
 
 def test_names_move_only_as_far_as_they_must() -> None:
