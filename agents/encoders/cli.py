@@ -25,17 +25,18 @@ from .training import draw_frames, train_encoder
 
 def retrain(
     spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None,
-    batch: int | None = None, latents: int | None = None,
+    batch: int | None = None, latents: int | None = None, device: str = "cpu",
 ) -> str:  # fmt: skip
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
     and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps``, ``batch`` and
-    ``latents`` replace its numbers of gradient steps, of images a step and of latents. A training that was killed
-    goes on from ``.<name>.unfinished.pt`` in ``out``.
+    ``latents`` replace its numbers of gradient steps, of images a step and of latents; the steps are made on
+    ``device``. A training that was killed goes on from ``.<name>.unfinished.pt`` in ``out``.
 
     Raises:
-        UnknownNameError: An unknown recipe or appearance.
+        UnknownNameError: An unknown recipe, appearance or device.
+        SetupError: The machine has no such device.
         ArtefactError: One of the three files exists; nothing was trained or written.
         DivergedError: The loss became NaN or infinite.
         InvalidValueError: A recipe of codes was given one of those numbers, or found no factor with two values in so
@@ -44,8 +45,9 @@ def retrain(
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     numbers = {"steps": steps, "batch": batch, "latents": latents}
     given: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
-    if recipe.kind == "codes" and given:
-        options = " ".join(f"--{name} {value}" for name, value in given.items())
+    elsewhere = {} if device == "cpu" else {"device": device}
+    if recipe.kind == "codes" and given | elsewhere:
+        options = " ".join(f"--{name} {value}" for name, value in (given | elsewhere).items())
         raise InvalidValueError(f"Recipe {recipe.name} finds its codes without gradient steps; leave out {options}.")
     recipe = replace(recipe, **given)
     appearance = appearance_name(appearance)
@@ -56,8 +58,9 @@ def retrain(
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
         show = partial(_show, bar)
         encoder = train_encoder(
-            spec, recipe=recipe, appearance=appearance, seed=seed, progress=show, unfinished=unfinished
-        )
+            spec, recipe=recipe, appearance=appearance, seed=seed, progress=show, unfinished=unfinished,
+            device=device,
+        )  # fmt: skip
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
     frames, macrostates = draw_frames(spec, appearance_of_tests(appearance), COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())

@@ -111,12 +111,17 @@ def train_vae(
 ) -> float:  # fmt: skip
     """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds of it, earlier processes' included.
 
+    The VAE stays on its device; what is drawn is drawn by ``generator``, on the CPU.
+
     Raises:
         DivergedError: The loss is not finite any more; the message names the step.
         ArtefactError: What is unfinished is damaged or another training.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
     n, first, order, begun_s = len(data.images), 0, torch.empty(0, dtype=torch.int64), time.process_time()
+    device = next(vae.parameters()).device
+    data = replace(data, images=data.images.to(device))
+    at_once = _PART if device.type == "cpu" else recipe.batch
     if unfinished is not None and (kept := unfinished.load()) is not None:
         first, order, begun_s = kept["step"], kept["order"], begun_s - kept["cpu_s"]
         vae.load_state_dict(kept["vae"])
@@ -134,8 +139,8 @@ def train_vae(
         noise = torch.randn((len(rows), vae.latent_size), generator=generator)
         optimiser.param_groups[0]["lr"] = learning_rate_at(recipe, step)
         optimiser.zero_grad()
-        total = torch.zeros(())
-        for part, its_noise in zip(rows.split(_PART), noise.split(_PART), strict=True):
+        total = torch.zeros((), device=device)
+        for part, its_noise in zip(rows.to(device).split(at_once), noise.to(device).split(at_once), strict=True):
             loss = vae.elbo(data.batch(part), its_noise, beta_at(recipe, step)).loss * (len(part) / len(rows))
             loss.backward()
             total += loss.detach()
@@ -150,17 +155,19 @@ def train_vae(
 
 def train_encoder(
     spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, progress: Progress | None = None,
-    unfinished: Path | None = None,
+    unfinished: Path | None = None, device: str = "cpu",
 ) -> Encoder:  # fmt: skip
     """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
 
     A recipe is a name among the task's ``RECIPES``, or settings of one's own. ``seed`` is the root of the seed tree:
     training frames come from its ``encoder_training`` branch and held-out ones from its ``encoder_probe`` branch, of
     looks kept for tests where the appearance has such. ``unfinished`` is a file in which a VAE's training is kept once
-    a minute and from which one that was killed goes on; when all is done it is removed.
+    a minute and from which one that was killed goes on; when all is done it is removed. ``device`` is where a VAE's
+    gradient steps are made; all else is the CPU's.
 
     Raises:
-        UnknownNameError: An unknown recipe or appearance.
+        UnknownNameError: An unknown recipe, appearance or device.
+        SetupError: The machine has no such device.
         DivergedError: The loss became NaN or infinite.
         InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
         ArtefactError: The unfinished training is damaged or another one.
@@ -170,7 +177,7 @@ def train_encoder(
         recipe = replace(recipe, frames=recipe.frames * max(image_shape(spec.preprocessing)[0], 3) // 3)
     appearance = appearance_name(appearance)
     progress = progress or (lambda stage, done: None)
-    prepare_torch("cpu")
+    prepare_torch(device)
     seeds = SeedTree(seed)
     train_seeds, probe_seeds = (seeds.child(use, spec.id, appearance) for use in ("encoder_training", "encoder_probe"))
     clock = {"": time.process_time()}
@@ -183,8 +190,9 @@ def train_encoder(
     if recipe.kind == "codes":
         network = discover(data.batch(torch.arange(recipe.frames)), generator)
     else:
-        kept = None if unfinished is None else Unfinished(unfinished, f"{spec.id} {appearance} {seed} {recipe}")
-        network, training_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, kept)
+        what = f"{spec.id} {appearance} {seed} {recipe} {device}"
+        kept = None if unfinished is None else Unfinished(unfinished, what)
+        network, training_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, kept, device)
         earlier_s = clock["frames"] + training_s - time.process_time()
         clock |= {stage: at - earlier_s for stage, at in clock.items()}
     _round_to_half(network)
@@ -201,10 +209,11 @@ def train_encoder(
     measured = _measure(network, probe, linear, held_out, noise)
     sizes = network.code_sizes if isinstance(network, DiscreteEncoder) else ()
     measured |= {"latent_size": network.latent_size, "code_sizes": sizes, "cpu_s": _laps(clock)}
-    return Encoder(network, probe, _card(spec, recipe, appearance, seed, **measured))
+    return Encoder(network, probe, _card(spec, recipe, appearance, seed, device, **measured))
 
 
-def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured: Any) -> EncoderCard:
+def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, device: str, **measured: Any) -> EncoderCard:
+    gpu = {"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}
     return EncoderCard(
         task=spec.id,
         appearance=appearance,
@@ -214,9 +223,9 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, **measured
         cardinalities=classes_of(spec),
         seed=seed,
         command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
-        f"--recipe {recipe.name} --seed {seed}{_changed(spec, recipe)}",
+        f"--recipe {recipe.name} --seed {seed}{_changed(spec, recipe)}{' --device cuda' if gpu else ''}",
         data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
-        versions={name: version(name) for name in _LIBRARIES},
+        versions={name: version(name) for name in _LIBRARIES} | gpu,
         **measured,
     )
 
@@ -236,13 +245,14 @@ def _laps(clock: dict[str, float]) -> dict[str, float]:
 
 def _trained_vae(
     recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress,
-    unfinished: Unfinished | None,
+    unfinished: Unfinished | None, device: str,
 ) -> tuple[Vae, float]:  # fmt: skip
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
     if isinstance(vae, MlpVae):
         vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
-    return vae, train_vae(vae, data, recipe, generator, progress, unfinished)
+    cpu_s = train_vae(vae.to(device), data, recipe, generator, progress, unfinished)
+    return vae.cpu(), cpu_s
 
 
 @torch.no_grad()

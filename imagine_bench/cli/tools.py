@@ -11,7 +11,7 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.cli.options import ANY, NEWEST, listed, only, require_values, shown
-from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
 from imagine_bench.tools.doctor import examine
@@ -57,6 +57,8 @@ class Encoder:
     """Images a gradient step, at least 1."""
     latents: Annotated[int | None, shown("INT", "(default: the recipe's)")] = None
     """Latents of the image, or of each strip, at least 1."""
+    device: str = DEVICES[0]
+    """Where gradient steps are made: cpu, or cuda (an NVIDIA GPU)."""
     out: Path = Path("encoders")
     """Folder for artefact, card and figure; never overwritten."""
 
@@ -65,7 +67,7 @@ class Encoder:
         retrain = registry.load(_RETRAIN)
         spec = registry.task(self.task)
         require_writable(self.out)
-        names = ("recipe", "appearance", "steps", "batch", "latents")
+        names = ("recipe", "appearance", "steps", "batch", "latents", "device")
         choices = {name: getattr(self, name) for name in names}
         print(retrain(spec, **choices, seed=self.seed, out=self.out))
 

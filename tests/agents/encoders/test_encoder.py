@@ -23,7 +23,7 @@ from imagine_bench.agents.networks.weights import initialise
 from safetensors.torch import save_file
 from torch import Tensor
 
-from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.preprocessing import gray_cells
 
 
@@ -239,6 +239,28 @@ def test_training_lowers_the_loss_and_reports_progress() -> None:
 
     assert loss(encoder.network).loss < 0.9 * loss(made_vae(recipe)).loss
     assert [stage for stage, done in stages if done == 1.0] == ["frames", "frames", "training", "probe"]
+
+
+def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UnknownNameError, match=r"No device 'gpu'.* Known: cpu, cuda"):
+        train_encoder(arrow_spec(), recipe=TINY, appearance="mild", seed=3, device="gpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SetupError, match="torch finds no NVIDIA GPU here; use device 'cpu'"):
+        train_encoder(arrow_spec(), recipe=TINY, appearance="mild", seed=3, device="cuda")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
+@pytest.mark.parametrize("recipe", [TINY, TINY_CONV], ids=lambda recipe: recipe.name)
+def test_a_gpu_repeats_itself_and_agrees_with_the_processor(recipe: Recipe) -> None:
+    few = replace(recipe, steps=20)
+    on_cpu, on_gpu, again = (
+        train_encoder(arrow_spec(), recipe=few, appearance="mild", seed=3, device=device)
+        for device in ("cpu", "cuda", "cuda")
+    )
+    frames, _ = draw_frames(arrow_spec(), "mild", 10, np.random.default_rng(0))
+    assert torch.equal(on_gpu.encode(frames)[0], again.encode(frames)[0])
+    torch.testing.assert_close(on_gpu.encode(frames)[0], on_cpu.encode(frames)[0], rtol=0.05, atol=0.05)
+    assert on_gpu.card.command == f"{on_cpu.card.command} --device cuda" and on_gpu.card.versions["gpu"]
 
 
 @pytest.mark.slow

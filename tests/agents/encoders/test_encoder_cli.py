@@ -60,8 +60,10 @@ def test_retrain_with_other_numbers_says_so(tmp_path: Path, monkeypatch: pytest.
     for nothing in ({"steps": 0}, {"batch": 0}, {"latents": 0}):
         with pytest.raises(InvalidValueError, match="has a count below 1"):
             retrain(arrow_spec(), recipe="tiny_conv", appearance="mild", seed=1, out=tmp_path / "none", **nothing)
-    with pytest.raises(InvalidValueError, match="without gradient steps; leave out --steps 1 --latents 11"):
+    with pytest.raises(InvalidValueError, match=r"without gradient steps; leave out --steps 1 --latents 11\."):
         retrain(arrow_spec(), recipe="codes", appearance="mild", seed=1, out=tmp_path, steps=1, latents=11)
+    with pytest.raises(InvalidValueError, match="leave out --device cuda"):
+        retrain(arrow_spec(), recipe="codes", appearance="mild", seed=1, out=tmp_path, device="cuda")
 
 
 def test_comparison_shows_both_cards() -> None:
