@@ -37,6 +37,7 @@ SHIFT_PX = 5
 _CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no change
 _CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change to belong to a factor
 _STARTS = (3, 0.2)  # the same of the starts of episodes: what no action changes may change there alone
+_ENOUGH = 500  # steps that a share is taken of at most: the more things there are, the more rarely each changes
 _LEAST_PX = 36  # pixels of a factor
 _LEAST_INNER_PX = 16  # the same of what is all in the inner of the picture: at its border, slivers come into view
 _FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
@@ -151,7 +152,8 @@ def _parts(
 def _often(change: Mask, begins: Mask) -> Mask:
     """Pixels (64, 64) that change in enough of the steps (N - 1, 64, 64), or of those to the first of an episode."""
     of = ((change, _CHANGES), (change[begins[1:]], _STARTS))
-    return np.any([steps.sum(axis=0) >= max(least, share * len(steps)) for steps, (least, share) in of], axis=0)
+    counts = ((steps.sum(axis=0), max(least, share * min(len(steps), _ENOUGH))) for steps, (least, share) in of)
+    return np.any([count >= enough for count, enough in counts], axis=0)
 
 
 def _resting(images: Images, change: Mask, noise: Mask) -> Images:

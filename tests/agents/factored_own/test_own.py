@@ -173,6 +173,15 @@ def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
     assert codes[[5, 20, 40]].tolist() == [[1]] * 3 and codes.sum() == 3
 
 
+def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() -> None:
+    """In 2.5 % of the steps, the share of one of many things; what changed half as often is none yet."""
+    frames = np.full((800, 64, 64, 3), 120, dtype=np.uint8)
+    frames[40::80, 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
+    frames[80::160, 40:52, 40:52] += (100 * shape(1))[..., None].astype(np.uint8)
+    found = looks.find(frames)
+    assert [len(factor.joint) for factor in found] == [2] and found[0].parts[0].mask[20:32, 20:32].any()
+
+
 def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
     """A sliver of what lies beside it has contours, but hardly any beside those of what may lie there."""
     value = np.arange(90) % 3  # nothing, or one of two marks
