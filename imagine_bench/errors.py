@@ -84,7 +84,7 @@ class RunFailedError(ImagineBenchError):
 EXTRAS = {
     "torch": "agents", "matplotlib": "report", "PIL": "report", "rerun": "rerun", "ray": "ray", "pygame": "play",
     "minari": "data", "pyarrow": "data", "stable_baselines3": "peers", "sb3_contrib": "peers", "sheeprl": "peers",
-    "hydra": "peers", "tensorboard": "tracking", "wandb": "tracking", "submitit": "slurm",
+    "torch_world": "peers", "hydra": "peers", "tensorboard": "tracking", "wandb": "tracking", "submitit": "slurm",
 }  # fmt: skip
 """The extra of this package that brings a module."""
 

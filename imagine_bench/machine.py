@@ -20,7 +20,7 @@ from imagine_bench import registry
 from imagine_bench.errors import SetupError
 
 PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
-OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3")
+OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3", "torch-world")
 """Of adapters and of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")

@@ -32,6 +32,7 @@ from ..encoders.perception import Perception, load_perception, prepare_torch
 from ..meters import Meters
 from ..settings import flatten
 from .dreamer_settings import HYPERPARAMETERS, DreamerSettings
+from .lent_generator import LentGenerator
 
 _PIXELS, _LATENTS = "rgb", "latents"
 _CHANNELS_FIRST = (2, 0, 1)
@@ -56,7 +57,7 @@ class Dreamer:
         self._config = _config(settings, pixels=perception is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
         self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
-        self._random = torch.Generator().manual_seed(seed).get_state()
+        self._random, self._test_random = LentGenerator(seed, device), LentGenerator(0, device)
         self._rng = np.random.default_rng([seed, 1])
         with self._drawing():
             shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
@@ -80,7 +81,7 @@ class Dreamer:
         """Forget what was seen: the next frame is an episode's first."""
         self._player.init_states()
         self._first = True
-        self._test_random = torch.Generator().manual_seed(0).get_state()
+        self._test_random.reset(0)
 
     @torch.no_grad()
     def act(self, observation: Observation, *, explore: bool) -> int:
@@ -144,24 +145,16 @@ class Dreamer:
 
     @contextmanager
     def _drawing(self, *, test: bool = False) -> Iterator[None]:
-        """Lend torch's global generator to the library: a test's, or this learner's own.
+        """The library draws from a test's generator, or from this learner's own.
 
-        A graphics card's is seeded from it. Distributions are not validated, as where the library runs by itself.
+        Distributions are not validated, as where the library runs by itself.
         """
-        before, validated = torch.get_rng_state(), Distribution._validate_args
+        validated = Distribution._validate_args
         Distribution.set_default_validate_args(False)
-        torch.set_rng_state(self._test_random if test else self._random)
-        if self._fabric.device.type == "cuda":
-            torch.cuda.manual_seed(int(torch.randint(2**62, (), generator=torch.default_generator)))
         try:
-            yield
+            with (self._test_random if test else self._random).lent():
+                yield
         finally:
-            after = torch.get_rng_state()
-            if test:
-                self._test_random = after
-            else:
-                self._random = after
-            torch.set_rng_state(before)
             Distribution.set_default_validate_args(validated)
 
     def diagnostics(self) -> dict[str, float]:
@@ -170,7 +163,7 @@ class Dreamer:
 
     def state(self) -> AgentState:
         """A snapshot between two episodes: weights, moments, replay, generators, counters."""
-        arrays = {"generator": self._random.numpy().copy()}
+        arrays = {"generator": self._random.state.numpy().copy()}
         for name, module, optimiser in self._trained():
             arrays |= snapshot.prefixed(name, snapshot.training_arrays(module, optimiser))
         for name, module in (("target", self._target), ("returns", self._moments)):
@@ -190,7 +183,7 @@ class Dreamer:
             snapshot.load_training(module, optimiser, snapshot.below(name, arrays))
         for name, module in (("target", self._target), ("returns", self._moments)):
             module.load_state_dict({k: torch.tensor(v) for k, v in snapshot.below(name, arrays).items()})
-        self._random = torch.tensor(arrays["generator"])
+        self._random.state = torch.tensor(arrays["generator"])
         self._memory.load(snapshot.below("replay", arrays))
         self._rng.bit_generator.state = values["exploration"]
         self.meters.restore(values["meters"])

@@ -15,7 +15,9 @@ import numpy as np
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.certificates.certificate import certificate
 from imagine_bench.report import plots
+from imagine_bench.report.data import collect
 from imagine_bench.report.radar import radar_figure
+from imagine_bench.store.archive import load_archive
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -30,12 +32,6 @@ COLORS = {
     "imagination_only": "#cc79a7",
     "sb3_dqn": "#b07d00",
     "sb3_dqn_latents": "#332288",
-}
-LEARNING = {
-    "arrow_puzzle-factored-2000-episodes": ("factored",),
-    "arrow_puzzle-2000-episodes": ("imagination_uncertainty", "imagination", "dqn", "imagination_only"),
-    "arrow_puzzle-sb3_dqn": ("sb3_dqn",),
-    "arrow_puzzle-sb3_dqn_latents": ("sb3_dqn_latents",),
 }
 
 
@@ -72,16 +68,39 @@ def finish(axes: plt.Axes, budgets: list[int]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def learning_curves() -> None:
-    """All agents on the arrow puzzle, to 2,000 episodes."""
-    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
-    for folder, agents in LEARNING.items():
-        for agent in agents:
-            curve(axes, folder, agent)
-    axes.set_ylabel("test episodes solved (%)")
-    finish(axes, [100, 250, 500, 1000, 2000])
-    figure.legend(loc="outside right upper", frameon=False)
-    figure.savefig(HERE / "learning_curves.png", dpi=150)
+PEERS = ("arrow_puzzle-controls-networks", "arrow_puzzle-peers", "arrow_puzzle-dreamer_latents")
+"""Kept benches with the same tests after 100, 250 and 500 episodes."""
+SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
+"""What stands behind a name that has settings, by one that only those have."""
+
+
+def peers() -> None:
+    """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
+    rows = [(data, agent) for kept in PEERS for data in [collect(load_archive(RESULTS / kept))] for agent in data.areas]
+    rows.sort(key=lambda row: row[0].areas[row[1]][500].value)
+    figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
+    columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
+    for height, (data, agent) in enumerate(rows):
+        color, area, price = plots.color(agent), data.areas[agent][500], data.prices[agent][500]
+        shares = statistics.running_means(data.budgets, data.result.success_rates(agent), data.facts.chance_level)
+        seeds = 100 * shares[:, data.budgets.index(500)]
+        axes.plot([100 * area.low, 100 * area.high], [height] * 2, color=color, linewidth=6, alpha=0.3)
+        axes.plot(seeds, [height] * len(seeds), "o", color=color, markersize=3.5)
+        axes.plot([100 * area.value], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
+        for place, value in zip(columns, (data.frames_before[agent], price.updates, price.train_cpu_s), strict=True):
+            said = "?" if value is None or np.isnan(value) else f"{value:,.0f}"
+            axes.text(place, height, said, transform=axes.get_yaxis_transform(), ha="right", va="center")
+    for place, name in columns.items():
+        axes.text(place, 1.0, name, transform=axes.transAxes, ha="right", va="bottom")
+    axes.axvline(100 * rows[0][0].facts.chance_level, color="#777777", linestyle=":", linewidth=1)
+    settings = ("".join(said for name, said in SETTINGS.items() if name in agent) for _, agent in rows)
+    names = [agent.partition(":")[0] + said for (_, agent), said in zip(rows, settings, strict=True)]
+    axes.set_yticks(range(len(rows)), names)
+    axes.set(xlim=(0, 100), ylim=(-0.6, len(rows) - 0.4))
+    axes.set_xlabel("mean success over the first 500 real episodes (%); dotted: chance")
+    axes.grid(axis="x", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(HERE / "peers.png", dpi=120, facecolor="white", bbox_inches="tight")
 
 
 LADDER = {
@@ -256,9 +275,7 @@ def dials() -> None:
     figure.savefig(HERE / "dials.png", dpi=110)
 
 
-PICTURES = {
-    each.__name__: each for each in (learning_curves, ladder, thesis_settings, rungs, mild, margins, why, radar, dials)
-}
+PICTURES = {each.__name__: each for each in (peers, ladder, thesis_settings, rungs, mild, margins, why, radar, dials)}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:

@@ -206,6 +206,12 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
         description="DreamerV3 on the latents that the suite's own DQN sees.",
     ),
+    "lewm": AgentEntry(
+        make="imagine_bench.agents.library.lewm:make", needs_encoder=False, title="LeWM (pixels)",
+        settings="imagine_bench.agents.library.lewm_settings:HYPERPARAMETERS",
+        description="torch-world's LeWM: a latent world model of pixels without rewards; plans toward frames that "
+        "earned most.",
+    ),
 }  # fmt: skip
 
 DEMONSTRATOR = "oracle"

@@ -31,7 +31,7 @@ _COLORS = (
     "#44aa99", "#aa4499", "#117733", "#cc6677", "#7f5539", "#9aa600",
     "#4d9221", "#5b5ea6", "#c51b7d", "#5ab4ac", "#b35806", "#542788",
     "#01665e", "#bf812d", "#762a83", "#7fbc41", "#2166ac", "#b2182b",
-    "#de77ae", "#35978f", "#a6761d", "#7570b3", "#e7298a",
+    "#de77ae", "#35978f", "#a6761d", "#7570b3", "#e7298a", "#1b7837",
 )  # fmt: skip
 Value = TypeVar("Value")
 Failures = dict[str, dict[int, tuple[int, Counter[str]]]]

@@ -1,0 +1,38 @@
+"""Torch's global generator, lent to a library that draws from no other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+class LentGenerator:
+    """A state of torch's global generator, which goes on where it stopped each time it is lent.
+
+    Args:
+        seed: Where it begins.
+        device: ``"cpu"``, or ``"cuda"``: then a graphics card's generator is seeded from it.
+    """
+
+    def __init__(self, seed: int, device: str) -> None:
+        self._device = device
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        """Begin anew."""
+        self.state = torch.Generator().manual_seed(seed).get_state()
+
+    @contextmanager
+    def lent(self) -> Iterator[None]:
+        """What is drawn in this block is drawn from here; the global generator is afterwards as it was."""
+        before = torch.get_rng_state()
+        torch.set_rng_state(self.state)
+        if self._device == "cuda":
+            torch.cuda.manual_seed(int(torch.randint(2**62, (), generator=torch.default_generator)))
+        try:
+            yield
+        finally:
+            self.state = torch.get_rng_state()
+            torch.set_rng_state(before)
