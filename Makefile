@@ -28,7 +28,7 @@ takes_docs := ARGS
 takes_lock := ARGS
 # The default of these; without TASK the others take the newest bench of any task.
 bench peers study judge encoder film: TASK ?= arrow_puzzle
-peers: AGENTS ?= sb3_dqn sb3_qrdqn sb3_dqn_latents dreamer_v3 dreamer_v3_latents
+peers: AGENTS ?= sb3_dqn sb3_qrdqn sb3_dqn_latents dreamer_v3 dreamer_v3_latents lewm
 peers: SEEDS ?= 0 1 2 3 4
 peers: BUDGETS ?= 100 250 500 1000 2000
 

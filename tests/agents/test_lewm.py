@@ -119,6 +119,8 @@ def test_restored_it_goes_on_to_the_bit_and_the_global_generator_is_left_alone()
     state = agent.state()
     twin = learner(seed=1, replay_ratio=0.7)
     twin.restore(state)
+    taken_up = twin.state().arrays
+    assert all(np.array_equal(taken_up[name], state.arrays[name]) for name in state.arrays)
     assert practise(agent, 12) == practise(twin, 12) and agent.updates == twin.updates == 13
     ours, theirs = agent.state(), twin.state()
     assert all(np.array_equal(ours.arrays[name], theirs.arrays[name]) for name in ours.arrays)

@@ -168,17 +168,8 @@ def price(budget: str, where: str, what: str) -> str:
     return "–" if np.isnan(mean) else f"{mean:,.0f}"
 
 
-def raw(run: str, budget: str, folder: str, column: str) -> str:
-    """A column of one run of a folder, at a budget that it may not have reached."""
-    with (RESULTS / folder / "results.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["agent"], row["episodes"]) == (run, budget)]
-    return f"{float(rows[0][column]):,.0f}" if rows else "–"
-
-
 def price_to(where: str, level: str, what: str) -> str:
     """The same until the test from which on all reach a level, mean over seeds."""
-    if what == "frames":
-        return price("0", where, what)
     budgets = reached(where, level)
     if np.isnan(budgets).any():
         return "–"
@@ -476,6 +467,6 @@ CELLS: dict[str, Callable[..., str | list[Compared]]] = {
         first_of, last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged,
         judged_after, choice,
         thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
-        shortest, price, price_to, raw, coverage, certified,
+        shortest, price, price_to, coverage, certified,
     )
 }  # fmt: skip
