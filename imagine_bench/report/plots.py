@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, TypeVar
 from zlib import crc32
 
@@ -101,7 +102,8 @@ def color(agent: str) -> str:
 
 def success_figure(data: ReportData) -> Figure:
     """Success (%) against real training episodes, with 95 % intervals, chance level, optimum and the thesis' points."""
-    figure = Figure(figsize=(9.2, 4.9), layout="constrained")
+    lines = sum(_lines(_in_lines(agent_words(agent).title)) for agent in data.scores)
+    figure = Figure(figsize=(9.2, max(4.9, 0.33 * lines)), layout="constrained")
     axes = figure.add_subplot()
     for share in (data.facts.optimum, data.facts.chance_level):
         axes.axhline(100.0 * share, **_REFERENCE_LINE)
@@ -125,9 +127,12 @@ def ladder_figure(reached: Mapping[str, Sequence[int | None]], last: int, floor:
     beyond = 1.6 * last
     found = {agent: [beyond if each is None else each for each in seeds] for agent, seeds in reached.items()}
     rungs = sorted(found, key=lambda agent: (float(np.median(found[agent])), float(np.mean(found[agent]))))
-    figure = Figure(figsize=(9.2, 1.0 + 0.34 * len(rungs)), layout="constrained")
+    names = [_in_lines(agent_words(agent).title) for agent in rungs]
+    spans = np.array([max(1.0, 0.5 * _lines(name)) for name in names])  # of a rung, in single ones
+    heights = spans.cumsum() - 0.5 * spans - 0.5
+    figure = Figure(figsize=(9.2, 1.0 + 0.34 * spans.sum()), layout="constrained")
     axes = figure.add_subplot()
-    for height, agent in enumerate(rungs):
+    for height, agent in zip(heights, rungs, strict=True):
         middle = float(np.median(found[agent]))
         axes.plot([floor or min(found[agent]), middle], [height] * 2, color=color(agent), alpha=0.35)
         axes.plot([middle], [height], "|", color=color(agent), markersize=13, markeredgewidth=2.5)
@@ -137,15 +142,15 @@ def ladder_figure(reached: Mapping[str, Sequence[int | None]], last: int, floor:
             axes.plot(values, height + shifts, marker, color=color(agent), markersize=4.5, linestyle="none")
     if floor is not None:
         axes.axvline(floor, **_REFERENCE_LINE)
-        name, top = f"information floor, {floor:.0f}", (floor, len(rungs) - 0.45)
+        name, top = f"information floor, {floor:.0f}", (floor, spans.sum() - 0.45)
         axes.annotate(name, top, xytext=(4, 0), textcoords="offset points", fontsize=9)
     ticks = [each for each in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000) if each <= last]
     axes.set_xscale("log")
     axes.set_xticks([*ticks, beyond], [*(f"{each:,}" for each in ticks), "never"])
     axes.minorticks_off()
-    axes.set_yticks(range(len(rungs)), [agent_words(agent).title for agent in rungs])
+    axes.set_yticks(heights, names)
     least = min(floor or beyond, *(min(seeds) for seeds in found.values()))
-    axes.set(xlim=(0.6 * least, 1.1 * beyond), ylim=(-0.6, len(rungs) - 0.1))
+    axes.set(xlim=(0.6 * least, 1.1 * beyond), ylim=(-0.6, spans.sum() - 0.1))
     axes.set_xlabel("real training episodes (logarithmic)")
     return figure
 
@@ -343,8 +348,8 @@ def _end_labels(axes: Axes, last: Mapping[str, float], to_x: float) -> None:
     step = 0.065 * (high - low) * 4.9 / axes.get_figure(root=True).get_figheight()  # type: ignore[union-attr]
     names = sorted(last, key=lambda agent: last[agent])
     words = {agent: _in_lines(agent_words(agent).title) for agent in names}
-    step *= max(1 + each.count("\n") for each in words.values())
-    places = spread_labels([last[agent] for agent in names], step, top=high)
+    rooms = [step * _lines(words[agent]) for agent in names]
+    places = spread_labels([last[agent] for agent in names], rooms, top=high)
     for agent, y in zip(names, places, strict=True):
         axes.annotate(
             words[agent], xy=(1.005, last[agent]), xycoords=axes.get_yaxis_transform(), xytext=(1.04, y),
@@ -360,13 +365,18 @@ def _in_lines(title: str) -> str:
     return "\n".join(line for part in parts for line in textwrap.wrap(part, _LONG))
 
 
-def spread_labels(values: Sequence[float], step: float, *, top: float) -> list[float]:
-    """Ascending values moved as little as it takes to lie ``step`` apart, none above ``top``."""
+def _lines(text: str) -> int:
+    return 1 + text.count("\n")
+
+
+def spread_labels(values: Sequence[float], rooms: Sequence[float], *, top: float) -> list[float]:
+    """Ascending values moved as little as it takes for each to have its room, half of it either way, none above top."""
+    steps = [0.5 * (before + after) for before, after in pairwise(rooms)]
     places: list[float] = []
-    for value in values:
-        places.append(max(value, places[-1] + step) if places else value)
+    for index, value in enumerate(values):
+        places.append(max(value, places[-1] + steps[index - 1]) if places else value)
     for index in reversed(range(len(places))):
-        places[index] = min(places[index], top - step * (len(places) - 1 - index))
+        places[index] = min(places[index], top - sum(steps[index:]))
     return places
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from imagine_bench.report import plots
 
@@ -45,3 +48,15 @@ def test_the_floor_stands_where_the_certificate_has_it() -> None:
     assert [text.get_text() for text in axes.texts] == ["information floor, 62"]
     (without,) = plots.ladder_figure(REACHED, LAST, None).axes
     assert not without.texts and "never" in [label.get_text() for label in without.get_xticklabels()]
+
+
+def test_names_with_many_settings_leave_room_for_all() -> None:
+    settings = ",".join(f"{name}_learning_rate=0.0003" for name in ("model", "actor", "critic"))
+    long = {f"dreamer_v3:{settings},batch_size={size},replay_ratio=2": (None, None, 500) for size in (16, 64)}
+    figure = plots.ladder_figure({**REACHED, **long}, LAST, FLOOR)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    (axes,) = figure.axes
+    boxes = [label.get_window_extent() for label in axes.get_yticklabels()]
+    assert all(below.y1 < above.y0 for below, above in pairwise(boxes))
+    assert axes.get_window_extent().width > 0.6 * figure.get_window_extent().width

@@ -129,8 +129,9 @@ def test_a_name_with_many_settings_stays_in_the_picture() -> None:
 
 
 def test_names_move_only_as_far_as_they_must() -> None:
-    assert plots.spread_labels([4.0, 98.0, 99.0, 100.0], 5.0, top=106.0) == [4.0, 96.0, 101.0, 106.0]
-    assert plots.spread_labels([0.0, 0.0, 50.0], 5.0, top=106.0) == [0.0, 5.0, 50.0]
+    assert plots.spread_labels([4.0, 98.0, 99.0, 100.0], [5.0] * 4, top=106.0) == [4.0, 96.0, 101.0, 106.0]
+    assert plots.spread_labels([0.0, 0.0, 50.0], [5.0] * 3, top=106.0) == [0.0, 5.0, 50.0]
+    assert plots.spread_labels([0.0, 0.0, 0.0], [2.0, 6.0, 2.0], top=106.0) == [0.0, 4.0, 8.0]
 
 
 def test_lines_along_an_axis_are_not_clipped(tmp_path: Path) -> None:
