@@ -91,9 +91,9 @@ class Hyperparameters(Generic[S]):
     groups: Mapping[str, ConfigGroup[S]]
 
     @classmethod
-    def everywhere(cls, settings: S) -> Hyperparameters[S]:
-        """The same settings in every group and set."""
-        return cls({group: ConfigGroup(settings, {name: {} for name in SETS}) for group in CONFIG_GROUPS})
+    def everywhere(cls, settings: S, **sets: Mapping[str, Override]) -> Hyperparameters[S]:
+        """The same settings in every group, and in every set but those that are given."""
+        return cls({group: ConfigGroup(settings, {**{name: {} for name in SETS}, **sets}) for group in CONFIG_GROUPS})
 
     def names(self) -> frozenset[str]:
         """The dotted names of all settings."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..settings import (
-    CONFIG_GROUPS,
     COUNT,
     NOT_NEGATIVE,
     POSITIVE,
     PROBABILITY,
     ROWS,
-    ConfigGroup,
     Hyperparameters,
     Override,
     between,
@@ -57,7 +55,7 @@ _FAST = {
     "model.classes": Override(8, "as units"),
     "model.categoricals": Override(8, "as units"),
     "learning_starts": Override(100, "episodes have 3 macro-actions, and budgets are some hundred episodes"),
-    "sequence_length": Override(10, "an episode is over after 10 macro-actions"),
+    "sequence_length": Override(10, "an episode is over after 10 macro-actions (as danijar/dreamer#47 advises)"),
     "horizon": Override(5, "the longest of shortest plans is 5 macro-actions"),
     "discount": Override(0.95, "as our agents"),
 }
@@ -69,10 +67,5 @@ _MINIMAL = {
     "learning_starts": Override(4, "only shows that all parts work"),
     "replay_ratio": Override(0.5, "only shows that all parts work"),
 }
-HYPERPARAMETERS = Hyperparameters(
-    {
-        group: ConfigGroup(DreamerSettings(), {"published": {}, "fast": _FAST, "minimal": _MINIMAL})
-        for group in CONFIG_GROUPS
-    }
-)
+HYPERPARAMETERS = Hyperparameters.everywhere(DreamerSettings(), fast=_FAST, minimal=_MINIMAL)
 """``published`` are the library's own."""

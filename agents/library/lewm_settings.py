@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from imagine_bench.errors import InvalidValueError
 
 from ..settings import (
-    CONFIG_GROUPS,
     COUNT,
     DROPOUT,
     NOT_NEGATIVE,
     POSITIVE,
     PROBABILITY,
     ROWS,
-    ConfigGroup,
     Hyperparameters,
     Override,
     between,
@@ -86,10 +84,5 @@ _MINIMAL = {
     "learning_starts": Override(4, "only shows that all parts work"),
     "horizon": Override(2, "only shows that all parts work"),
 }
-HYPERPARAMETERS = Hyperparameters(
-    {
-        group: ConfigGroup(LeWMSettings(), {"published": {}, "fast": _FAST, "minimal": _MINIMAL})
-        for group in CONFIG_GROUPS
-    }
-)
+HYPERPARAMETERS = Hyperparameters.everywhere(LeWMSettings(), fast=_FAST, minimal=_MINIMAL)
 """``published`` are the paper's."""
