@@ -252,7 +252,7 @@ def make() -> Callable[..., tuple[int, str]]:
         ("bench APPEARANCE=mild EXECUTION=x ENCODER=y", "bench --task {} --appearance mild --execution x --encoder y"),
         (
             "peers SEEDS=7 BUDGETS=9",
-            "bench --task {} --agents sb3_dqn sb3_qrdqn sb3_dqn_latents dreamer_v3 dreamer_v3_latents "
+            "bench --task {} --agents sb3_dqn sb3_qrdqn sb3_dqn_latents dreamer_v3 dreamer_v3_latents lewm "
             "--seeds 7 --budgets 9",
         ),
         ("plan", "plan"),
