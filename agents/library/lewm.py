@@ -53,6 +53,7 @@ class LeWMPlanner:
         self._sequences = nn.functional.one_hot(sequences, n_actions).float().to(device)  # [S, H, A]
         self._rows: dict[str, list[Any]] = {name: [] for name in _ROW}
         self._goals: list[Frame] = []
+        self._aims: Tensor | None = None  # latents of the goals (G, D), until these or the model change
         self._most = -np.inf  # earned by a transition
         self.meters = Meters()
         self.steps = self.updates = 0
@@ -80,9 +81,11 @@ class LeWMPlanner:
 
         That is the library's objective of a path, whose mean distance counts, of an episode that arrives at any step.
         """
-        start, goals = self._model.encode(self._pixels([frame, *self._goals])).split((1, len(self._goals)))
+        if self._aims is None:
+            self._aims = self._model.encode(self._pixels(self._goals))[:, 0]
+        start = self._model.encode(self._pixels([frame]))
         path = self._model.rollout(start.expand(len(self._sequences), -1, -1), self._sequences)[:, 1:]  # [S, H, D]
-        apart = torch.cdist(path.flatten(0, 1), goals[:, 0]).square().unflatten(0, path.shape[:2])  # [S, H, G]
+        apart = torch.cdist(path.flatten(0, 1), self._aims).square().unflatten(0, path.shape[:2])  # [S, H, G]
         rest = torch.arange(path.shape[1] - 1, -1, -1, device=apart.device)[:, None]  # [H, 1]
         return self._first[int((apart.cumsum(dim=1) + rest * apart).flatten(1).amin(dim=1).argmin())]
 
@@ -95,7 +98,7 @@ class LeWMPlanner:
         if transition.reward > self._most:
             self._most, self._goals = transition.reward, []
         if transition.reward == self._most:
-            self._goals = [*self._goals, following][-self.settings.goals :]
+            self._goals, self._aims = [*self._goals, following][-self.settings.goals :], None
         self.steps += 1
         if self.steps >= self.settings.learning_starts:
             self._owed += self.settings.replay_ratio
@@ -120,7 +123,7 @@ class LeWMPlanner:
                 recompute_batchnorm(self._model.eval(), [batch], lambda each: self._model(*each))
         for name in ("pred_loss", "sigreg_loss"):
             self.meters.add(f"loss/{name.removesuffix('_loss')}", losses[name].item())
-        self.updates += 1
+        self.updates, self._aims = self.updates + 1, None
 
     def _pixels(self, frames: list[Frame]) -> Tensor:
         """What the model reads of N frames. Shape (N, 1, 3, 64, 64), in [0, 1]."""
@@ -155,7 +158,7 @@ class LeWMPlanner:
         for name, value in self._model.named_buffers():
             value.copy_(torch.tensor(arrays[f"buffer/{name}"]))
         self._rows = {name: list(arrays[f"replay/{name}"]) for name in _ROW}
-        self._goals = list(arrays["replay/goals"])
+        self._goals, self._aims = list(arrays["replay/goals"]), None
         self._most = -np.inf if values["most"] is None else values["most"]
         self._random.state = torch.tensor(arrays["generator"])
         self._rng.bit_generator.state = values["exploration"]

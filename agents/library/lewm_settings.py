@@ -64,7 +64,7 @@ class LeWMSettings:
 _FAST = {
     "regularisation": Override(1.0, "solves 15 % after 500 episodes on a tuning seed, 0.09 less than 5 %"),
     "model.embedding": Override(96, "a world of some hundred macrostates; two cores"),
-    "model.encoder_depth": Override(3, "as embedding; an update is 20 times as fast"),
+    "model.encoder_depth": Override(3, "as embedding"),
     "model.predictor_depth": Override(2, "as embedding"),
     "model.predictor_heads": Override(4, "as embedding"),
     "model.units": Override(256, "as embedding"),

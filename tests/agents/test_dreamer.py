@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from small_runs import context
 
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import AgentContext, Observation, Transition
-from imagine_bench.seeding import SeedTree
+from imagine_bench.interfaces import Observation, Transition
 
 pytest.importorskip("sheeprl")
 with warnings.catch_warnings():
@@ -22,12 +23,8 @@ with warnings.catch_warnings():
 
 
 def learner(seed: int = 0, encoder: Path | None = None, **overrides: Any) -> Dreamer:
-    return make(
-        AgentContext(
-            n_actions=3, preprocessing="gray_strips", encoder=encoder, seeds=SeedTree(seed).child("agent"),
-            hyperparameters="minimal", overrides=overrides,
-        )
-    )  # fmt: skip
+    changes = {"n_actions": 3, "encoder": encoder, "hyperparameters": "minimal", "overrides": overrides}
+    return make(replace(context(seed), **changes))
 
 
 def seen(value: int) -> Observation:

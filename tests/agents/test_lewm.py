@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from small_runs import context
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import AgentContext, Observation, Transition
-from imagine_bench.seeding import SeedTree
+from imagine_bench.interfaces import Observation, Transition
 
 pytest.importorskip("torch_world")
 import torch
@@ -20,12 +21,7 @@ GOAL = 2
 
 
 def learner(seed: int = 0, **overrides: Any) -> LeWMPlanner:
-    return make(
-        AgentContext(
-            n_actions=3, preprocessing="gray_strips", encoder=None, seeds=SeedTree(seed).child("agent"),
-            hyperparameters="minimal", overrides=overrides,
-        )
-    )  # fmt: skip
+    return make(replace(context(seed), n_actions=3, hyperparameters="minimal", overrides=overrides))
 
 
 def seen(place: int) -> Observation:
@@ -94,7 +90,7 @@ def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
     assert agent.act(seen(GOAL + 1), explore=False) == 0
     two_away = agent.act(seen(0), explore=False)
     assert two_away in {0, 2} and agent.act(seen(moved(0, two_away)), explore=False) == two_away
-    agent._goals = [seen(0).frame, seen(3).frame]
+    agent._goals, agent._aims = [seen(0).frame, seen(3).frame], None
     assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
 
 
