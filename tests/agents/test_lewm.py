@@ -140,3 +140,14 @@ def test_tests_change_nothing() -> None:
 def test_sizes_that_do_not_fit_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidValueError, match=r"patch is .* must divide 64.* multiple of 4 times .*, 12"):
         learner(**wrong)
+
+
+@pytest.mark.parametrize("replay_ratio", [0.0, 1.0])
+def test_plans_follow_new_goals_and_a_changed_model(replay_ratio: float) -> None:
+    agent = learner(replay_ratio=replay_ratio)
+    for seen_so_far in (12, 6, 1):
+        practise(agent, seen_so_far)
+        agent.act(seen(0), explore=False)
+        with torch.no_grad():
+            now = agent._model.encode(agent._pixels(agent._goals))[:, 0]
+        assert agent._aims is not None and torch.equal(agent._aims, now)
