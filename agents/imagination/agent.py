@@ -172,7 +172,8 @@ class ImaginingAgent(DQN):
         encoder, imagination = self.perception.encoder, self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
         parts = [decompose(step.samples) for step in imagined]
-        before = accumulate((imagination.uncertainty(step) for step in imagined), initial=torch.zeros(1))
+        nothing = torch.zeros_like(imagined[0].reward)  # on the device of what follows
+        before = accumulate(map(imagination.uncertainty, imagined), initial=nothing)
         gathered = before if imagination.settings.accumulates else repeat(0.0)
 
         def joined(values: Iterable[Tensor]) -> NDArray[Any]:
