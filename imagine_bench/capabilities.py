@@ -93,6 +93,17 @@ class ValueReader(Protocol):
 
 
 @runtime_checkable
+class NoveltyReader(Protocol):
+    """An agent that can say how much of each macro-action it does not know: what its curiosity goes by."""
+
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+        """How unknown every macro-action is, in [0, 1] by the agent's own measure; None where it has none. Shape (A,).
+
+        ``rng`` draws weight samples; nothing changes in the agent.
+        """
+
+
+@runtime_checkable
 class ModelOnlyTrainer(Protocol):
     """An agent that is trained in its model alone before it is tested."""
 

@@ -151,6 +151,14 @@ class CodeAgent(Generic[PerceptionT]):
         """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
         return self._values(self.perception.code(observation.frame)).astype(np.float32)
 
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+        """Where it would explore; see :class:`imagine_bench.capabilities.NoveltyReader`. None before it learned."""
+        del rng
+        if not self._ready:
+            return None
+        code = self.perception.code(observation.frame)
+        return self.planner.values(code, "novelty", self._left).astype(np.float32)
+
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         began = self.tasks[-1] if self.tasks else 0

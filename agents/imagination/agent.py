@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
-from imagine_bench.interfaces import AgentContext, AgentState, Frame
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -24,6 +24,7 @@ from ..meters import Meters
 from ..networks.precision import settle
 from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
+from .filter import weight_samples
 from .rollouts import TERMINAL, Imagination, Imagined, Weights
 from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
@@ -89,7 +90,7 @@ class ImaginingAgent(DQN):
         batch, weight = super().draw_batch(memory), self.settings.imagination.curiosity
         if weight == 0.0 or memory is not self.real:
             return batch
-        paid = weight * self.imagination.ignorance(batch.z, batch.action)
+        paid = weight * self.imagination.ignorance(batch.z, batch.action, self.imagination.generators["dropout"])
         self.meters.add("imagination/intrinsic_reward", float(paid.mean()))
         return replace(batch, reward=batch.reward + paid)
 
@@ -126,6 +127,14 @@ class ImaginingAgent(DQN):
         self.real.clear()
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
         self.steps = self.updates = 0
+
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+        """What curiosity pays for; see :class:`imagine_bench.capabilities.NoveltyReader`. None of a single network."""
+        if weight_samples(self.settings) * self.settings.model.members == 1:
+            return None
+        z = self.perceive(observation.frame).expand(self.n_actions, -1)
+        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
+        return self.imagination.ignorance(z, torch.arange(self.n_actions, device=z.device), generator).cpu().numpy()
 
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator

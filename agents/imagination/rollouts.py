@@ -129,12 +129,12 @@ class Imagination:
         del z, action
         return predicted
 
-    def ignorance(self, z: Tensor, action: Tensor) -> Tensor:
+    def ignorance(self, z: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Epistemic variance of where actions (N,) lead from z (N, Z), reduced as the filter does, at most 1: (N,).
 
         Noise and the choice among several outcomes are no part of it (thesis 6): it is to be paid for exploring.
         """
-        weights = self.model.draw_weights(self.settings.weight_samples, self.generators["dropout"])
+        weights = self.model.draw_weights(self.settings.weight_samples, generator)
         return self.filter.score(decompose(self.model.predict(z, action, weights)).epistemic).clamp(max=1.0)
 
     def _predicted(

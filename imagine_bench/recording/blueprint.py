@@ -19,12 +19,12 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
 
 
 def blueprint(
-    *, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool, sees: bool
+    *, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool, sees: bool, explores: bool
 ) -> rrb.Blueprint:
     """The layout: the scene large, beside it what the agent sees and predicts, below it what it imagines.
 
     ``target_m`` (3,) is what the 3D view looks at; ``several`` rollouts may be imagined from each frame; ``sees``: it
-    shows how it learned to see.
+    shows how it learned to see; ``explores``: it tells how unknown each macro-action is.
     """
     frame = rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64")
     text = rrb.TextDocumentView(origin="/real/text", name="What happens")
@@ -32,7 +32,7 @@ def blueprint(
     if values:
         side.append(rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action"))
     top = rrb.Horizontal(scene_view(target_m), rrb.Vertical(*side), column_shares=[1.1, 1.0])
-    pages: list[rrb.Container | rrb.View] = [_over_time(values=values)]
+    pages: list[rrb.Container | rrb.View] = [_over_time(values=values, explores=explores)]
     if imagines:
         pages = [_imagined_now(), *([_sampled_rollouts()] if several else []), *pages, _by_depth()]
     if sees:
@@ -66,10 +66,12 @@ def _sampled_rollouts() -> rrb.Spatial2DView:
     )
 
 
-def _over_time(*, values: bool) -> rrb.Horizontal:
+def _over_time(*, values: bool, explores: bool) -> rrb.Horizontal:
     views = [rrb.TimeSeriesView(origin="/real/reward", name="Reward of each real macro-action")]
     if values:
         views.append(rrb.TimeSeriesView(origin="/real/q_values", name="Q-value of each macro-action"))
+    if explores:
+        views.append(rrb.TimeSeriesView(origin="/real/novelty", name="What is unknown of each macro-action"))
     return rrb.Horizontal(*views, name="Rewards and values over time")
 
 

@@ -16,7 +16,14 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, MemoryReader, SeeingLearner, ValueReader, begin_episode
+from imagine_bench.capabilities import (
+    Imaginer,
+    MemoryReader,
+    NoveltyReader,
+    SeeingLearner,
+    ValueReader,
+    begin_episode,
+)  # fmt: skip
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
@@ -61,12 +68,14 @@ def record_run(
     scene = env.unwrapped
     if isinstance(scene, SceneReader):
         scene.capture_motion_hz = MOTION_HZ
-    env.reset(seed=episode_seed("recording", seed, 1))
+    seen, info = env.reset(seed=episode_seed("recording", seed, 1))
+    begin_episode(agent)
+    first = Observation.of(seen, info, privileged=entry.privileged)
     values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
     several = imagines and is_random(spec.rules)
     layout = blueprint(
         target_m=look_target_m(scene), values=values, imagines=imagines, several=several,
-        sees=isinstance(agent, SeeingLearner),
+        sees=isinstance(agent, SeeingLearner), explores=_novelty(agent, first, SeedTree(seed)) is not None,
     )  # fmt: skip
     with recording_file(path, task, layout) as recording:
         recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
@@ -89,6 +98,11 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
         cells = round(1 + (_BAR_CELLS - 1) * (float(value) - low) / (high - low or 1.0))
         rows.append(f"{'>' if index == chosen else ' '} {name:<{width}} {value:+7.2f} {'█' * cells}")
     return "\n".join(["```", *rows, "```", "\\> is the one it carries out."])
+
+
+def _novelty(agent: Agent, observation: Observation, seeds: SeedTree) -> NDArray[np.float32] | None:
+    """How unknown every macro-action is to an agent that can tell. Shape (A,)."""
+    return agent.novelty(observation, seeds.generator()) if isinstance(agent, NoveltyReader) else None
 
 
 class _EpisodeRecorder:
@@ -117,6 +131,7 @@ class _EpisodeRecorder:
             action = int(self._agent.act(observation, explore=False))
             self._describe(heading, info, f"Next: {self._spec.action_names[action]}.", observation.frame)
             self._log_values(observation, action)
+            self._log_novelty(observation, episode, step)
             self._recording.stream.disable_timeline("imagined_depth")
             self._log_imagination(observation.frame, macrostate, episode, step)
             self._episode.append(tuple(macrostate.tolist()))
@@ -137,7 +152,8 @@ class _EpisodeRecorder:
         if not isinstance(self._agent, SeeingLearner):
             return
         for seen in self._agent.perceived():
-            values = f"{len(seen.sizes)} things, of {', '.join(map(str, seen.sizes))} values"
+            count = len(seen.sizes)
+            values = f"{count} thing{'s' * (count != 1)}, of {', '.join(map(str, seen.sizes))} values"
             told = f"In training episode {seen.episodes} it tells apart {values if seen.sizes else 'nothing yet'}."
             self._recording.text("/real/text", told)
             self._recording.sheet("/seen/factors", seen.picture)
@@ -189,6 +205,13 @@ class _EpisodeRecorder:
         for name, value in zip(names, values, strict=True):
             self._recording.scalar(f"/real/q_values/{entity_name(name)}", value)
         self._recording.text("/real/q_table", q_table(names, values, action))
+
+    def _log_novelty(self, observation: Observation, episode: int, step: int) -> None:
+        """How unknown each macro-action is to the agent, a curve each."""
+        novelty = _novelty(self._agent, observation, SeedTree(self._seed).child("novelty", episode, step))
+        if novelty is not None:
+            for name, value in zip(self._spec.action_names, novelty, strict=True):
+                self._recording.scalar(f"/real/novelty/{entity_name(name)}", value)
 
     def _clear_predictions(self) -> None:
         """Remove what was predicted from the frame before: at an episode's end nothing more is carried out."""

@@ -131,6 +131,29 @@ def test_how_it_learned_to_see_is_shown_before_it_acts(imagined: Path, tmp_path:
     assert "/seen/factors" not in contents(imagined)
 
 
+class _Explores(FakeAgent):
+    """Does not know its actions, or cannot tell."""
+
+    def __init__(self, *, tells: bool) -> None:
+        super().__init__()
+        self._tells = tells
+
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+        return rng.random(6, dtype=np.float32) if self._tells else None
+
+
+def test_what_is_unknown_is_shown_of_agents_that_can_tell(tmp_path: Path) -> None:
+    entity = "/real/novelty/turn_the_left_cube_clockwise"
+    tells, silent = (
+        record(_Explores(tells=tells), tmp_path / f"{tells}.rrd", name="random") for tells in (True, False)
+    )
+    acted = {step - 1 for step in times(tells, "/real/reward", "env_step")}
+    assert len(acted) >= 2 and times(tells, entity, "env_step") == acted
+    assert not any("novelty" in path for path in contents(silent))
+    shown = [b"What is unknown of each macro-action" in path.read_bytes() for path in (tells, silent)]
+    assert shown == [True, False], "the view is there where there is something to see"
+
+
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
     with closing(gymnasium.make("imagine_bench/PickPlace-v0")) as env:
         path = record_run(

@@ -19,7 +19,7 @@ from imagine_bench.agents.factored.planner import TIE, Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Imaginer, ValueReader
+from imagine_bench.capabilities import Imaginer, NoveltyReader, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
 
@@ -313,6 +313,20 @@ def test_imagined_rollouts_end_where_expected_and_change_nothing() -> None:
     assert (greedy.p_terminated[:-1] <= 0.5).all()
     with pytest.raises(InvalidValueError, match="must lie in"):
         learner.imagine(frame((0, 1, 0)), actions=np.array([9]), depth=1, rng=np.random.default_rng(0))
+
+
+def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
+    learner, seen, rng = agent(), Observation(frame=frame((0, 1, 0))), np.random.default_rng(0)
+    assert isinstance(learner, NoveltyReader)
+    assert learner.novelty(seen, rng) is None, "before anything was seen there is no measure"
+    live(learner, range(2), rng)
+    before, novelty = learner.state(), learner.novelty(seen, rng)
+    assert same(before, learner.state())
+    assert novelty is not None and novelty.shape == (ACTIONS,) and 0.5 < novelty.max() <= 1.0
+    assert novelty[learner.act(seen, explore=True)] == novelty.max()
+    live(learner, range(2, 60), rng)
+    known = learner.novelty(seen, rng)
+    assert known is not None and known.max() < novelty.max() / 2
 
 
 def test_curiosity_outlearns_random_exploration() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from agent_states import same
 from counting_model import CountingModel, T, make
-from fake_latents import SMALL, context, live
+from fake_latents import ACTIONS, SMALL, context, frame, live
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.rollouts import Imagination
@@ -14,7 +15,9 @@ from imagine_bench.agents.imagination.settings import Settings, WorldModelSettin
 from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.replay import Batch
 
+from imagine_bench.capabilities import NoveltyReader
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import SeedTree
 
 
@@ -30,7 +33,7 @@ def test_what_is_known_but_noisy_pays_nothing_to_the_bit() -> None:
     z, action = torch.zeros(3, 2), torch.zeros(3, dtype=torch.int64)
     parts = decompose(imagination.model.predict(z, action, None))
     assert (parts.aleatoric > 7.0).all() and (parts.modal == 25.0).all()
-    assert imagination.ignorance(z, action).tolist() == [0.0, 0.0, 0.0]
+    assert imagination.ignorance(z, action, torch.Generator()).tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_learned_model_pays_for_the_unseen_not_for_noise() -> None:
@@ -46,7 +49,7 @@ def test_a_learned_model_pays_for_the_unseen_not_for_noise() -> None:
         imagination.model.update(batch, imagination.generators["dropout"])
     parts = decompose(imagination.model.predict(z[:1], action[:1], None))
     assert parts.aleatoric.max() == pytest.approx(0.25, abs=0.1) and parts.modal.max() == pytest.approx(4.0, abs=0.4)
-    known, unknown = imagination.ignorance(z[:2], torch.tensor([0, 1])).tolist()
+    known, unknown = imagination.ignorance(z[:2], torch.tensor([0, 1]), noise).tolist()
     assert known < 0.001 and unknown > 0.03
 
 
@@ -57,7 +60,7 @@ def test_real_rewards_alone_are_paid_in_proportion(monkeypatch: pytest.MonkeyPat
     for agent in agents:
         live(agent, range(3), np.random.default_rng(0))
         agent._replay.manual_seed(3)
-        agent.imagination.ignorance = lambda z, action: z[:, 0].abs().clamp(max=1.0)  # type: ignore[method-assign]
+        agent.imagination.ignorance = lambda z, action, _: z[:, 0].abs().clamp(max=1.0)  # type: ignore[method-assign]
     plain, half, double = [agent.draw_batch(agent.real) for agent in agents]
     assert torch.equal(plain.z, half.z) and torch.equal(plain.next_z, double.next_z)
     unknown = plain.z[:, 0].abs().clamp(max=1.0)
@@ -77,7 +80,7 @@ def test_more_than_one_squared_unit_counts_as_one() -> None:
     z = torch.tensor([[0.0, 0.0], [0.0, 1.0]])
     action = torch.zeros(2, dtype=torch.int64)
     assert decompose(imagination.model.predict(z, action, None)).epistemic[:, 0].tolist() == [5.0, 0.0]
-    assert imagination.ignorance(z, action).tolist() == [1.0, 0.0]
+    assert imagination.ignorance(z, action, torch.Generator()).tolist() == [1.0, 0.0]
 
 
 def test_curiosity_changes_what_is_learned_and_its_absence_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,3 +102,16 @@ def test_curiosity_of_one_network_is_refused(monkeypatch: pytest.MonkeyPatch) ->
         imagination_agents.make(context(monkeypatch, alone))
     imagination_agents.make(context(monkeypatch, {**alone, "imagination.curiosity": 0.0}))
     imagination_agents.make(context(monkeypatch, {**alone, "model.members": 2}))
+
+
+def test_what_it_pays_for_can_be_read_of_a_frame_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent, seen = imagination_agents.make(context(monkeypatch)), Observation(frame=frame(1))
+    live(agent, range(4), np.random.default_rng(0))
+    assert isinstance(agent, NoveltyReader)
+    before = agent.state()
+    first, again, other = (agent.novelty(seen, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert same(before, agent.state())
+    assert first is not None and first.shape == (ACTIONS,) and 0.0 < first.min() < first.max() <= 1.0
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    alone = imagination_agents.make(context(monkeypatch, {"model.dropout": 0.0}))
+    assert alone.novelty(seen, np.random.default_rng(3)) is None, "nothing differs from a single network"
