@@ -23,7 +23,7 @@ from imagine_bench.capabilities import (
     SeeingLearner,
     ValueReader,
     begin_episode,
-)  # fmt: skip
+)
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
