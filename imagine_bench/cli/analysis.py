@@ -65,7 +65,7 @@ class Judge:
     task: str = "arrow_puzzle"
     """Task whose world is imagined."""
     models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite but slow ones)")] = None
-    """World models, as 'imagine-bench list' names them, or folders of finished runs, whose agents are judged."""
+    """World models, as 'imagine-bench list' names them, or folders of a finished run or of all of an agent's."""
     sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
         100,
         300,

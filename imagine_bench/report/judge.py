@@ -23,7 +23,7 @@ from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.models.outcomes import sampling_noise_floor
 from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
-from imagine_bench.judge.models.trained import is_run, model_entry
+from imagine_bench.judge.models.trained import model_entry, runs_of
 from imagine_bench.judge.models.truth import shares
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.plots import image
@@ -138,11 +138,16 @@ def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
 
 def _size(model: str, size: int) -> str:
     """The transitions that it learned from here; a trained agent's own are its bench's to say."""
-    return DASH if is_run(model) else f"{size:,}"
+    return DASH if runs_of(model) else f"{size:,}"
 
 
 def _title(model: str) -> str:
     return model_entry(model).title
+
+
+def _after(judgement: Judgement, size: int) -> str:
+    """Words for what models had learned from; none where all are trained agents, which learned in their benches."""
+    return f" after {size:,} transitions" if judgement.learning else ""
 
 
 def _rows(judgement: Judgement, cells: Cells, names: Sequence[str], sizes: Sequence[int]) -> list[list[Any]]:
@@ -165,8 +170,8 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     short = Table(
         name="short", header=["world model", "transitions", *(COLUMNS[name] for name in SHORT)], why_dash=_WHY_DASH,
         rows=_rows(judgement, cells, SHORT, last),
-        caption=f"Interquartile means over {len(judgement.seeds)} seeds of data and model, with 95 % intervals. 0 is "
-        "best in every error; value loss is in units of reward.",
+        caption=f"Interquartile means over {_seeds(judgement)}, with 95 % intervals. 0 is best in every error; value "
+        "loss is in units of reward.",
     )  # fmt: skip
     images = [*_futures(judgement, pictures), *_risk_images(judgement, cells, largest)]
     by_question = {title: _question_section(title, judgement, cells) for title in QUESTIONS}
@@ -174,7 +179,11 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
     sections = [
         Section(title="In short", words=[_reader_words(folder)], tables=[short]),
         Section(title="One future, and the errors of the surest answers", images=images),
-        Section(title="How much data does it need?", images=[_curve_image(judgement, cells)]),
+        *(
+            [Section(title="How much data does it need?", images=[_curve_image(judgement, cells)])]
+            if judgement.learning
+            else []
+        ),
         replace(outcomes, images=[_depth_image(folder, judgement, cells, largest)]),
         rewards,
         replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
@@ -182,15 +191,23 @@ def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
         *others,
         Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
     ]
+    data = f"Data: {judgement.policy} policy, kinematic" if judgement.learning else "Trained agents"
     return Page(
         title=f"{spec.title}: world models against the exact truth",
-        subtitle=f"Data: {judgement.policy} policy, kinematic · appearance “{judgement.appearance}” · "
-        f"{judgement.samples} futures a question",
+        subtitle=f"{data} · appearance “{judgement.appearance}” · {judgement.samples} futures a question",
         question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
         answers=_answers(judgement, cells, largest), sections=sections,
         facts=flat("", made), settings={}, protocol=flat("", dataclasses.asdict(judgement)), recordings=[],
         files={"scores.csv": _csv(cells)},
     )  # fmt: skip
+
+
+def _seeds(judgement: Judgement) -> str:
+    """What an interval is over."""
+    kinds = [f"{len(judgement.seeds)} seeds of data and model"] if judgement.learning else []
+    if len(judgement.learning) < len(judgement.models):
+        kinds.append("the runs of each trained agent")
+    return " or ".join(kinds)
 
 
 def _reader_words(folder: Path) -> str:
@@ -243,7 +260,7 @@ def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[
         }
         if scored:
             best = min(scored, key=lambda model: scored[model])
-            found.append(f"After {last:,} transitions {_title(best)} has the smallest {words}: {number(scored[best])}.")
+            found.append(f"{_title(best)} has the smallest {words}{_after(judgement, last)}: {number(scored[best])}.")
     return found
 
 
@@ -274,8 +291,8 @@ def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Tabl
     ]  # fmt: skip
     return Table(
         name="differences", header=["model", "against", "difference of total variation", "p"], rows=rows,
-        caption=f"After {last:,} transitions; Yuen's test over seeds, p by Holm.", why_dash="one seed says nothing",
-        folded="Every pair",
+        caption=f"Total variation of one step{_after(judgement, last)}; Yuen's test over seeds, p by Holm.",
+        why_dash="one seed says nothing", folded="Every pair",
     )  # fmt: skip
 
 
@@ -306,7 +323,7 @@ def _curve_image(judgement: Judgement, cells: Cells) -> Image:
             series = {
                 model: [float(np.mean(scores(cells[model, size], name))) if (model, size) in cells else math.nan
                         for size in sizes]
-                for model in judgement.models
+                for model in judgement.learning
             }  # fmt: skip
             _draw(axes, series, sizes, xscale="log", xlabel="transitions of the same data", ylabel=label)
             axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
@@ -327,12 +344,13 @@ def _risk_images(judgement: Judgement, cells: Cells, models: Sequence[str]) -> l
     shares = [100.0 * share for share in COVERAGES]
     if not series:
         return []
+    when = f"{_after(judgement, size)}, where most of them still err" if judgement.learning else ""
     one = image(
         "risk_coverage",
         lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
         alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
         caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
-        f"uncertainty are not here. After {size:,} transitions, where most of them still err, mean over seeds.",
+        f"uncertainty are not here. Mean over seeds{when}.",
     )  # fmt: skip
     return [one]
 
@@ -365,7 +383,7 @@ def _depth_image(folder: Path, judgement: Judgement, cells: Cells, models: Seque
 
     return image(
         "depth", draw, svg=True, alt="Total variation to the exact distribution by imagined depth",
-        caption=f"Total variation to the exact distribution by depth, after {last:,} transitions; dotted: what "
+        caption=f"Total variation to the exact distribution by depth{_after(judgement, last)}; dotted: what "
         f"{judgement.samples} samples of the exact distribution itself would show.",
     )  # fmt: skip
 
@@ -424,7 +442,7 @@ def _where_section(
     ]
     table = Table(
         name="where", header=["by", "which", *map(_title, models)], rows=rows, why_dash="no such transition",
-        caption=f"Total variation of one step after {last:,} transitions; of a coordinate, that of it alone.",
+        caption=f"Total variation of one step{_after(judgement, last)}; of a coordinate, that of it alone.",
     )  # fmt: skip
     images = []
     for model, arrays in pictures.items():

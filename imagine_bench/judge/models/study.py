@@ -32,7 +32,7 @@ from imagine_bench.judge.models.asking import Answers, Reader, ask, call
 from imagine_bench.judge.models.change import Streams, counterfactual_error, noticing, streams_of
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.scores import after_the_end, by_depth, one_step_scores, ranking_scores
-from imagine_bench.judge.models.trained import TrainedModel, is_run, load_model, model_entry
+from imagine_bench.judge.models.trained import TrainedModel, load_model, model_entry, runs_of
 from imagine_bench.judge.models.truth import Questions, shares
 from imagine_bench.machine import describe_environment
 from imagine_bench.rules import states_of
@@ -55,7 +55,7 @@ class Judgement:
     """What is judged. InvalidValueError: nothing to judge, or sizes, seeds or samples out of range."""
 
     task: str
-    models: tuple[str, ...]  #: Names, or folders of runs, whose agents are judged as they are: once
+    models: tuple[str, ...]  #: Names, or folders of runs, whose agents are judged as they are
     sizes: tuple[int, ...] = SIZES  #: Transitions of the same data, ascending
     seeds: tuple[int, ...] = (0, 1, 2)
     samples: int = SAMPLES  #: Futures imagined of each question
@@ -86,9 +86,18 @@ class Judgement:
 
     @property
     def cells(self) -> list[Cell]:
-        """Every fit that is judged, and every trained agent."""
-        whole = [(s, m, n) for s in self.seeds for m in self.models for n in self.sizes]
-        return [Cell(m, s, n) for s, m, n in whole if not is_run(m) or (s, n) == (self.seeds[0], self.sizes[-1])]
+        """Every fit that is judged, and every run of a trained agent, once, with the seed of its bench."""
+        fits = [Cell(m, s, n) for s in self.seeds for m in self.learning for n in self.sizes]
+        return fits + [Cell(model, seed, self.sizes[-1]) for model in self.models for seed in runs_of(model)]
+
+    @property
+    def learning(self) -> list[str]:
+        """The models that are fitted here."""
+        return [model for model in self.models if not runs_of(model)]
+
+    def shown(self, model: str) -> Cell:
+        """The cell of a model whose pictures are kept: the first seed, the most transitions."""
+        return Cell(model, next(iter(runs_of(model)), self.seeds[0]), self.sizes[-1])
 
     @property
     def folder_name(self) -> str:
@@ -135,7 +144,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         The folder with a file a cell, and what went wrong with models, a sentence each.
     """
     folder = make_folder(root / judgement.folder_name)
-    for seed in judgement.seeds:
+    for seed in judgement.seeds if judgement.learning else ():
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
     cells = judgement.cells
@@ -170,7 +179,7 @@ def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
         found, pictures = judge_cell(judgement, folder, cell)
     except ImagineBenchError as error:
         return str(error)
-    if cell.seed == judgement.seeds[0] and cell.transitions == judgement.sizes[-1]:
+    if cell == judgement.shown(cell.model):
         write_arrays(folder / Path(cell.file).with_suffix(".npz"), pictures)
     write_json(folder / cell.file, sealed(with_null(found)))
     return ""
@@ -184,12 +193,12 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
     """
     world = prepare(judgement, folder)
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
-    dataset = data_of(judgement, folder, cell.seed)
-    model, price = make(cell.model, world.spec, world.gallery, judgement.appearance, seeds, judgement.encoder)
-    episodes = dataset.episodes.first(cell.transitions)
-    begun_s = time.process_time()
-    call(cell.model, "fit", model.fit, episodes, seeds.child("fit").generator())
-    fit_s = time.process_time() - begun_s
+    name = str(runs_of(cell.model).get(cell.seed, cell.model))
+    model, price = make(name, world.spec, world.gallery, judgement.appearance, seeds, judgement.encoder)
+    if isinstance(model, TrainedModel):  # what it learned from and what that cost is its bench's to say
+        seen, learned = model.visited, {"data": "", "fit_s": math.nan, "parameters": math.nan}
+    else:
+        seen, learned = _fit(model, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
     questions = {
         "one_step": world.one_step, "rollouts": world.rollouts, "ranked": world.ranked, "after": world.after_the_end
     }  # fmt: skip
@@ -206,10 +215,9 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
         for each in world.counterfactuals
     ]  # fmt: skip
     steps = sum(each.steps for each in answers.values())
-    seen = model.visited if isinstance(model, TrainedModel) else visited(dataset, cell.transitions)
     scores = one_step_scores(world.spec, world.one_step, answers["one_step"], seen)
     found = {
-        **cell._asdict(), "data": dataset.episodes.hash, **scores,
+        **cell._asdict(), **learned, **scores,
         **by_depth(world.rollouts, answers["rollouts"]), **ranking_scores(world.spec, world.ranked, answers["ranked"]),
         **after_the_end(world.after_the_end, answers.get("after"), answers["one_step"]),
         **noticing(world.streams, answers["one_step"]),
@@ -218,12 +226,23 @@ def judge_cell(judgement: Judgement, folder: Path, cell: Cell) -> tuple[dict[str
             "real": [_named(world.spec, shares(outcomes)) for outcomes in world.rollouts.truth[0]],
             "imagined": [_named(world.spec, answers["rollouts"].distribution(0, step)) for step in range(asking.DEPTH)],
         },
-        "fit_s": fit_s, "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps,
-        "parameters": int(call(cell.model, "parameters", model.parameters)), **price,
+        "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in answers.values()) / steps, **price,
     }  # fmt: skip
-    if isinstance(model, TrainedModel):  # what it cost is its bench's to say
-        found |= {"fit_s": math.nan, "parameters": math.nan}
     return found, _pictures(model, world, scores["worst"], seeds)
+
+
+def _fit(
+    model: WorldModel, cell: Cell, dataset: Dataset, rng: np.random.Generator
+) -> tuple[set[tuple[State, int]], dict[str, Any]]:
+    """Fit a model: what it has seen then, and the data's hash, CPU seconds and parameters."""
+    episodes = dataset.episodes.first(cell.transitions)
+    begun_s = time.process_time()
+    call(cell.model, "fit", model.fit, episodes, rng)
+    fit_s = time.process_time() - begun_s
+    parameters = int(call(cell.model, "parameters", model.parameters))
+    return visited(dataset, cell.transitions), {
+        "data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters
+    }  # fmt: skip
 
 
 def _named(spec: TaskSpec, outcomes: dict[State, float]) -> dict[str, float]:
@@ -237,7 +256,7 @@ def make(
     name: str, spec: TaskSpec, gallery: Gallery, appearance: str, seeds: SeedTree, encoder: str | None = None
 ) -> tuple[WorldModel, dict[str, Any]]:
     """A new model, or a trained agent, and what was spent on it beforehand: the encoder's name and frames."""
-    if is_run(name):
+    if Path(name) in runs_of(name).values():
         trained = load_model(Path(name), spec.id)
         return trained, trained.price
     entry = registry.world_model_entry(name)
@@ -381,12 +400,12 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
 
 
 def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
-    """By model, the pictures and the cell that are kept of the first seed and the most transitions.
+    """By model, the pictures and the cell that are kept of :meth:`Judgement.shown`.
 
     Raises:
         ArtefactError: A file is damaged.
     """
-    cells = {model: Cell(model, judgement.seeds[0], judgement.sizes[-1]).file for model in judgement.models}
+    cells = {model: judgement.shown(model).file for model in judgement.models}
     return {
         model: {**read_arrays((folder / file).with_suffix(".npz")), **read_sealed(folder / file, "a judged cell")}
         for model, file in cells.items()

@@ -25,18 +25,29 @@ _CONFIG = "config.json"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept
 
 
-def is_run(model: str) -> bool:
-    """Whether a name is a run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``."""
-    return (Path(model) / _CONFIG).is_file()
+def runs_of(model: str) -> dict[int, Path]:
+    """The runs that a name stands for, by seed; none where it is a world model's.
+
+    A name is a run's folder, such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``, or the folder above it,
+    which stands for every run of that agent.
+    """
+    folder = Path(model)
+    configs = [folder / _CONFIG] if (folder / _CONFIG).is_file() else folder.glob(f"seed_*/{_CONFIG}")
+    found = {read_sealed(config, "a run's configuration")["seed"]: config.parent for config in configs}
+    return dict(sorted(found.items()))
 
 
 def model_entry(model: str) -> WorldModelEntry:
-    """The registry line of a world model, or one for the agent of a run's folder. Raises UnknownNameError."""
-    if not is_run(model):
+    """The registry line of a world model, or one for the agent of the runs of a folder. Raises UnknownNameError."""
+    runs = runs_of(model)
+    if not runs:
         return registry.world_model_entry(model)
-    config = read_sealed(Path(model) / _CONFIG, "a run's configuration")
-    title = f"{registry.agent_entry(config['agent']).title or config['agent']}, seed {config['seed']}"
-    return WorldModelEntry(make=f"{__name__}:load_model", title=title)
+    seed, folder = next(iter(runs.items()))
+    agent = read_sealed(folder / _CONFIG, "a run's configuration")["agent"]
+    title = registry.agent_entry(agent).title or agent
+    return WorldModelEntry(
+        make=f"{__name__}:load_model", title=f"{title}, seed {seed}" if folder == Path(model) else title
+    )
 
 
 class TrainedModel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,39 +13,70 @@ from small_runs import Inline, small
 from imagine_bench.bench import bench as benches
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.models import study
-from imagine_bench.judge.models.study import Judgement, judge, kept
+from imagine_bench.judge.models.study import Judgement, judge, kept, shown
 from imagine_bench.judge.models.trained import load_model, model_entry
 from imagine_bench.report.judge import judgement_report
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    wanted = small(budgets=(2,), agents=("table", "imaginer"), seeds=(0,))
+    """The run of seed 0 of each agent; that of seed 1 lies beside it."""
+    wanted = small(budgets=(2,), agents=("table", "imaginer"), seeds=(0, 1))
     result = benches.bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
-    return {run.agent: run.folder for run in result.runs}
+    return {run.agent: run.folder for run in result.runs if run.seed == 0}
 
 
-def test_right_macrostates_beside_black_frames_are_fog(
-    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A reader that sees nothing, and few questions."""
     monkeypatch.setattr(study, "_reader", lambda spec, appearance, folder: BlindReader(len(spec.macrostate_names)))
+    monkeypatch.setattr(study.asking, "STATES", 20)
+    yield
+    study._prepared.cache_clear()
+    study._data.cache_clear()
+
+
+def report(folder: Path, judgement: Judgement) -> str:
+    errors = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
+    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(errors, 0.0)))
+    return judgement_report(folder, judgement)
+
+
+@pytest.mark.usefixtures("blind")
+def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tmp_path: Path) -> None:
     run = str(runs["imaginer"])
     judgement = Judgement(task="arrow_puzzle", models=(run, "copy"), sizes=(20, 40), seeds=(1000, 1001), samples=1)
-    monkeypatch.setattr(study.asking, "STATES", 20)
     folder, failed = judge(judgement, tmp_path, workers=1)
     assert failed == []
     found = [cell for cell in kept(folder, judgement) if cell["model"] == run]
-    assert [(cell["seed"], cell["transitions"]) for cell in found] == [(1000, 40)], "it learns nothing here: once"
+    assert [(cell["seed"], cell["transitions"]) for cell in found] == [(0, 40)], "it learns nothing here: once"
     assert found[0]["nothing"] == found[0]["total_variation"] == found[0]["after_the_end"] == 1.0
     assert found[0]["fit_s"] is None
     seen = found[0]["where"]["in its data"]
     assert set(seen) <= {"seen", "never"}
-    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(
-        ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read"), 0.0
-    )))  # fmt: skip
-    assert "imaginer, seed 0  " in judgement_report(folder, judgement)
-    study._prepared.cache_clear()
-    study._data.cache_clear()
+    assert "imaginer, seed 0  " in report(folder, judgement)
+    assert "has the smallest total variation after 40 transitions" in (folder / "report/report.md").read_text()
+
+
+@pytest.mark.usefixtures("blind")
+def test_the_folder_of_an_agent_stands_for_all_its_runs(
+    runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, loaded = str(runs["imaginer"].parent), []
+    monkeypatch.setattr(study, "load_model", lambda folder, task: loaded.append(folder) or load_model(folder, task))
+    judgement = Judgement(task="arrow_puzzle", models=(agent,), sizes=(20, 40), seeds=(1000,), samples=1)
+    folder, failed = judge(judgement, tmp_path, workers=1)
+    assert failed == []
+    assert [folder.name for folder in loaded] == ["seed_0", "seed_1"]
+    assert [(cell["model"], cell["seed"]) for cell in kept(folder, judgement)] == [(agent, 0), (agent, 1)]
+    assert not list(folder.glob("data-*")), "nothing is collected for what does not learn"
+    assert list(shown(folder, judgement)) == [agent]
+    (row,) = (line for line in report(folder, judgement).splitlines() if line.startswith("imaginer"))
+    assert "seed" not in row
+    page = (folder / "report/report.md").read_text()
+    assert "over the runs of each trained agent" in page
+    assert "after 40 transitions" not in page
+    assert "How much data" not in page
 
 
 def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path]) -> None:
