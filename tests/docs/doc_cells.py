@@ -352,7 +352,7 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    share = score.startswith(("auroc", "total", "tv", "counter", "best"))
+    share = score.startswith(("auroc", "total", "tv", "after", "counter", "best"))
     digits = 2 if share or "skill" in score else 1
     numbers = (statistics.iqm(values), *statistics.interval(values, share=share))
     value, *ends = (f"{number:.{digits}f}".replace("-", "−") for number in numbers)
