@@ -99,6 +99,10 @@ class Judgement:
         """The cell of a model whose pictures are kept: the first seed, the most transitions."""
         return Cell(model, next(iter(runs_of(model)), self.seeds[0]), self.sizes[-1])
 
+    def files(self, cell: Cell) -> list[str]:
+        """The names of a cell's files: its scores and, of the one that is shown, its pictures."""
+        return [cell.file, cell.pictures] if cell == self.shown(cell.model) else [cell.file]
+
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
@@ -120,6 +124,11 @@ class Cell(NamedTuple):
     def file(self) -> str:
         """The name of its file."""
         return f"{file_name(self.model)}-seed{self.seed}-{self.transitions}.json"
+
+    @property
+    def pictures(self) -> str:
+        """The name of the file of its pictures."""
+        return self.file.removesuffix(".json") + ".npz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +157,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
     cells = judgement.cells
-    waiting = [cell for cell in cells if not (folder / cell.file).exists()]
+    waiting = [cell for cell in cells if not all((folder / name).exists() for name in judgement.files(cell))]
     failed: dict[str, None] = {}
     with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:
         for cell, why in _carried_out(judgement, folder, waiting, workers):
@@ -180,7 +189,7 @@ def carry_out(judgement: Judgement, folder: Path, cell: Cell) -> str:
     except ImagineBenchError as error:
         return str(error)
     if cell == judgement.shown(cell.model):
-        write_arrays(folder / Path(cell.file).with_suffix(".npz"), pictures)
+        write_arrays(folder / cell.pictures, pictures)
     write_json(folder / cell.file, sealed(with_null(found)))
     return ""
 
@@ -405,9 +414,9 @@ def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
     Raises:
         ArtefactError: A file is damaged.
     """
-    cells = {model: judgement.shown(model).file for model in judgement.models}
+    cells = {model: judgement.shown(model) for model in judgement.models}
     return {
-        model: {**read_arrays((folder / file).with_suffix(".npz")), **read_sealed(folder / file, "a judged cell")}
-        for model, file in cells.items()
-        if (folder / file).exists()
+        model: {**read_arrays(folder / cell.pictures), **read_sealed(folder / cell.file, "a judged cell")}
+        for model, cell in cells.items()
+        if (folder / cell.file).exists()
     }

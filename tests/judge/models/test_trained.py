@@ -79,6 +79,15 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(
     assert "How much data" not in page
 
 
+@pytest.mark.usefixtures("blind")
+def test_pictures_are_made_up_for_where_another_seed_is_shown(tmp_path: Path) -> None:
+    for seeds in ((1000, 1001), (1001,)):
+        judgement = Judgement(task="arrow_puzzle", models=("copy",), sizes=(20,), seeds=seeds, samples=1)
+        folder, failed = judge(judgement, tmp_path, workers=1)
+        assert failed == []
+        assert shown(folder, judgement)["copy"]["seed"] == seeds[0]
+
+
 def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path]) -> None:
     assert model_entry(str(runs["table"])).title == "table, seed 0"
     with pytest.raises(InvalidValueError, match="does not imagine"):
