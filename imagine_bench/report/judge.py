@@ -260,7 +260,8 @@ def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[
         }
         if scored:
             best = min(scored, key=lambda model: scored[model])
-            found.append(f"{_title(best)} has the smallest {words}{_after(judgement, last)}: {number(scored[best])}.")
+            when = "" if runs_of(best) else _after(judgement, last)
+            found.append(f"{_title(best)} has the smallest {words}{when}: {number(scored[best])}.")
     return found
 
 

@@ -55,7 +55,9 @@ def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tm
     seen = found[0]["where"]["in its data"]
     assert set(seen) <= {"seen", "never"}
     assert "imaginer, seed 0  " in report(folder, judgement)
-    assert "has the smallest total variation after 40 transitions" in (folder / "report/report.md").read_text()
+    page = (folder / "report/report.md").read_text()
+    assert "imaginer, seed 0 has the smallest total variation: 1.00." in page
+    assert "by depth after 40 transitions" in page
 
 
 @pytest.mark.usefixtures("blind")
