@@ -14,7 +14,7 @@ import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.certificates.certificate import certificate
-from imagine_bench.report import plots
+from imagine_bench.report import figures
 from imagine_bench.report.data import collect
 from imagine_bench.report.radar import radar_figure
 from imagine_bench.store.archive import load_archive
@@ -81,7 +81,7 @@ def peers() -> None:
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
     columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
     for height, (data, agent) in enumerate(rows):
-        color, area, price = plots.color(agent), data.areas[agent][500], data.prices[agent][500]
+        color, area, price = figures.color(agent), data.areas[agent][500], data.prices[agent][500]
         shares = statistics.running_means(data.budgets, data.result.success_rates(agent), data.facts.chance_level)
         seeds = 100 * shares[:, data.budgets.index(500)]
         axes.plot([100 * area.low, 100 * area.high], [height] * 2, color=color, linewidth=6, alpha=0.3)
@@ -125,8 +125,8 @@ def ladder() -> None:
         reached[agent] = [statistics.first_lasting(list(table), seed, 0.95) for seed in by_seed]
     floor = certificate(registry.task("arrow_puzzle")).floor
     last = max(max(table) for table in tested.values())
-    figure = plots.image(
-        "ladder", lambda: plots.ladder_figure(reached, last, floor and floor.episodes), alt="", caption="", dpi=110
+    figure = figures.image(
+        "ladder", lambda: figures.ladder_figure(reached, last, floor and floor.episodes), alt="", caption="", dpi=110
     )
     (HERE / "ladder.png").write_bytes(figure.draw()[0])
 
@@ -215,12 +215,12 @@ def why() -> None:
     """Failures by cause, as the report draws them."""
     kept = RESULTS / "arrow_puzzle-mild-why"
     tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
-    found: plots.Failures = {}
+    found: figures.Failures = {}
     for run in json.loads((kept / "why.json").read_text())["runs"]:
         for budget, counts in run["failures"].items():
             before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
             found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
-    figure = plots.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
+    figure = figures.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 

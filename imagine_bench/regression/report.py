@@ -13,9 +13,9 @@ from imagine_bench.judge.calibration import LEVELS
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
+from imagine_bench.report.figures import image
 from imagine_bench.report.page import aligned, made, write_page
-from imagine_bench.report.plots import image
-from imagine_bench.report.sections import Image, Page, Section, Table, mean_std, number
+from imagine_bench.report.tables import Image, Page, Section, Table, mean_std, number
 from imagine_bench.store.codec import table_text
 from imagine_bench.store.files import csv_text
 

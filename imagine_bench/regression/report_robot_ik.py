@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from imagine_bench import reference, registry, statistics
 from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
-from imagine_bench.report.plots import image
-from imagine_bench.report.sections import DASH, Image, Section, Table, mean_std
+from imagine_bench.report.figures import image
+from imagine_bench.report.tables import DASH, Image, Section, Table, mean_std
 
 Values = NDArray[np.float64]
 Pair = tuple[str, str]

@@ -9,8 +9,8 @@ from scipy import stats
 
 from imagine_bench import registry
 from imagine_bench.regression.results import RegressionResult
-from imagine_bench.report.plots import image
-from imagine_bench.report.sections import Image, Section, Table, number
+from imagine_bench.report.figures import image
+from imagine_bench.report.tables import Image, Section, Table, number
 
 _REGION, _EDGE = (-10.0, 10.0), 30.0
 _SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00"}

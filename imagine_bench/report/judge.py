@@ -25,10 +25,10 @@ from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
 from imagine_bench.judge.models.trained import model_entry, runs_of
 from imagine_bench.judge.models.truth import shares
+from imagine_bench.report.figures import image
 from imagine_bench.report.page import aligned, flat, write_page
-from imagine_bench.report.plots import image
-from imagine_bench.report.sections import DASH, Image, Page, Section, Table, number
-from imagine_bench.report.sections import Cell as TableCell
+from imagine_bench.report.tables import DASH, Image, Page, Section, Table, number
+from imagine_bench.report.tables import Cell as TableCell
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, interval, iqm
 from imagine_bench.store.files import csv_text, read_json

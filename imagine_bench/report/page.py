@@ -9,9 +9,10 @@ from typing import Any
 
 import jinja2
 
-from imagine_bench.report import plots, text
+from imagine_bench.report import figures, text
 from imagine_bench.report.data import ReportData, collect, open_loop_csv, summary_csv
-from imagine_bench.report.sections import Page, Section, causes, certificate, imagination, policy, success
+from imagine_bench.report.sections import causes, certificate, imagination, policy, success
+from imagine_bench.report.tables import Page, Section
 from imagine_bench.report.text import agent_words, percent, score_text
 from imagine_bench.store.archive import archive_files
 from imagine_bench.store.files import make_folder, sweep, write_bytes
@@ -46,7 +47,7 @@ def report_page(result: BenchResult) -> Page:
         answers=text.answers(data),
         sections=_sections(data),
         files=files,
-        colors={agent_words(agent).title: plots.color(agent) for agent in agents},
+        colors={agent_words(agent).title: figures.color(agent) for agent in agents},
         **made(result, {agent: agent_words(agent).title for agent in agents}),
     )
 

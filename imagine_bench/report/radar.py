@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from imagine_bench.report.plots import color
+from imagine_bench.report.figures import color
 from imagine_bench.report.text import agent_words
 from imagine_bench.statistics import Estimate
 

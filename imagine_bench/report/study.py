@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import statistics
 from imagine_bench.report.analysis import markdown
-from imagine_bench.report.plots import image
+from imagine_bench.report.figures import image
 from imagine_bench.report.text import estimate_text, percent
 from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
 from imagine_bench.studies.study import Line, Study

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from imagine_bench.report import plots
+from imagine_bench.report import figures
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.radar import radar_figure
-from imagine_bench.report.sections import DASH, Cell, Page, Section, Table, seconds
+from imagine_bench.report.tables import DASH, Cell, Page, Section, Table, seconds
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.files import csv_text, json_text
@@ -56,7 +56,7 @@ def suite_page(result: SuiteResult) -> Page:
         protocol=flat("", dataclasses.asdict(suite)),
         recordings=(),
         files={"levels.csv": levels_csv(result), "scores.csv": scores_csv(result), "suite.json": _definition(result)},
-        colors=dict(zip(titles, map(plots.color, result.agents), strict=True)),
+        colors=dict(zip(titles, map(figures.color, result.agents), strict=True)),
     )
 
 
@@ -85,7 +85,7 @@ def _answers(result: SuiteResult) -> list[str]:
 def _overview(result: SuiteResult) -> Section:
     scores = _scores(result)
     by_agent = {agent: [row[index] for row in scores.values()] for index, agent in enumerate(result.agents)}
-    radar = plots.image(
+    radar = figures.image(
         "radar", lambda: radar_figure(list(scores), by_agent), svg=True, dpi=180,
         alt="Radar chart: a spoke an experiment, an outline an agent, from 0 in the middle to 1 at the rim.",
         caption="(success − chance) / (optimum − chance), mean over the levels of each experiment. The middle is blind "
@@ -107,7 +107,7 @@ def _overview(result: SuiteResult) -> Section:
 
 
 def _levels(result: SuiteResult) -> Section:
-    figure = plots.image(
+    figure = figures.image(
         "levels", lambda: _levels_figure(result), svg=True, dpi=160,
         alt="Scores by level, a panel an experiment, a line an agent.",
         caption="Scores by level: 0 is chance, 1 the optimum (dashed).",
@@ -142,7 +142,7 @@ def _levels_figure(result: SuiteResult) -> Figure:
             axes.axhline(height, color="#8c8c8c", linewidth=0.8, linestyle=(0, (4, 3)))
         for agent in result.agents:
             found = [_mean(level) for level in result.levels[each.name, agent]]
-            axes.plot(names, found, marker="o", markersize=4, color=plots.color(agent))
+            axes.plot(names, found, marker="o", markersize=4, color=figures.color(agent))
         axes.set(title=each.name, xlabel=each.dial, ylim=(-0.15, 1.1))
     for axes in panels[len(experiments) :]:
         axes.set_axis_off()

@@ -11,7 +11,7 @@ import numpy as np
 from imagine_bench import statistics
 from imagine_bench.report.data import BASE_AGENT, Comparison, ReportData, Score
 from imagine_bench.report.missing import known_agent, missing
-from imagine_bench.report.sections import DASH
+from imagine_bench.report.tables import DASH
 from imagine_bench.statistics import Estimate
 
 _NAMED = 4  # missing runs that are named; the others are counted

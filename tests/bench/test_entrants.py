@@ -17,8 +17,8 @@ from imagine_bench.entrants import entrant, file_name
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import digest
+from imagine_bench.report.figures import color
 from imagine_bench.report.page import summary_table
-from imagine_bench.report.plots import color
 from imagine_bench.store.archive import archive_files, load_archive
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.merge import merge

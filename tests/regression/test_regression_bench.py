@@ -31,7 +31,7 @@ from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.page import flat
-from imagine_bench.report.sections import number
+from imagine_bench.report.tables import number
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import read_json
 from imagine_bench.store.trained import load_trained

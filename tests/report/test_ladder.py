@@ -7,7 +7,7 @@ from itertools import pairwise
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from imagine_bench.report import plots
+from imagine_bench.report import figures
 
 REACHED = {
     "dqn": (1000, None, None),
@@ -31,7 +31,7 @@ def points(axes: Axes, marker: str) -> dict[str, list[float]]:
 
 
 def test_rungs_rise_with_the_medians_and_hold_every_seed() -> None:
-    (axes,) = plots.ladder_figure(REACHED, LAST, FLOOR).axes
+    (axes,) = figures.ladder_figure(REACHED, LAST, FLOOR).axes
     assert [label.get_text() for label in axes.get_yticklabels()] == ["factored", "count table", "DQN", "random"]
     learned, never = points(axes, "o"), points(axes, ">")
     assert learned == {"factored": [60, 80, 60], "count table": [250, 500, 250], "DQN": [1000], "random": []}
@@ -42,18 +42,18 @@ def test_rungs_rise_with_the_medians_and_hold_every_seed() -> None:
 
 
 def test_the_floor_stands_where_the_certificate_has_it() -> None:
-    (axes,) = plots.ladder_figure(REACHED, LAST, FLOOR).axes
+    (axes,) = figures.ladder_figure(REACHED, LAST, FLOOR).axes
     upright = [line.get_xdata() for line in axes.get_lines() if list(line.get_ydata()) == [0, 1]]
     assert [list(ends) for ends in upright] == [[FLOOR, FLOOR]]
     assert [text.get_text() for text in axes.texts] == ["information floor, 62"]
-    (without,) = plots.ladder_figure(REACHED, LAST, None).axes
+    (without,) = figures.ladder_figure(REACHED, LAST, None).axes
     assert not without.texts and "never" in [label.get_text() for label in without.get_xticklabels()]
 
 
 def test_names_with_many_settings_leave_room_for_all() -> None:
     settings = ",".join(f"{name}_learning_rate=0.0003" for name in ("model", "actor", "critic"))
     long = {f"dreamer_v3:{settings},batch_size={size},replay_ratio=2": (None, None, 500) for size in (16, 64)}
-    figure = plots.ladder_figure({**REACHED, **long}, LAST, FLOOR)
+    figure = figures.ladder_figure({**REACHED, **long}, LAST, FLOOR)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     (axes,) = figure.axes

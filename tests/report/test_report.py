@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.judge import filmstrips
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
-from imagine_bench.report import plots, summary_table, write_report
+from imagine_bench.report import figures, summary_table, write_report
 from imagine_bench.report import text as words
 from imagine_bench.report.data import collect
 from imagine_bench.report.sections.imagination import encoder_views
@@ -156,7 +156,7 @@ def test_differences_and_gains_are_those_in_the_summary(folder: Path, page: Cell
 def test_the_gain_s_plot_draws_the_table_and_the_thesis(result: BenchResult, folder: Path, tmp_path: Path) -> None:
     data = collect(result)
     assert set(data.thesis_gains) == {"imagination", "imagination_uncertainty"} < set(result.protocol.agents)
-    drawn = [list(zip(*line.get_data(), strict=True)) for line in plots.gain_figure(data).axes[0].get_lines()]
+    drawn = [list(zip(*line.get_data(), strict=True)) for line in figures.gain_figure(data).axes[0].get_lines()]
     for agent, printed in data.thesis_gains.items():
         assert [(budget, 100.0 * gain) for budget, gain in printed.items()] in drawn
         assert [(budget, 100.0 * row.gain.value) for budget, row in data.comparisons[agent].items()] in drawn
@@ -369,8 +369,8 @@ def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(result: BenchRe
     data = collect(result)
     loop = data.open_loop["imagination"]
     none = dataclasses.replace(loop, aleatoric=np.zeros_like(loop.aleatoric))
-    panels = plots.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes
-    fewer = plots.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": none})).axes
+    panels = figures.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes
+    fewer = figures.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": none})).axes
     assert len(panels[3].lines) == len(fewer[3].lines) + 1
     assert panels[3].get_yscale() == fewer[3].get_yscale() == "log"
 
@@ -420,9 +420,9 @@ def test_episodes_to_success_use_the_threshold_of_the_task(
 
 def test_no_two_registered_agents_share_a_color() -> None:
     own = [name for name, entry in registry.AGENTS.items() if entry.make.startswith("imagine_bench.")]  # no test's
-    colors = [plots.color(agent) for agent in own]
+    colors = [figures.color(agent) for agent in own]
     assert len(own) > 8 and len(set(colors)) == len(colors)
-    assert plots.color("an agent that nobody registered").startswith("#")
+    assert figures.color("an agent that nobody registered").startswith("#")
 
 
 def test_a_p_value_of_just_5_percent_shows_no_difference(result: BenchResult) -> None:

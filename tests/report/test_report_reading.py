@@ -15,10 +15,10 @@ from report_pages import check_report, narrowest_px, read_tables
 
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
-from imagine_bench.report import plots, text, write_report
+from imagine_bench.report import figures, text, write_report
 from imagine_bench.report.data import ReportData, collect
 from imagine_bench.report.page import markdown_code, markdown_text
-from imagine_bench.report.sections import DASH, Cell, Table
+from imagine_bench.report.tables import DASH, Cell, Table
 from imagine_bench.store.results import BenchResult
 
 
@@ -95,7 +95,7 @@ def test_a_dash_is_explained_only_where_there_is_one() -> None:
 def test_far_points_of_the_thesis_do_not_stretch_the_plots(tmp_path: Path) -> None:
     data = short_run(tmp_path)
     assert min(data.thesis["dqn"]) == 2000
-    axes = plots.success_figure(data).axes[0]
+    axes = figures.success_figure(data).axes[0]
     assert axes.get_xlim()[1] < 25
     assert not any("thesis" in label.get_text() for label in axes.get_legend().get_texts())
     assert not (write_report(data.result).parent / "gain.png").exists()
@@ -105,7 +105,7 @@ def test_far_points_of_the_thesis_do_not_stretch_the_plots(tmp_path: Path) -> No
 
 def test_leader_lines_stay_in_the_margin(tmp_path: Path) -> None:
     data = short_run(tmp_path)
-    for draw in (plots.success_figure, plots.acceptance_figure):
+    for draw in (figures.success_figure, figures.acceptance_figure):
         axes = draw(data).axes[0]
         assert axes.texts
         colors = {line.get_color() for line in axes.get_lines()}
@@ -116,11 +116,11 @@ def test_leader_lines_stay_in_the_margin(tmp_path: Path) -> None:
 
 def test_a_name_with_many_settings_stays_in_the_picture() -> None:
     agent = "dreamer_v3:actor_learning_rate=0.001,critic_learning_rate=0.001,model_learning_rate=0.001,replay_ratio=4"
-    with mpl.rc_context(plots.STYLE):
+    with mpl.rc_context(figures.STYLE):
         figure = Figure(figsize=(9.2, 4.9), layout="constrained")
         axes = figure.add_subplot()
         axes.set_ylim(-2, 108)
-        plots._end_labels(axes, {agent: 50.0}, 1.0)
+        figures._end_labels(axes, {agent: 50.0}, 1.0)
         FigureCanvasAgg(figure).draw()
     (label,) = axes.texts
     written = label.get_window_extent()
@@ -129,16 +129,16 @@ def test_a_name_with_many_settings_stays_in_the_picture() -> None:
 
 
 def test_names_move_only_as_far_as_they_must() -> None:
-    assert plots.spread_labels([4.0, 98.0, 99.0, 100.0], [5.0] * 4, top=106.0) == [4.0, 96.0, 101.0, 106.0]
-    assert plots.spread_labels([0.0, 0.0, 50.0], [5.0] * 3, top=106.0) == [0.0, 5.0, 50.0]
-    assert plots.spread_labels([0.0, 0.0, 0.0], [2.0, 6.0, 2.0], top=106.0) == [0.0, 4.0, 8.0]
+    assert figures.spread_labels([4.0, 98.0, 99.0, 100.0], [5.0] * 4, top=106.0) == [4.0, 96.0, 101.0, 106.0]
+    assert figures.spread_labels([0.0, 0.0, 50.0], [5.0] * 3, top=106.0) == [0.0, 5.0, 50.0]
+    assert figures.spread_labels([0.0, 0.0, 0.0], [2.0, 6.0, 2.0], top=106.0) == [0.0, 4.0, 8.0]
 
 
 def test_lines_along_an_axis_are_not_clipped(tmp_path: Path) -> None:
     data = short_run(tmp_path)
     loop = data.open_loop["imagination"]
     loop = dataclasses.replace(loop, reward_mae=0.0 * loop.reward_mae, correct=0.0 * loop.correct + 1.0)
-    for axes in plots.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes[:3]:
+    for axes in figures.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes[:3]:
         low, high = axes.get_ylim()
         values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
         assert low < np.nanmin(values) and np.nanmax(values) < high

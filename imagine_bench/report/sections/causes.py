@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from imagine_bench.judge.causes import CAUSES
-from imagine_bench.report import plots
-from imagine_bench.report.sections import DASH, Section, Table
+from imagine_bench.report import figures
+from imagine_bench.report.tables import DASH, Section, Table
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.store.files import reading
 
@@ -17,7 +17,7 @@ HEAD = ("agent", "seed", "episodes", "tests", "test", "cause")
 _FILE = Path("why") / "causes.csv"
 
 
-def read_failures(bench: Path) -> plots.Failures:
+def read_failures(bench: Path) -> figures.Failures:
     """What was found of a bench, if anything. Raises ArtefactError: the file is damaged."""
     path = bench / _FILE
     if not path.is_file():
@@ -29,9 +29,9 @@ def read_failures(bench: Path) -> plots.Failures:
         return failures(rows)
 
 
-def failures(rows: Iterable[Sequence[object]]) -> plots.Failures:
+def failures(rows: Iterable[Sequence[object]]) -> figures.Failures:
     """Tests, and failures by cause, of all seeds together, from rows below :data:`HEAD`; no cause is no failure."""
-    found: plots.Failures = {}
+    found: figures.Failures = {}
     tested: dict[tuple[str, int], dict[str, int]] = {}
     for agent, seed, episodes, tests, _, cause in rows:
         key = (str(agent), int(str(episodes)))
@@ -47,10 +47,10 @@ def failures(rows: Iterable[Sequence[object]]) -> plots.Failures:
     }
 
 
-def causes(found: plots.Failures) -> Section:
+def causes(found: figures.Failures) -> Section:
     """Causes by agent and budget."""
-    figure = plots.image(
-        "causes", lambda: plots.causes_figure(found), svg=True, dpi=180,
+    figure = figures.image(
+        "causes", lambda: figures.causes_figure(found), svg=True, dpi=180,
         alt="Failed test episodes by cause, against real training episodes, a panel an agent.",
         caption="Test episodes of all seeds that failed, by cause. What is above a bar was solved.",
     )  # fmt: skip
@@ -67,7 +67,7 @@ def causes(found: plots.Failures) -> Section:
     )
 
 
-def causes_table(found: plots.Failures) -> Table:
+def causes_table(found: figures.Failures) -> Table:
     """Shares of the failures by agent and budget."""
     rows = [
         [

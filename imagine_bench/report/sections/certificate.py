@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from imagine_bench.certificates.certificate import Certificate, certificate_rows
-from imagine_bench.report import plots
-from imagine_bench.report.sections import Section, Table
+from imagine_bench.report import figures
+from imagine_bench.report.tables import Section, Table
 from imagine_bench.report.text import percent
 
 
 def world(found: Certificate) -> Section:
     """What follows from the rules alone."""
-    figure = plots.image(
-        "plans", lambda: plots.plan_lengths_figure(found.plan_lengths), svg=True, dpi=180,
+    figure = figures.image(
+        "plans", lambda: figures.plan_lengths_figure(found.plan_lengths), svg=True, dpi=180,
         alt="How many starts need how many macro-actions at least.",
         caption="Fewest macro-actions after which a success is possible, by start.",
     )  # fmt: skip

@@ -13,10 +13,10 @@ import numpy as np
 
 from imagine_bench.entrants import file_name
 from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
-from imagine_bench.report import plots
+from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData
 from imagine_bench.report.missing import known_agent
-from imagine_bench.report.sections import DASH, Cell, Image, Section, Table
+from imagine_bench.report.tables import DASH, Cell, Image, Section, Table
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, reading
@@ -97,8 +97,8 @@ def _acceptance(data: ReportData) -> Section:
         "imagined transitions. Mean over seeds."
     )
     alt = "Share of imagined transitions that the uncertainty filter kept while training."
-    draw = functools.partial(plots.acceptance_figure, data)
-    figure = plots.image("acceptance", draw, alt=alt, caption=caption, svg=True, dpi=180)
+    draw = functools.partial(figures.acceptance_figure, data)
+    figure = figures.image("acceptance", draw, alt=alt, caption=caption, svg=True, dpi=180)
     return Section(
         title="How much imagination is kept",
         words=(
@@ -115,7 +115,9 @@ def _open_loop(data: ReportData) -> Section:
     deep = any(len(loop.correct) > 1 for loop in data.open_loop.values())
     alt = "Open-loop error and uncertainty of imagined rollouts by depth."
     caption = f"After {data.budgets[-1]:,} real episodes. Means over seeds."
-    figure = plots.image("open_loop", lambda: plots.open_loop_figure(data), alt=alt, caption=caption, svg=True, dpi=180)
+    figure = figures.image(
+        "open_loop", lambda: figures.open_loop_figure(data), alt=alt, caption=caption, svg=True, dpi=180
+    )
     return Section(
         title="Open-loop error by depth",
         words=(

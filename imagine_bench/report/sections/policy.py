@@ -9,7 +9,7 @@ import numpy as np
 from imagine_bench.interfaces import Floats, State, TaskSpec
 from imagine_bench.judge.policy import Terminations, optimal_length, terminations
 from imagine_bench.report.data import ReportData
-from imagine_bench.report.sections import Section, Table
+from imagine_bench.report.tables import Section, Table
 from imagine_bench.report.text import agent_words, mean_text, percent
 from imagine_bench.rules import greedy
 

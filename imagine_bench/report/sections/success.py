@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Mapping
 
 from imagine_bench import statistics
-from imagine_bench.report import plots
+from imagine_bench.report import figures
 from imagine_bench.report.data import Comparison, ReportData, Score
-from imagine_bench.report.sections import DASH, Cell, Section, Table, seconds
+from imagine_bench.report.tables import DASH, Cell, Section, Table, seconds
 from imagine_bench.report.text import (
     agent_words,
     chance_words,
@@ -52,10 +52,10 @@ def success(data: ReportData, interval_words: str) -> Section:
     """Success of every agent at every budget, with its price."""
     protocol = data.result.protocol
     seeds = f"{len(protocol.seeds)} seed{'' if len(protocol.seeds) == 1 else 's'}"
-    near = any(plots.near(data, printed) for printed in data.thesis.values())
+    near = any(figures.near(data, printed) for printed in data.thesis.values())
     thesis = f" Diamonds: the thesis ({data.thesis_source})." if near else ""
-    figure = plots.image(
-        "success", lambda: plots.success_figure(data), svg=True, dpi=180,
+    figure = figures.image(
+        "success", lambda: figures.success_figure(data), svg=True, dpi=180,
         alt=f"Success against real training episodes in {data.spec.title}, one curve an agent.",
         caption="Test episodes solved after so many real training episodes; the axis is logarithmic. Points: "
         f"interquartile mean over {seeds} (independent trainings, the same {protocol.evaluation_episodes:,} test "
@@ -187,9 +187,9 @@ def _heads(first: str, data: ReportData) -> list[str]:
 
 def gain(data: ReportData) -> Section:
     """Every learner against DQN, beside the thesis' gains."""
-    near = any(plots.near(data, printed) for printed in data.thesis_gains.values())
-    figure = plots.image(
-        "gain", lambda: plots.gain_figure(data), svg=True, dpi=180,
+    near = any(figures.near(data, printed) for printed in data.thesis_gains.values())
+    figure = figures.image(
+        "gain", lambda: figures.gain_figure(data), svg=True, dpi=180,
         alt="Gain over DQN against real training episodes, with the thesis' gains.",
         caption="Gain of the means over seeds; bands: 95 % interval over seeds (Fieller). Diamonds: the thesis (its "
         "means alone).",
@@ -265,8 +265,8 @@ def threshold(data: ReportData) -> Section:
     ]
     known = data.result.certificate
     floor = None if known is None or known.floor is None else known.floor.episodes
-    figure = plots.image(
-        "ladder", lambda: plots.ladder_figure(data.reached, data.budgets[-1], floor), svg=True, dpi=180,
+    figure = figures.image(
+        "ladder", lambda: figures.ladder_figure(data.reached, data.budgets[-1], floor), svg=True, dpi=180,
         alt=f"Real episodes until {asked} of tests are solved, one rung an agent.",
         caption="Points: seeds; bars: medians; triangles: not by the last test."
         + ("" if floor is None else " Dashed: what a learner needs that knows the factor graph, and nothing else."),

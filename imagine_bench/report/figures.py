@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from imagine_bench.judge.causes import CAUSES
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData, Score
-from imagine_bench.report.sections import Image
+from imagine_bench.report.tables import Image
 from imagine_bench.report.text import agent_words
 from imagine_bench.statistics import Estimate
 
