@@ -185,12 +185,16 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
 
     settings: OwnSettings
     _acted = 0
+    """Macro-actions that the agent itself chose in this episode."""
+    _observed = 0
+    """Transitions of this episode that it was shown, its own or another's."""
     _longest: int | None = None
-    """Macro-actions of this episode, and after how many an episode was cut, if any was."""
+    """After how many macro-actions an episode was cut, if any was."""
 
     def begin_episode(self) -> None:
         """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
         self._acted = 0
+        self._observed = 0
         self.perception.begin_episode()
 
     @property
@@ -199,7 +203,9 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
 
     @property
     def _left(self) -> int | None:
-        return None if self._longest is None else self._longest - self._acted
+        if self._longest is None:
+            return None
+        return self._longest - max(self._acted, self._observed)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act as on any codes, and count."""
@@ -210,12 +216,13 @@ class OwnPerceptionAgent(CodeAgent[OwnPerception]):
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember what was seen, see anew if that is due, and learn as from any codes."""
         eyes = self.perception
+        self._observed += 1
         if transition.truncated:
-            self._longest = max(self._acted, self._longest or 0)
+            self._longest = max(self._observed, self._longest or 0)
         if not eyes.full:
             with self.meters.cpu_time("time/perception_s"):
                 before, after = transition.observation.frame, transition.next_observation.frame
-                eyes.remember(before, transition.action, after, begins=self._acted <= 1)
+                eyes.remember(before, transition.action, after, begins=self._observed == 1)
                 found = (eyes.found, eyes.found_in)
                 if eyes.renew():
                     self._recode(*found)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from itertools import pairwise
 
 import fake_codes
 import numpy as np
 import pytest
+from agent_states import same
 from fake_codes import starts
 from fake_pictures import Code, agent, picture
 from imagine_bench.agents.factored.factors import CodeTransition, Memory
@@ -19,7 +21,7 @@ from imagine_bench.agents.factored_own.memory import candidates, choose, contrad
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
-from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
 
 HIDDEN = 2
 """Value of the lamp where it is covered: in every frame of an episode but its first."""
@@ -252,3 +254,44 @@ def test_another_task_is_no_reason_to_remember(monkeypatch: pytest.MonkeyPatch) 
     rows = learner.replay.rows()
     assert contradictions(rows) > 0 == contradictions(rows[learner.tasks[-1] :])
     assert tried and not any(tried)
+
+
+def test_watching_episodes_teaches_what_living_them_does() -> None:
+    """Of the same transitions, acted or only shown: the same snapshot but for the generator, and the same values."""
+    actor, watcher = agent(seed=0), agent(seed=1)
+    for episode in range(10):
+        begin_episode(actor)
+        begin_episode(watcher)
+        for transition in covered_episode(actor, episode):
+            actor.observe(transition, episode=episode)
+            watcher.observe(transition, episode=episode)
+    lived, watched = learned(actor), learned(watcher)
+    assert lived.values["longest"] == 2, "some episode was cut"
+    assert same(lived, watched)
+    seen = Observation(frame=picture(shown(starts()[0], 0), np.random.default_rng(0)))
+    assert np.array_equal(actor.q_values(seen), watcher.q_values(seen))
+
+
+def covered_episode(learner: OwnPerceptionAgent, episode: int) -> Iterator[Transition]:
+    """One training episode, cut after two macro-actions, of the world whose lamp is covered."""
+    rng = np.random.default_rng((1, episode))
+    code = starts()[int(rng.integers(len(starts())))]
+    seen = Observation(frame=picture(shown(code, 0), rng))
+    for step in range(2):
+        action = learner.act(seen, explore=True)
+        code, reward, ended = fake_codes.step(code, action)
+        after = Observation(frame=picture(shown(code, step + 1), rng))
+        yield Transition(
+            observation=seen, action=action, reward=reward, next_observation=after, terminated=ended,
+            truncated=not ended and step == 1,
+        )  # fmt: skip
+        seen = after
+        if ended:
+            return
+
+
+def learned(learner: OwnPerceptionAgent) -> AgentState:
+    """What an agent knows: its snapshot without the generator and what only acting measures."""
+    state = learner.state()
+    meters = {name: value for name, value in state.values["meters"].items() if not name.startswith("exploration/")}
+    return AgentState(arrays=state.arrays, values={**state.values, "exploration": None, "meters": meters})
