@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -51,6 +52,8 @@ class Dataset:
 def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[str, Any], format: str) -> Dataset:
     """Write a dataset into a new folder, whole or not at all.
 
+    A killed writer leaves a hidden folder ``.<name>.<8 hex digits>.partial``, which no later one reads or removes.
+
     Raises:
         UnknownNameError: An unknown format.
         SetupError: The library that the format needs is not installed, or the folder cannot be written.
@@ -58,11 +61,13 @@ def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[
     """
     require_format(format)
     require_new(folder)
-    partial = make_folder(folder.with_name(f".{folder.name}.partial"))
     whole = {**card, "format": format, "content": episodes.hash}
     whole["apart"] = {name: content_hash(arrays) for name, arrays in apart.items()}
+    make_folder(folder.parent)
+    partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
     try:
         with writing(folder):
+            partial.mkdir()  # a new folder, so that nothing a killed writer or anybody else left is in the dataset
             registry.load(FORMATS[format]).write(partial, episodes, card)
             for name, arrays in apart.items():
                 write_arrays(partial / f"{name}.npz", arrays)

@@ -25,61 +25,88 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
-    """A dataclass, or a sequence of them, as JSON-like values and arrays that lie at ``path`` among others.
+    """Split a dataclass, or a sequence of them, into JSON-like values and arrays named below ``path``.
 
-    Its fields are dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None.
+    Fields may hold dataclasses, sequences, mappings of numbers, arrays, numbers, texts or None. A numpy scalar is kept
+    as the Python number of the same value.
     """
-    if isinstance(value, np.ndarray | np.generic):
-        return None, {path: np.asarray(value)}
+    if isinstance(value, np.ndarray):
+        return None, {path: value}
+    if isinstance(value, np.generic):
+        return value.item(), {}
     if dataclasses.is_dataclass(value):
-        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        packed = {name: pack(part, _join(path, name)) for name, part in parts.items()}
-        values: Any = {name: found for name, (found, _) in packed.items()}
-        return values, _united(arrays for _, arrays in packed.values())
-    if isinstance(value, list | tuple) and dataclasses.is_dataclass(next(iter(value), None)):
-        each = [pack(part, _join(path, index)) for index, part in enumerate(value)]
-        return [found for found, _ in each], _united(arrays for _, arrays in each)
-    return (dict(value) if isinstance(value, Mapping) else list(value) if isinstance(value, tuple) else value), {}
+        arrays: Arrays = {}
+        values = {}
+        for field in dataclasses.fields(value):
+            values[field.name], inner = pack(getattr(value, field.name), _join(path, field.name))
+            arrays.update(inner)
+        return values, arrays
+    if isinstance(value, Mapping):
+        return {name: pack(part)[0] for name, part in value.items()}, {}
+    if isinstance(value, list | tuple):
+        parts = [pack(part, _join(path, index)) for index, part in enumerate(value)]
+        return [part for part, _ in parts], {name: array for _, inner in parts for name, array in inner.items()}
+    return value, {}
 
 
 def unpack(kind: Any, values: Any, arrays: Mapping[str, NDArray[Any]], path: str = "") -> Any:
-    """The inverse of :func:`pack`, of type ``kind``; ``values`` is None where there are none beside arrays.
+    """Rebuild an object of type ``kind`` from what :func:`pack` gave; ``values`` is None if only arrays were kept.
+
+    A field that files do not have takes its default.
 
     Raises:
-        KeyError: A value or an array is missing.
+        KeyError: A value or an array without a default is missing.
         TypeError: A value is of another type.
     """
-    origin, arguments = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    arguments = get_args(kind)
+    if origin in (Union, types.UnionType):
+        kept = [argument for argument in arguments if argument is not types.NoneType]
+        if values is None and not _has_arrays(arrays, path):
+            return None
+        return unpack(kept[0], values, arrays, path) if len(kept) == 1 else values
     if origin is np.ndarray:
         return arrays[path]
-    if origin in (Union, types.UnionType):
-        absent = values is None and not any(name.startswith(f"{path}/") for name in arrays)
-        (kept,) = (argument for argument in arguments if argument is not type(None))
-        return None if absent else unpack(kept, values, arrays, path)
     if dataclasses.is_dataclass(kind):
-        hints, given = get_type_hints(kind), values or {}
-        names = [field.name for field in dataclasses.fields(kind) if field.init]
-        fields = {name: unpack(hints[name], given.get(name), arrays, _join(path, name)) for name in names}
-        return kind(**fields)  # type: ignore[operator]
-    if origin in (list, tuple) and dataclasses.is_dataclass(arguments[0]):
-        parts = _indexed(arrays, path) * [None] if values is None else values
-        return origin(unpack(arguments[0], part, arrays, _join(path, index)) for index, part in enumerate(parts))
+        return _unpack_fields(kind, values or {}, arrays, path)
+    if origin in (list, tuple):
+        each = [None] * _count(arrays, path) if values is None and dataclasses.is_dataclass(arguments[0]) else values
+        if each is None:
+            raise KeyError(path)
+        hints = arguments if origin is tuple and arguments[-1] is not Ellipsis else [arguments[0]] * len(each)
+        parts = zip(hints, each, strict=True)
+        return origin(unpack(hint, part, arrays, _join(path, i)) for i, (hint, part) in enumerate(parts))
     if values is None:
         raise KeyError(path)
-    return origin(values) if origin in (list, tuple) else values
+    return values
+
+
+def _unpack_fields(kind: Any, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], path: str) -> Any:
+    hints = get_type_hints(kind)
+    found = {}
+    for field in dataclasses.fields(kind):
+        inside = _join(path, field.name)
+        absent = values.get(field.name) is None and not _has_arrays(arrays, inside)
+        has_default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        if field.init and not (absent and has_default and field.name not in values):
+            found[field.name] = unpack(hints[field.name], values.get(field.name), arrays, inside)
+    return kind(**found)
 
 
 def _join(path: str, name: str | int) -> str:
     return f"{path}/{name}" if path else str(name)
 
 
-def _united(each: Iterable[Arrays]) -> Arrays:
-    return {name: array for arrays in each for name, array in arrays.items()}
+def _has_arrays(arrays: Mapping[str, NDArray[Any]], path: str) -> bool:
+    """Whether an array lies at ``path`` or below it."""
+    return (not path and bool(arrays)) or any(name == path or name.startswith(f"{path}/") for name in arrays)
 
 
-def _indexed(arrays: Mapping[str, NDArray[Any]], path: str) -> int:
-    """How many parts of a sequence have arrays."""
-    return len({name[len(path) + 1 :].partition("/")[0] for name in arrays if name.startswith(f"{path}/")})
+def _count(arrays: Mapping[str, NDArray[Any]], path: str) -> int:
+    """How many parts of a sequence have arrays: one more than the largest index below ``path``."""
+    prefix = f"{path}/" if path else ""
+    below = (name.removeprefix(prefix) for name in arrays if name.startswith(prefix))
+    return max((int(name.partition("/")[0]) + 1 for name in below), default=0)
 
 
 def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:

@@ -148,4 +148,4 @@ class Counters:
     @classmethod
     def of(cls, snapshot: Snapshot) -> Counters:
         """The inverse of :meth:`snapshot`."""
-        return unpack(cls, {**pack(cls())[0], **snapshot.values}, snapshot.arrays)  # an older one has fewer fields
+        return unpack(cls, snapshot.values, snapshot.arrays)

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from small_runs import FORMATS, collected, written
 
+from imagine_bench.data import npz
 from imagine_bench.data.collect import describe
 from imagine_bench.data.episodes import joined
 from imagine_bench.data.folder import read_dataset
@@ -195,6 +196,37 @@ def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypa
     with pytest.raises(ImagineBenchError, match="the disk is full"):
         written(tmp_path / "set")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_a_killed_writer_left_is_in_no_other_set(sets: Path, tmp_path: Path, format: str) -> None:
+    left = tmp_path / ".set.partial"
+    shutil.copytree(sets / format, left)
+    (left / "card.json").unlink()
+    more = left / "data/chunk-000/file-001.parquet"
+    if format == "lerobot":
+        shutil.copy(left / _DATA, more)
+    before = sorted(path.relative_to(left) for path in left.rglob("*"))
+    written(tmp_path / "set", format, episodes=3)
+    assert len(read_dataset(tmp_path / "set").episodes) == 3
+    assert sorted(path.relative_to(left) for path in left.rglob("*")) == before, "it may be anybody's"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".set.partial", "set"]
+
+
+def test_writers_of_one_name_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second begins while the first is at it: one set is whole, and the other writer says why it has none."""
+    write = npz.write
+
+    def write_while_another_does(folder: Path, episodes: Any, card: Any) -> None:
+        monkeypatch.setattr(npz, "write", write)
+        written(tmp_path / "set", episodes=3)
+        write(folder, episodes, card)
+
+    monkeypatch.setattr(npz, "write", write_while_another_does)
+    with pytest.raises(ImagineBenchError, match="Cannot write"):
+        written(tmp_path / "set")
+    assert len(read_dataset(tmp_path / "set").episodes) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_no_value_changes_with_its_type() -> None:
