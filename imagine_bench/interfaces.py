@@ -255,6 +255,14 @@ class TaskSpec:
         pairs = zip(self.macrostate_values, macrostate, strict=True)
         return tuple(names[int(value)] if 0 <= value < len(names) else "not seen" for names, value in pairs)
 
+    def as_observed(self, shown: Sequence[int] | Macrostate) -> State:
+        """What a probe reads in a frame that shows this, -1 for what it hides. Length M.
+
+        A hidden coordinate is read as one more than its last value.
+        """
+        pairs = zip(self.macrostate_values, shown, strict=True)
+        return tuple(len(values) if value < 0 else int(value) for values, value in pairs)
+
 
 def appearance_of_tests(appearance: str) -> str:
     """The appearance that tests have where training has ``appearance``."""

@@ -35,7 +35,7 @@ ARROWS: dict[str, set[str]] = {
     "store": {"entrants", "registry", "protocols", "certificates", "statistics"},
     "data": {*_DATA, "certificates", "machine", "statistics"},
     "bench": {*_DATA, "machine", "data"},
-    "judge": {*_DATA, "data", "machine", "statistics"},
+    "judge": {*_DATA, "bench", "data", "machine", "statistics"},
     "recording": {*_DATA, "judge"},
     "studies": {*_DATA, "bench", "judge", "statistics"},
     "suite": {*_DATA, "bench", "statistics"},

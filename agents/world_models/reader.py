@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -63,13 +63,13 @@ class Reader:
         """Correlation (N,) of the details of each image with the real frame that is most like it."""
         return (details(images) @ self.references.T).amax(dim=1)
 
-    def save(self, path: Path) -> None:
-        """Write it as safetensors."""
+    def content(self) -> bytes:
+        """All that :meth:`load` needs, as safetensors."""
         extra = {"references": self.references, "limits": self.limits}
-        save_file({**self.network.state_dict(), **extra}, path)
+        return save({**self.network.state_dict(), **extra})
 
     def load(self, path: Path) -> Reader:
-        """Take up what :meth:`save` wrote."""
+        """Take up a file of :meth:`content`."""
         tensors = load_file(path)
         self.references, self.limits = tensors.pop("references"), tensors.pop("limits")
         self.network.load_state_dict(tensors, assign=True)
@@ -209,5 +209,5 @@ def spoiled(images: Tensor, others: Tensor, generator: torch.Generator) -> Tenso
 
 
 def load_reader(spec: TaskSpec, path: Path) -> Reader:
-    """The reader that :meth:`Reader.save` wrote."""
+    """The reader of a file of :meth:`Reader.content`."""
     return Reader(tuple(len(values) for values in spec.macrostate_values)).load(path)

@@ -92,6 +92,7 @@ def misread(agent: Agent, frames: Frame, states: NDArray[np.int64]) -> NDArray[n
     """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,)."""
     if not isinstance(agent, FrameReader):
         return np.zeros(len(frames), dtype=np.bool_)
+    begin_episode(agent)
     return np.asarray((agent.read_frames(frames) != states).any(axis=1))
 
 
@@ -103,6 +104,7 @@ def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator,
             seen = Observation(frame=frames[row], macrostate=np.array(state) if privileged else None)
             begin_episode(agent)
             action[row] = agent.act(seen, explore=False)
+    begin_episode(agent)
     model = agent.predict_outcomes(frames, rng) if isinstance(agent, OutcomePredictor) else None
     if model is not None:
         small = {"macrostates": np.int16, "p_continues": np.float32, "reward": np.float32}

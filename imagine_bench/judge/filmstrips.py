@@ -61,7 +61,8 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
     """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
 
     Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
-    orange where not. The image has shape (height, width, 3), uint8.
+    orange where not, in black where frames hide or delay a part, so that single steps cannot be judged. The image has
+    shape (height, width, 3), uint8.
     """
     depth = max(len(each.rollout.actions) for each in sampled_rollouts)
     texts = [_what_changes(each, step, spec) for each in sampled_rollouts for step in range(len(each.rollout.actions))]
@@ -193,7 +194,9 @@ def _sampled_cell(
     draw.multiline_text((left, top - _SHEET_HEADER), "\n".join(title), font=font(11, bold=True), fill=INK, spacing=2)
     _paste(canvas, rgb(rollout.frames[step]), (left, top))
     lines = _what_changes(compared, step, spec)
-    color = RIGHT if is_possible(spec.rules, before, action, now) else WRONG
+    color = INK
+    if spec.sight is None:
+        color = RIGHT if is_possible(spec.rules, before, action, now) else WRONG
     draw.multiline_text((left, top + _CELL + 3), "\n".join(lines), font=font(11), fill=color, spacing=2)
 
 

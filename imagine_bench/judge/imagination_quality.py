@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
 from imagine_bench.judge.calibration import auroc
-from imagine_bench.judge.models.truth import advance, certainly, expected_reward, shares
+from imagine_bench.judge.models.truth import Outcomes, advance, expected_reward, shares
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.store.results import ComparedRollout, OpenLoop
@@ -36,7 +36,9 @@ class OpenLoopStart:
 
     frame: Frame  # the real frame
     actions: NDArray[np.int64]  # drawn uniformly among those that end no episode, now or by force later. Shape (D,).
-    beliefs: tuple[dict[State, float], ...]  # probabilities of the macrostates after each action. Length D.
+    #: Probabilities of what the agent's frame shows after each action, as :meth:`TaskSpec.as_observed` has it. In a
+    #: task without ``sight`` that is the macrostate. Length D.
+    beliefs: tuple[dict[State, float], ...]
     rewards: Floats  # expected reward of each action. Shape (D,).
 
 
@@ -49,24 +51,37 @@ def open_loop_starts(
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
     alive = _alive(spec)
+    looks = {state: _clearest_look(spec.sight, state) for state in spec.rules.start_states}
+    alike = {look: [state for state in looks if looks[state] == look] for look in looks.values()}
     candidates: list[State] = []
     while depth and not candidates:
-        candidates = [state for state in spec.rules.start_states if alive(frozenset({state}), depth)]
+        candidates = [state for state in looks if alive(frozenset(alike[looks[state]]), depth)]
         depth -= not candidates
     if not candidates or not starts:
         return ()
-    states = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
-    frames = spec.render_macrostates(np.array(states, dtype=np.int64), appearance, rng)
-    return tuple(_start(spec, alive, state, frame, depth, rng) for state, frame in zip(states, frames, strict=True))
+    shown = [looks[candidates[index]] for index in rng.integers(len(candidates), size=starts)]
+    frames = spec.render_macrostates(np.array(shown, dtype=np.int64), appearance, rng)
+    return tuple(
+        _start(spec, alive, alike[look], look, frame, depth, rng) for look, frame in zip(shown, frames, strict=True)
+    )
+
+
+def _clearest_look(sight: Sight | None, state: State) -> State:
+    """What the first frame of an episode shows of its start where it hides as little as it can; -1 for the hidden."""
+    if sight is None:
+        return state
+    return min((what for _, what in sight.seen(state, 0)), key=lambda what: sum(value < 0 for value in what))
 
 
 def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTree) -> OpenLoop:
     """Imagine the macro-actions of every start in closed loop of the model and compare by depth.
 
-    An imagined macrostate is correct if the rules allow it after these actions; the reward is compared with its
-    expectation. The rules keep every rollout alive: any predicted termination is wrong. There is at least one start,
-    all have the same depth D; the agent, which draws from the generators of ``seeds``, is not changed.
+    An imagined macrostate is correct if the agent's frame may show it after these actions; the reward is compared with
+    its expectation. The rules keep every rollout alive: any predicted termination is wrong. There is at least one
+    start, all have the same depth D; the agent, which draws from the generators of ``seeds``, learns nothing. Each
+    start is the first frame of an episode to it.
     """
+    begin_episode(agent)
     rollouts = [
         agent.imagine(start.frame, actions=start.actions, depth=len(start.actions), rng=seeds.child(index).generator())
         for index, start in enumerate(starts)
@@ -110,13 +125,15 @@ def examples(
     """A handful of rollouts that the greedy controller chooses, each from a start of its own, beside reality.
 
     The starts are the same for every agent and seed, the real frames kinematic. The agent, which draws from the
-    generators of ``seeds``, is not changed.
+    generators of ``seeds``, learns nothing; each start is the first frame of an episode to it.
     """
     starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
     picks = rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)
     states = np.array([starts[index] for index in picks], dtype=np.int64)
-    frames = spec.render_macrostates(states, appearance, rng)
+    shown = np.array([_clearest_look(spec.sight, starts[index]) for index in picks], dtype=np.int64)
+    frames = spec.render_macrostates(shown, appearance, rng)
+    begin_episode(agent)
     return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=spec.horizon)
 
 
@@ -127,9 +144,12 @@ def imagine_sampled_rollouts(
     if not is_random(spec.rules):
         return ()
     rng = SeedTree(0).child(purpose, "sampled_rollouts", spec.id).generator()
-    start = np.array(spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))], dtype=np.int64)
-    frame = spec.render_macrostates(start[None], appearance, rng)[0]
-    return sampled_rollouts_from(agent, spec, frame=frame, macrostate=start, appearance=appearance, seeds=seeds)
+    start = spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))]
+    shown = np.array([_clearest_look(spec.sight, start)], dtype=np.int64)
+    frame = spec.render_macrostates(shown, appearance, rng)[0]
+    begin_episode(agent)
+    macrostate = np.array(start, dtype=np.int64)
+    return sampled_rollouts_from(agent, spec, frame=frame, macrostate=macrostate, appearance=appearance, seeds=seeds)
 
 
 def sampled_rollouts_from(
@@ -162,28 +182,24 @@ def compare_rollout(
 
     The rules give states and rewards, the kinematic mode gives frames: those that the agent would really see after the
     macrostates ``before`` of the same episode, old or hiding something where the task's are. Where the rules leave
-    several outcomes to chance, the one that was imagined is taken if it is among them, else ``rng`` draws.
+    several outcomes to chance, one that looks as was imagined is taken if there is any, else ``rng`` draws.
     Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
     """
     start = state = tuple(int(value) for value in macrostate)
     over = spec.rules.is_terminal(state)
     real: list[tuple[State, float, bool]] = []
-    for action, imagined in zip(rollout.actions, rollout.macrostates, strict=True):
+    for step, action in enumerate(rollout.actions.tolist()):
         reward = 0.0
         if not over:
-            outcome = _choose(spec.rules.outcomes(state, int(action)), tuple(imagined.tolist()), rng)
+            possible = spec.rules.outcomes(state, action)
+            alike = _as_imagined(spec, possible, rollout, step, len(before))
+            outcome = alike[0] if len(alike) == 1 else _draw(alike or possible, rng)
             state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
         real.append((state, reward, over))
     seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)[len(before) + 1 :]
     frames = spec.render_macrostates(np.array(seen), appearance, rng) if real else ()
-    read = [(as_read(spec, shown), reward, over) for shown, (_, reward, over) in zip(seen, real, strict=True)]
+    read = [(spec.as_observed(shown), reward, over) for shown, (_, reward, over) in zip(seen, real, strict=True)]
     return beside_reality(rollout, frame, macrostate, frames, read)
-
-
-def as_read(spec: TaskSpec, shown: Sequence[int]) -> State:
-    """What an encoder reads in a frame that shows this: one more than the last value of a coordinate that is hidden."""
-    pairs = zip(spec.macrostate_values, shown, strict=True)
-    return tuple(len(values) if value < 0 else int(value) for values, value in pairs)
 
 
 def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
@@ -218,12 +234,30 @@ def beside_reality(
     )
 
 
-def _choose(outcomes: tuple[Outcome, ...], imagined: State, rng: np.random.Generator) -> Outcome:
-    """The imagined outcome if it is possible, else one of the possible ones, with its probability."""
-    for outcome in outcomes:
-        if outcome.macrostate == imagined:
-            return outcome
-    return outcomes[int(rng.choice(len(outcomes), p=[outcome.probability for outcome in outcomes]))]
+def _as_imagined(
+    spec: TaskSpec, possible: Sequence[Outcome], rollout: ImaginedRollout, step: int, before: int
+) -> tuple[Outcome, ...]:
+    """Those outcomes of the rollout's action number ``step`` that look as they were imagined.
+
+    ``before`` macro-actions of the episode came before the rollout. Where frames are late, so is what was imagined.
+    """
+    lag = 0 if spec.sight is None else spec.sight.lag
+    if step + lag >= len(rollout.macrostates):
+        return ()
+    imagined = tuple(rollout.macrostates[step + lag].tolist())
+
+    def looks(outcome: Outcome) -> set[State]:
+        if spec.sight is None:
+            return {outcome.macrostate}
+        return {spec.as_observed(what) for _, what in spec.sight.seen(outcome.macrostate, before + step + 1)}
+
+    return tuple(outcome for outcome in possible if imagined in looks(outcome))
+
+
+def _draw(outcomes: Sequence[Outcome], rng: np.random.Generator) -> Outcome:
+    """One of the outcomes, in proportion to their probabilities."""
+    probabilities = np.array([outcome.probability for outcome in outcomes])
+    return outcomes[int(rng.choice(len(outcomes), p=probabilities / probabilities.sum()))]
 
 
 def _alive(spec: TaskSpec) -> Alive:
@@ -248,18 +282,36 @@ def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps:
 
 
 def _start(
-    spec: TaskSpec, alive: Alive, start: State, frame: Frame, depth: int, rng: np.random.Generator
-) -> OpenLoopStart:
-    outcomes = certainly(start)
-    actions, beliefs, rewards = [], [], []
+    spec: TaskSpec, alive: Alive, alike: Sequence[State], look: State, frame: Frame, depth: int,
+    rng: np.random.Generator,
+) -> OpenLoopStart:  # fmt: skip
+    """A start of which ``frame`` shows ``look``, as it does of each of the equally likely macrostates ``alike``."""
+    outcomes: Outcomes = {(state, False): (1.0 / len(alike), 0.0) for state in alike}
+    actions, rewards = [], []
+    in_turn = [shares(outcomes)]
     for step in range(depth):
-        actions.append(int(rng.choice(_safe_actions(spec, alive, shares(outcomes), depth - step))))
+        actions.append(int(rng.choice(_safe_actions(spec, alive, in_turn[-1], depth - step))))
         outcomes = advance(spec.rules, outcomes, actions[-1])
-        beliefs.append(shares(outcomes))
+        in_turn.append(shares(outcomes))
         rewards.append(expected_reward(outcomes))
     return OpenLoopStart(
         frame=frame,
         actions=np.array(actions, dtype=np.int64),
-        beliefs=tuple(beliefs),
+        beliefs=tuple(_read_after(spec, in_turn, look, step) for step in range(1, depth + 1)),
         rewards=np.array(rewards, dtype=np.float64),
     )
+
+
+def _read_after(spec: TaskSpec, in_turn: Sequence[dict[State, float]], look: State, step: int) -> dict[State, float]:
+    """Probabilities of what the agent's frame shows after ``step`` actions, given those of macrostates in turn."""
+    if spec.sight is None:
+        return in_turn[step]
+    taken = step - spec.sight.lag
+    if taken <= 0:
+        return {spec.as_observed(look): 1.0}
+    found: dict[State, float] = {}
+    for state, share in in_turn[taken].items():
+        for probability, what in spec.sight.seen(state, taken):
+            read = spec.as_observed(what)
+            found[read] = found.get(read, 0.0) + share * probability
+    return found

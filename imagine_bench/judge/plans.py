@@ -16,11 +16,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.bench import run_state
+from imagine_bench.capabilities import ImaginedRollout, begin_episode
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
-from imagine_bench.judge.imagination_quality import as_read, beside_reality
+from imagine_bench.judge.imagination_quality import beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
@@ -90,10 +90,9 @@ def make_plans(trained: Trained, *, count: int, execution: str, max_epistemic: f
 
 
 def make_env(trained: Trained, execution: str) -> gymnasium.Env[Any, Any]:
-    """The environment that plans are carried out in, at the appearance the agent is tested at."""
-    entry = registry.task_entry(trained.spec.protocol.task)
-    appearance = trained.spec.protocol.appearance_in_tests
-    return gymnasium.make(entry.env_id, execution=execution, appearance=appearance, disable_env_checker=True)
+    """The environment that plans are carried out in: the one that the agent is tested in, but for its execution."""
+    protocol = trained.spec.protocol
+    return run_state.make_env(protocol, protocol.task, testing=True, execution=execution)
 
 
 def carry_out(
@@ -109,6 +108,7 @@ def carry_out(
     frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
     start = _state(info)
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
+    begin_episode(trained.agent)
     rollout = trained.imaginer.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)
     refused = _refusal(rollout, max_epistemic)
     if on_plan is not None:
@@ -117,7 +117,7 @@ def carry_out(
     for step, action in enumerate([] if refused else rollout.actions, start=1):
         seen, reward, terminated, truncated, info = env.step(int(action))
         frames.append(seen)
-        shown = as_read(trained.task, info.get("shown", info["macrostate"]))
+        shown = trained.task.as_observed(info.get("shown", info["macrostate"]))
         real.append((shown, float(reward), bool(terminated)))
         faults, solved = faults + bool(info["fault"]), bool(info["is_success"])
         if on_step is not None:

@@ -105,7 +105,8 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.solved += bool(info["is_success"])
         if self._rollout is not None:
             self.imagined += 1
-            self.foreseen += bool(np.array_equal(self._rollout.macrostates[-1], info["macrostate"]))
+            shown = self._task.as_observed(info.get("shown", info["macrostate"]))
+            self.foreseen += tuple(self._rollout.macrostates[-1].tolist()) == shown
         end = "solved" if info["is_success"] else "an illegal end" if terminated else "out of time" if truncated else ""
         self._said += f"\nreward {reward:+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)

@@ -5,14 +5,23 @@ from __future__ import annotations
 import dataclasses
 
 import bench_fakes
+import gymnasium
 import numpy as np
 import pytest
 from small_runs import context
 
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
-from imagine_bench.interfaces import Outcome, TaskSpec
-from imagine_bench.judge.imagination_quality import EXAMPLES, OpenLoopStart, examples, open_loop, open_loop_starts
+from imagine_bench.interfaces import Observation, Outcome, TaskSpec
+from imagine_bench.judge.imagination_quality import (
+    EXAMPLES,
+    SAMPLED_ROLLOUTS,
+    OpenLoopStart,
+    examples,
+    imagine_sampled_rollouts,
+    open_loop,
+    open_loop_starts,
+)
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
 
 
@@ -163,3 +172,70 @@ def test_random_rules_give_only_starts_that_surely_stay_alive(spec: TaskSpec) ->
     found = open_loop_starts(coin, starts=8, depth=3, appearance="clean")
     assert len(found) == 8
     assert all(start.actions.tolist() == [0, 0, 0] for start in found)  # from (0,) alone, staying
+
+
+def labelled(task: str) -> TaskSpec:
+    """A task whose frames show what they show as numbers: one more than each coordinate, 0 for a hidden one."""
+
+    def render(states: np.ndarray, appearance: str, rng: np.random.Generator) -> np.ndarray:
+        frames = np.zeros((len(states), 64, 64, 3), dtype=np.uint8)
+        frames[:, 0, : states.shape[1], 0] = states + 1
+        return frames
+
+    return dataclasses.replace(registry.task(task), render_macrostates=render)
+
+
+class Perfect(bench_fakes.RulesImaginer):
+    """Imagines what the environment itself shows, from a start that its first frame cannot tell from the real one."""
+
+    fresh = False
+
+    def __init__(self, spec: TaskSpec) -> None:
+        super().__init__(context())
+        self.spec, self.env = spec, gymnasium.make(spec.env_id, execution="kinematic", disable_env_checker=True)
+
+    def begin_episode(self) -> None:
+        self.fresh = True
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        self.fresh = False
+        return 0
+
+    def imagine(self, frame, *, actions, depth, rng) -> ImaginedRollout:  # type: ignore[no-untyped-def]
+        assert self.fresh, "it is asked in the middle of an episode"
+        actions = np.zeros(depth, dtype=np.int64) if actions is None else actions
+        shown = frame[0, : len(self.spec.macrostate_names), 0].astype(int) - 1
+        alike = [state for state in self.spec.rules.start_states if ((shown == state) | (shown < 0)).all()]
+        start = alike[int(rng.integers(len(alike)))]
+        looks = (self.env.reset(seed=int(rng.integers(2**31)), options={"macrostate": start})[1] for _ in range(100))
+        next(info for info in looks if np.array_equal(info.get("shown", info["macrostate"]), shown))
+        infos = [self.env.step(action)[4] for action in actions]
+        blank = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        read = [self.spec.as_observed(info.get("shown", info["macrostate"])) for info in infos]
+        return dataclasses.replace(blank, macrostates=np.array(read))
+
+
+@pytest.mark.parametrize(
+    ("task", "depth"),
+    [("pick_place:gesture=first", 1), ("arrows:cubes=3,gesture=0.5,lag=2", 5), ("arrows:cubes=3,gesture=0.0", 5)],
+)
+def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> None:
+    spec = labelled(task)
+    starts = open_loop_starts(spec, starts=12, depth=5, appearance="clean")
+    agent = Perfect(spec)
+    agent.act(Observation(frame=starts[0].frame), explore=False)  # the last frame of a test episode
+    loop = open_loop(agent, starts, SeedTree(0))
+    assert loop.correct.tolist() == [1.0] * depth
+
+
+def test_examples_and_samples_begin_an_episode() -> None:
+    spec = labelled("pick_place:gesture=first")
+    agent = Perfect(spec)
+    agent.act(Observation(frame=np.zeros((64, 64, 3), np.uint8)), explore=False)
+    found = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
+    agent.fresh = False
+    found += imagine_sampled_rollouts(agent, spec, appearance="clean", seeds=SeedTree(0))
+    assert len(found) == EXAMPLES + SAMPLED_ROLLOUTS
+    for each in found:  # chance goes as was imagined, as far as frames tell
+        until = int(each.real_terminated.argmax()) if each.real_terminated.any() else len(each.real_terminated)
+        assert np.array_equal(each.real_macrostates[:until], each.rollout.macrostates[:until])

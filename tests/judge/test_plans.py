@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 from imagine_bench import registry
 from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Frame, State
+from imagine_bench.interfaces import Frame, PhysicsSettings, State
 from imagine_bench.judge.plans import Plan, carry_out, make_env, make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
@@ -157,6 +157,17 @@ def test_all_agents_have_the_same_starts_and_tuning_has_others() -> None:
             return [carry_out(env, who, number).start for number in range(12)]
 
     assert starts(0) == starts(3) != starts(1000)
+
+
+def test_plans_are_carried_out_in_the_world_of_the_tests() -> None:
+    """Its physics, and the starts that are held out for tests."""
+    whose = trained(Dreamer(choose=lambda state: 0))
+    wanted = protocol("arrow_puzzle", "smoke", physics=(("object_mass", 2.0),), split="plan_length=2")
+    whose = dataclasses.replace(whose, spec=dataclasses.replace(whose.spec, protocol=wanted))
+    with closing(make_env(whose, "physics")) as env:
+        assert env.unwrapped.get_state().kind[3] == PhysicsSettings(object_mass=2.0)  # type: ignore[attr-defined]
+        _, info = env.reset(seed=3)
+        assert tuple(info["macrostate"].tolist()) in wanted.spec(testing=True).rules.start_states
 
 
 def test_the_fewest_macro_actions_are_the_optimal_agents() -> None:

@@ -10,8 +10,9 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.entrants import entrant, file_name
-from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
 from imagine_bench.judge.models import asking
 from imagine_bench.judge.models.asking import Answers, Reader, ask, call
@@ -39,13 +40,24 @@ from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.codec import read_arrays, write_arrays
-from imagine_bench.store.files import make_folder, read_json, read_sealed, sealed, with_null, write_json
+from imagine_bench.store.files import (
+    lock,
+    make_folder,
+    read_json,
+    read_sealed,
+    reading,
+    sealed,
+    with_null,
+    write_bytes,
+    write_json,
+)
 from imagine_bench.world_models import WorldModel
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
 _FORMAT = 3
 _AFTER = 6  # transitions after the end whose pictures are kept
+_PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the data or the reader
 _READ = 1_000  # frames that the reader is measured on
 _READER = "imagine_bench.agents.world_models.reader"
 
@@ -67,6 +79,10 @@ class Judgement:
     def __post_init__(self) -> None:
         if not self.models or not self.seeds or min(self.seeds) < 0:
             raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise InvalidValueError(f"seeds is {brief(self.seeds)}; give each seed once.")
+        if len(set(map(_one_name, self.models))) < len(self.models):
+            raise InvalidValueError(f"models is {brief(self.models)}; give each world model or run once.")
         if not self.sizes or sorted(set(self.sizes)) != list(self.sizes) or self.sizes[0] < 1:
             raise InvalidValueError(f"sizes is {self.sizes}; give ascending numbers of transitions, at least 1.")
         if not 1 <= self.samples <= 1_000:
@@ -111,6 +127,11 @@ class Judgement:
             same += (encoders.identity(encoders.resolve(registry.task(self.task), self.appearance, self.encoder)),)
         digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
         return f"{file_name(self.task)}-{self.appearance}-{digest}"
+
+
+def _one_name(model: str) -> str:
+    """The same text for the same model, however its settings or the path of its runs were written."""
+    return str(Path(model).resolve()) if runs_of(model) else str(entrant(model))
 
 
 class Cell(NamedTuple):
@@ -296,8 +317,19 @@ def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
 @functools.lru_cache(maxsize=4)
 def _data(task: str, policy: str, appearance: str, transitions: int, folder: Path, seed: int) -> Dataset:
     place = folder / f"data-seed{seed}"
-    if place.exists():
-        return read_dataset(place)
+    with _making(folder):
+        return read_dataset(place) if place.exists() else _collected(task, policy, appearance, transitions, place, seed)
+
+
+@contextmanager
+def _making(folder: Path) -> Iterator[None]:
+    """Let one process at a time make what all cells of a folder share; the others wait and find it made."""
+    with lock(folder / ".lock", f"The folder {folder}", patience_s=_PATIENCE_S):
+        yield
+
+
+def _collected(task: str, policy: str, appearance: str, transitions: int, place: Path, seed: int) -> Dataset:
+    """Episodes of at least so many transitions, kept in a new folder."""
     spec = registry.task(task)
     episodes = -(-transitions // spec.horizon)
     while True:
@@ -335,11 +367,13 @@ def _prepared(task: str, appearance: str, folder: Path) -> _World:
 def _reader(spec: TaskSpec, appearance: str, folder: Path) -> Reader:
     """The reader of a folder, trained and measured where there is none."""
     path, code = folder / "reader.safetensors", registry.load(_READER)
-    if not path.exists():
-        reader = code.train_reader(spec, appearance)
-        write_json(folder / "reader.json", reader_errors(reader, spec, appearance))
-        reader.save(path)
-    return code.load_reader(spec, path)
+    with _making(folder):
+        if not path.exists():
+            reader = code.train_reader(spec, appearance)
+            write_json(folder / "reader.json", reader_errors(reader, spec, appearance))
+            write_bytes(path, reader.content())
+    with reading(path, "the judge's reader; remove it, and the same command trains a new one"):
+        return code.load_reader(spec, path)
 
 
 def reader_errors(reader: Reader, spec: TaskSpec, appearance: str) -> dict[str, float]:

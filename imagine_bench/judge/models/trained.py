@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer
+from imagine_bench.capabilities import Imaginer, begin_episode
 from imagine_bench.data.episodes import Episodes
 from imagine_bench.entrants import WorldModelEntry
 from imagine_bench.errors import ArtefactError, InvalidValueError
@@ -74,6 +74,7 @@ class TrainedModel:
         """Rollouts of the agent, one after another; see :class:`imagine_bench.world_models.WorldModel`."""
         asked = actions[:, frames.shape[1] - 1 :]
         seeds = rng.integers(2**63, size=(len(frames), samples))
+        begin_episode(self.agent)
         found = [
             [
                 self.agent.imagine(frame, actions=row, depth=len(row), rng=np.random.default_rng(seed))

@@ -6,8 +6,12 @@ import dataclasses
 import json
 import re
 import sys
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from doc_cells import ROOT
@@ -17,7 +21,7 @@ from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.judge.models import study
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.study import Judgement, judge, kept
@@ -143,6 +147,39 @@ def test_nonsense_is_refused() -> None:
         Judgement(task="pick_place", models=("copy", "structured"), encoder="pick_place-mild")
     with pytest.raises(InvalidValueError, match="samples is 0"):
         Judgement(task="pick_place", models=("copy",), samples=0)
+    with pytest.raises(InvalidValueError, match=r"seeds is \(0, 1, 0\); give each seed once"):
+        Judgement(task="pick_place", models=("copy",), seeds=(0, 1, 0))
+    twice = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")
+    for models in (("copy", "exact", "copy"), twice):
+        with pytest.raises(InvalidValueError, match="give each world model or run once"):
+            Judgement(task="pick_place", models=models)
+
+
+def test_two_judges_at_once_train_one_reader_and_see_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, trained = registry.task("pick_place"), []
+
+    class Slow(BlindReader):
+        def content(self) -> bytes:
+            return b"whole"
+
+    def train(*_: object) -> Slow:
+        trained.append(threading.get_ident())
+        time.sleep(0.2)
+        return Slow(4)
+
+    code = SimpleNamespace(train_reader=train, load_reader=lambda spec, path: path.read_bytes())
+    monkeypatch.setattr(registry, "load", lambda name: code)
+    monkeypatch.setattr(study, "reader_errors", lambda *_: {})
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [pool.submit(study._reader, spec, "clean", tmp_path) for _ in range(2)]
+    assert [job.result() for job in jobs] == [b"whole", b"whole"]
+    assert len(trained) == 1
+
+
+def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "reader.safetensors").write_bytes(b"half")
+    with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
+        study._reader(registry.task("pick_place"), "clean", tmp_path)
 
 
 def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:
