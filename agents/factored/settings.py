@@ -1,4 +1,4 @@
-"""Every setting of ``factored`` and ``factored_own``, the same for every task and set of hyperparameters."""
+"""Every setting of ``factored`` and ``factored:given``, the same for every task and set of hyperparameters."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class PlanningSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FactoredSettings:
-    """All settings of the agent."""
+    """All settings of the agent ``factored:given``."""
 
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     outcomes: OutcomeSettings = field(default_factory=OutcomeSettings)
@@ -79,8 +79,8 @@ HYPERPARAMETERS = Hyperparameters.everywhere(FactoredSettings())
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnPerceptionSettings:
-    """How an agent learns to see; see :mod:`..factored_own`."""
+class LearnedPerceptionSettings:
+    """How an agent learns to see; see :mod:`.learned_perception`."""
 
     #: Most frames of its own that it remembers, 12 kB each; then perception stays as it is.
     frames: int = setting(1000, between(4, 100_000))
@@ -90,12 +90,12 @@ class OwnPerceptionSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnSettings(FactoredSettings):
-    """All settings of the agent ``factored_own``."""
+class LearnedSettings(FactoredSettings):
+    """All settings of the agent ``factored``, whose perception is learned."""
 
     #: How much more likely, as a logarithm, a memory must make other episodes than none does; see ``memory``.
     memory_evidence: float = setting(10.0, POSITIVE)
-    perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
+    perception: LearnedPerceptionSettings = field(default_factory=LearnedPerceptionSettings)
 
 
-OWN = Hyperparameters.everywhere(OwnSettings())
+LEARNED = Hyperparameters.everywhere(LearnedSettings())

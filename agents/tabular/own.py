@@ -1,4 +1,4 @@
-"""The control ``count_table_own``: a count table that learns to see as ``factored_own`` does, from its own frames.
+"""The control ``count_table_own``: a count table that learns to see as ``factored`` does, from its own frames.
 
 It has the same codes and counts, and neither structure nor uncertainty: R-max on whole codes. Whenever factors are
 found anew, it counts all remembered transitions once more by the codes that their frames have now.
@@ -13,7 +13,7 @@ from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
-from ..factored_own.agent import OwnPerception
+from ..factored.learned_perception import LearnedPerception
 from .count_table import CountTableAgent
 from .settings import OWN, OwnCountTableSettings
 
@@ -24,7 +24,7 @@ class OwnCountTableAgent(CountTableAgent):
     settings: OwnCountTableSettings
 
     def __init__(self, n_actions: int, settings: OwnCountTableSettings, seeds: SeedTree) -> None:
-        self.eyes = OwnPerception(settings.perception, factored=False)
+        self.eyes = LearnedPerception(settings.perception, factored=False)
         super().__init__(self._see, n_actions, settings, seeds, directed=True)
         self._happened: list[tuple[float, bool]] = []
         """Reward and end of every remembered transition."""

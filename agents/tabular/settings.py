@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..dqn_settings import FAST_3, FAST_5, GreedySettings
-from ..factored.settings import OwnPerceptionSettings
+from ..factored.settings import LearnedPerceptionSettings
 from ..settings import POSITIVE, RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
 
 
@@ -20,7 +20,7 @@ class CountTableSettings:
 class OwnCountTableSettings(CountTableSettings):
     """All settings of the count table that learns to see."""
 
-    perception: OwnPerceptionSettings = field(default_factory=OwnPerceptionSettings)
+    perception: LearnedPerceptionSettings = field(default_factory=LearnedPerceptionSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

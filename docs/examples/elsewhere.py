@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation, ResizeObservation, TransformReward
-from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent, make
+from imagine_bench.agents.factored.learned import LearnedPerceptionAgent, make
 
 from imagine_bench.interfaces import AgentContext, Observation, Transition
 from imagine_bench.machine import describe_environment
@@ -37,7 +37,7 @@ def environment(name: str) -> gymnasium.Env[Any, Any]:
     return TransformReward(pictures, lambda reward: float(reward > 0.0))
 
 
-def live(agent: OwnPerceptionAgent | None, env: gymnasium.Env[Any, Any], seeds: range, *, explore: bool) -> float:
+def live(agent: LearnedPerceptionAgent | None, env: gymnasium.Env[Any, Any], seeds: range, *, explore: bool) -> float:
     """One episode a seed, which an agent learns from if it explores; the share that is rewarded. None acts blindly."""
     solved, blind = 0.0, np.random.default_rng(seeds.start)
     for episode, seed in enumerate(seeds):

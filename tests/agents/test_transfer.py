@@ -13,10 +13,10 @@ from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
 from fake_latents import context
 from fake_latents import live as live_on_latents
-from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.dynamics import Dynamics
 from imagine_bench.agents.factored.exploration import last_step, likeliest
 from imagine_bench.agents.factored.factors import CodeTransition
+from imagine_bench.agents.factored.given import GivenPerceptionAgent
 from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.settings import OutcomeSettings
 from imagine_bench.agents.imagination import agent as imagination_agents
@@ -46,7 +46,7 @@ def other_task(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fake_codes, "starts", lambda: codes)
 
 
-def dynamics_of(learner: FactoredAgent) -> list[np.ndarray]:
+def dynamics_of(learner: GivenPerceptionAgent) -> list[np.ndarray]:
     return [part.evidence for part in learner.model.dynamics.factors]
 
 
@@ -90,7 +90,7 @@ def test_earlier_causes_are_priors_that_one_test_refutes(carried: float) -> None
     assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by the prior alone, too"
 
 
-def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
+def watch(learner: GivenPerceptionAgent, code: tuple[int, ...], action: int) -> None:
     learner.observe(fake_codes.transition(code, action), episode=0)
 
 
@@ -166,7 +166,7 @@ def test_resumed_on_a_second_task_equals_uninterrupted(other_task: None) -> None
 # --- queries -----------------------------------------------------------------------------------------------------
 
 
-def ask(learner: FactoredAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+def ask(learner: GivenPerceptionAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
     """Let it query, and label truly; the macro-actions asked about."""
     asked = []
     for _ in range(queries):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from fake_codes import ACTIONS
-from imagine_bench.agents.factored.settings import OWN
-from imagine_bench.agents.factored_own.agent import OwnPerception, OwnPerceptionAgent
+from imagine_bench.agents.factored.learned import LearnedPerception, LearnedPerceptionAgent
+from imagine_bench.agents.factored.settings import LEARNED
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame
@@ -30,8 +30,8 @@ def picture(code: Code, rng: np.random.Generator) -> Frame:
     return (255.0 * image * rng.uniform(0.6, 1.0, size=3)).astype(np.uint8)
 
 
-def agent(seed: int = 0, **overrides: object) -> OwnPerceptionAgent:
+def agent(seed: int = 0, **overrides: object) -> LearnedPerceptionAgent:
     named = {name.replace("__", "."): value for name, value in overrides.items()}
-    settings = OWN.resolve("fast", named, "chapter_5")
-    perception = OwnPerception(settings.perception, factored=settings.dynamics.factored)
-    return OwnPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
+    settings = LEARNED.resolve("fast", named, "chapter_5")
+    perception = LearnedPerception(settings.perception, factored=settings.dynamics.factored)
+    return LearnedPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))

@@ -13,9 +13,9 @@ from itertools import compress
 
 import numpy as np
 
-from ..factored.factors import Code, CodeTransition, Memory
-from ..factored.model import FactoredModel
-from ..factored.settings import OwnSettings
+from .factors import Code, CodeTransition, Memory
+from .model import FactoredModel
+from .settings import LearnedSettings
 
 _FEWEST = 3
 """Values of a factor worth remembering: one that tells nothing, and two to tell apart."""
@@ -51,7 +51,7 @@ def contradictions(rows: Sequence[CodeTransition]) -> int:
 
 def choose(
     rows: Sequence[CodeTransition], begins: Sequence[bool], sizes: tuple[int, ...], n_actions: int,
-    settings: OwnSettings,
+    settings: LearnedSettings,
 ) -> Memory | None:  # fmt: skip
     """The memory that explains transitions between codes best; None unless it does so much better than none."""
     if not contradictions(rows):

@@ -1,4 +1,4 @@
-"""What ``factored_own`` remembers of an episode: chosen by evidence alone, and worth what it should be."""
+"""What ``factored`` remembers of an episode: chosen by evidence alone, and worth what it should be."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 from agent_states import same
 from fake_codes import starts
 from fake_pictures import Code, agent, picture
+from imagine_bench.agents.factored import learned as own
 from imagine_bench.agents.factored.factors import CodeTransition, Memory
+from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
+from imagine_bench.agents.factored.memory import candidates, choose, contradictions, remembering
 from imagine_bench.agents.factored.model import FactoredModel
-from imagine_bench.agents.factored.settings import OWN
-from imagine_bench.agents.factored_own import agent as own
-from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
-from imagine_bench.agents.factored_own.memory import candidates, choose, contradictions, remembering
+from imagine_bench.agents.factored.settings import LEARNED
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
@@ -87,7 +87,7 @@ def flickering(episodes: int, rng: np.random.Generator) -> tuple[list[CodeTransi
 def test_what_is_remembered_follows_from_what_is_seen() -> None:
     """A model of both apart would have a color shown and another one remembered."""
     memory, rng = Memory(1, HIDDEN), np.random.default_rng(0)
-    rows, settings = remembering(*flickering(400, rng), memory), OWN.resolve("fast", {}, "chapter_5")
+    rows, settings = remembering(*flickering(400, rng), memory), LEARNED.resolve("fast", {}, "chapter_5")
     found = {}
     for known in (memory, None):
         model = FactoredModel((2, 3, 3), 2, settings, known)
@@ -118,11 +118,11 @@ def test_only_factors_that_can_hide_two_values_are_candidates() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_covered_is_found_and_nothing_where_nothing_was(seed: int) -> None:
-    settings = OWN.resolve("fast", {}, "chapter_5")
+    settings = LEARNED.resolve("fast", {}, "chapter_5")
     rows, begins = lived(150, np.random.default_rng(seed), covered=True)
     assert contradictions(rows)
     assert choose(rows, begins, SIZES, ACTIONS, settings) == Memory(factor=2, hidden=HIDDEN)
-    sceptical = OWN.resolve("fast", {"memory_evidence": 1e6}, "chapter_5")
+    sceptical = LEARNED.resolve("fast", {"memory_evidence": 1e6}, "chapter_5")
     assert choose(rows, begins, SIZES, ACTIONS, sceptical) is None
     rows, begins = lived(150, np.random.default_rng(seed), covered=False)
     assert not contradictions(rows) and choose(rows, begins, SIZES, ACTIONS, settings) is None
@@ -134,11 +134,11 @@ def test_chance_alone_is_no_reason_to_remember() -> None:
     rows, begins = lived(150, rng, covered=False)
     rows = [row._replace(reward=float(rng.integers(2))) if not row.terminated else row for row in rows]
     assert contradictions(rows)
-    assert choose(rows, begins, SIZES, ACTIONS, OWN.resolve("fast", {}, "chapter_5")) is None
+    assert choose(rows, begins, SIZES, ACTIONS, LEARNED.resolve("fast", {}, "chapter_5")) is None
 
 
 def success(
-    learner: OwnPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True, well: float = 1.0,
+    learner: LearnedPerceptionAgent, episodes: range, *, explore: bool, covered: bool = True, well: float = 1.0,
     steps: int = 6,
 ) -> float:  # fmt: skip
     """Live in pictures of the world, whose lamp may be covered; the share of episodes that ended well.
@@ -224,20 +224,20 @@ def test_what_was_seen_is_kept_where_outcomes_contradict_what_is_seen_anew(
     success(learner, range(40), explore=True, covered=False)
     assert success(learner, range(30), explore=False, covered=False) >= 0.9
     assert learner.perception.sizes == (3, 3, 2)
-    found, find = [], own.looks.find
+    found, find = [], own.appearance.find
 
-    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.looks.Factor]:
+    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.appearance.Factor]:
         found.append(len(frames))
         return [factor for factor in find(frames, begins, actions) if len(factor.joint) == 3]
 
-    monkeypatch.setattr(own.looks, "find", blind)
+    monkeypatch.setattr(own.appearance, "find", blind)
     monkeypatch.setattr(own, "_CONTRADICTIONS", allowed)
     success(learner, range(40, 55), explore=True, covered=False)
     assert found, "it looked again"
     assert [len(factor.joint) for factor in learner.perception.found] == ([3, 3, 2] if allowed < 1.0 else [3, 3])
     if allowed < 1.0:
         resumed = agent(seed=5, perception__growth_if_known=1.1)
-        monkeypatch.setattr(own.looks, "find", find)
+        monkeypatch.setattr(own.appearance, "find", find)
         resumed.restore(learner.state())
         assert resumed.perception.sizes == learner.perception.sizes
         assert resumed.perception.found_in < resumed.perception.looked_at
@@ -272,7 +272,7 @@ def test_watching_episodes_teaches_what_living_them_does() -> None:
     assert np.array_equal(actor.q_values(seen), watcher.q_values(seen))
 
 
-def covered_episode(learner: OwnPerceptionAgent, episode: int) -> Iterator[Transition]:
+def covered_episode(learner: LearnedPerceptionAgent, episode: int) -> Iterator[Transition]:
     """One training episode, cut after two macro-actions, of the world whose lamp is covered."""
     rng = np.random.default_rng((1, episode))
     code = starts()[int(rng.integers(len(starts())))]
@@ -290,7 +290,7 @@ def covered_episode(learner: OwnPerceptionAgent, episode: int) -> Iterator[Trans
             return
 
 
-def learned(learner: OwnPerceptionAgent) -> AgentState:
+def learned(learner: LearnedPerceptionAgent) -> AgentState:
     """What an agent knows: its snapshot without the generator and what only acting measures."""
     state = learner.state()
     meters = {name: value for name, value in state.values["meters"].items() if not name.startswith("exploration/")}

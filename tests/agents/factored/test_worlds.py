@@ -1,11 +1,11 @@
-"""What ``factored_own`` finds in frames of worlds that are hard to see."""
+"""What ``factored`` finds in frames of worlds that are hard to see."""
 
 from __future__ import annotations
 
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.agents.factored_own import looks
+from imagine_bench.agents.factored import appearance
 
 
 @pytest.mark.parametrize(
@@ -29,5 +29,5 @@ def test_every_cube_and_the_hand_are_factors_and_nothing_else(world: dict[str, i
                 begins.append(False)
                 ended = terminated or truncated
             actions.append(-1)
-    found = looks.find(np.array(frames), np.array(begins), np.array(actions))
+    found = appearance.find(np.array(frames), np.array(begins), np.array(actions))
     assert sorted(len(factor.joint) for factor in found) == sizes

@@ -8,8 +8,8 @@ import pytest
 from agent_states import same
 from fake_codes import ACTIONS, starts
 from fake_pictures import Code, agent, picture, shape
-from imagine_bench.agents.factored_own import looks
-from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
+from imagine_bench.agents.factored import appearance
+from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
 from numpy.typing import NDArray
 
 from imagine_bench.capabilities import begin_episode
@@ -28,7 +28,7 @@ def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[
     return codes, np.stack([picture(code, rng) for code in codes])
 
 
-def live(learner: OwnPerceptionAgent, episodes: range, seed: int) -> list[int]:
+def live(learner: LearnedPerceptionAgent, episodes: range, seed: int) -> list[int]:
     """Train on pictures of the tiny world; each episode is drawn from its own seed. The actions taken."""
     taken = []
     for episode in episodes:
@@ -55,10 +55,10 @@ def live(learner: OwnPerceptionAgent, episodes: range, seed: int) -> list[int]:
 def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
     """One value a shape, whatever the jitter and tint: codes of fresh pictures and true codes name each other."""
     _, frames = walk(60, np.random.default_rng(0))
-    found = looks.find(frames)
+    found = appearance.find(frames)
     assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
     truth, fresh = walk(300, np.random.default_rng(1))
-    codes, known = looks.read(found, fresh)
+    codes, known = appearance.read(found, fresh)
     pairs = {(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}
     assert len(pairs) == len({code for code, _ in pairs}) == len({true for _, true in pairs}) == len(set(truth)) > 6
     assert known.mean() > 0.98
@@ -67,9 +67,9 @@ def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
 def test_where_nothing_happens_nothing_is_found() -> None:
     rng = np.random.default_rng(0)
     still = np.full((20, 64, 64, 3), 120, dtype=np.uint8)
-    assert looks.find(still) == [] and looks.find(still[:1]) == []
+    assert appearance.find(still) == [] and appearance.find(still[:1]) == []
     tinted = (still * rng.uniform(0.5, 1.0, size=(20, 1, 1, 3))).astype(np.uint8)
-    assert looks.find(tinted) == [], "light is no factor"
+    assert appearance.find(tinted) == [], "light is no factor"
 
 
 def test_noise_in_view_is_no_factor_and_hides_none() -> None:
@@ -77,9 +77,9 @@ def test_noise_in_view_is_no_factor_and_hides_none() -> None:
     rng = np.random.default_rng(0)
     truth, frames = walk(120, rng)
     frames[:, 24:40, 2:30] = rng.integers(256, size=(120, 16, 28, 3))
-    found = looks.find(frames)
+    found = appearance.find(frames)
     assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
-    codes, known = looks.read(found, frames)
+    codes, known = appearance.read(found, frames)
     assert known.mean() > 0.98
     assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
 
@@ -92,8 +92,8 @@ def test_what_stands_in_front_of_noise_is_seen() -> None:
     frames[:, 4:36, 8:56] = rng.integers(256, size=(240, 8, 12, 3)).repeat(4, axis=1).repeat(4, axis=2)
     for frame, place in zip(frames, places, strict=True):
         frame[8:32, 12 + 14 * place : 20 + 14 * place] = (200, 150, 120)
-    found = looks.find(frames[:120])
-    codes, known = looks.read(found, frames)
+    found = appearance.find(frames[:120])
+    codes, known = appearance.read(found, frames)
     assert codes.shape == (240, 1) and known.mean() > 0.98
     assert len(set(zip(codes[:, 0].tolist(), places.tolist(), strict=True))) == len(found[0].joint) == 3
 
@@ -103,7 +103,7 @@ def test_pieces_that_hardly_part_are_one_factor() -> None:
     shown = np.where(np.arange(60) % 2, np.random.default_rng(0).integers(1, 3, size=60), 0)
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
     frames[shown == 1, 20:27, 20:22] = frames[shown == 2, 20:22, 24:31] = 220
-    codes, _ = looks.read(looks.find(frames), frames)
+    codes, _ = appearance.read(appearance.find(frames), frames)
     assert codes.shape == (60, 1) and len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == 3
 
 
@@ -112,7 +112,7 @@ def test_a_small_thing_is_a_factor_unless_the_border_cuts_it(top: int, found: in
     """Five by five pixels; what comes into view at the border is as small, and no thing."""
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
     frames[np.random.default_rng(0).random(60) < 0.5, top : top + 5, 30:35] = 220
-    assert len(looks.find(frames)) == found
+    assert len(appearance.find(frames)) == found
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,8 @@ def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: b
     frames = np.full((count, 64, 64, 3), 120, dtype=np.uint8)
     frames[shown < 2, 20:40, 27:33] = frames[shown == 1, 20:29, 33:41] = frames[shown == 2, 28:34, 20:40] = 220
     actions[-1] = -1
-    found = looks.find(frames, None, actions if told else None)
-    codes, _ = looks.read(found, frames)
+    found = appearance.find(frames, None, actions if told else None)
+    codes, _ = appearance.read(found, frames)
     parted = len(set(zip(codes[:, 0].tolist(), shown.tolist(), strict=True))) == len(found[0].joint) == 3
     assert parted == (matters and told)
 
@@ -146,7 +146,7 @@ def test_how_likely_values_make_what_follows_is_a_product_of_predictions() -> No
     for value, action, after in zip(values, actions, following, strict=True):
         product *= (1.0 + seen[value, action, after]) / (3.0 + seen[value, action].sum())
         seen[value, action, after] += 1.0
-    assert looks.follows(values, actions, following) == pytest.approx(np.log(product))
+    assert appearance.follows(values, actions, following) == pytest.approx(np.log(product))
 
 
 def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
@@ -157,8 +157,8 @@ def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     for frame, place in zip(frames, places, strict=True):
         frame[20:32, 8 + 12 * place : 16 + 12 * place] = 220
     begins = np.arange(600) % 25 == 0
-    assert looks.find(frames) == [], "no pixel changes in 3 % of all steps"
-    codes, _ = looks.read(looks.find(frames, begins), frames)
+    assert appearance.find(frames) == [], "no pixel changes in 3 % of all steps"
+    codes, _ = appearance.read(appearance.find(frames, begins), frames)
     pairs = set(zip(map(tuple, codes.tolist()), places.tolist(), strict=True))
     assert len(pairs) == len({code for code, _ in pairs}) == len(set(places.tolist())) == 4
 
@@ -167,8 +167,8 @@ def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
     """Where most crops of a region have no contour at all."""
     frames = np.full((60, 64, 64, 3), 120, dtype=np.uint8)
     frames[[5, 20, 40], 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
-    found = looks.find(frames)
-    codes, known = looks.read(found, frames)
+    found = appearance.find(frames)
+    codes, known = appearance.read(found, frames)
     assert codes.shape == (60, 1) and known.all()
     assert codes[[5, 20, 40]].tolist() == [[1]] * 3 and codes.sum() == 3
 
@@ -178,7 +178,7 @@ def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() ->
     frames = np.full((800, 64, 64, 3), 120, dtype=np.uint8)
     frames[40::80, 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
     frames[80::160, 40:52, 40:52] += (100 * shape(1))[..., None].astype(np.uint8)
-    found = looks.find(frames)
+    found = appearance.find(frames)
     assert [len(factor.joint) for factor in found] == [2] and found[0].parts[0].mask[20:32, 20:32].any()
 
 
@@ -189,8 +189,8 @@ def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
     for kind in (0, 1):
         frames[value == kind + 1, 20:32, 20:32] += (100 * shape(kind))[..., None].astype(np.uint8)
     frames[(value == 0) & (np.arange(90) % 2 == 0), 20:32, 20:21] += 50
-    found = looks.find(frames)
-    codes, known = looks.read(found, frames)
+    found = appearance.find(frames)
+    codes, known = appearance.read(found, frames)
     assert [len(factor.joint) for factor in found] == [3] and known.all()
     assert len(set(zip(codes[:, 0].tolist(), value.tolist(), strict=True))) == 3
 
@@ -199,8 +199,8 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
     rng = np.random.default_rng(0)
     codes, frames = walk(80, rng)
     without = np.array([code[0] != 2 for code in codes])
-    found = looks.find(frames[without])
-    _, known = looks.read(found, frames)
+    found = appearance.find(frames[without])
+    _, known = appearance.read(found, frames)
     wheel = int(np.argmin(known[~without].mean(axis=0)))
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
 
@@ -210,17 +210,19 @@ def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int,
     def contours(kind: int, at: tuple[int, int], gain: float) -> NDArray[np.float32]:
         image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
         image[0, 26 + at[0] : 38 + at[0], 26 + at[1] : 38 + at[1]] += shape(kind)[..., None].astype(np.float32)
-        return looks.contours(gain * image)
+        return appearance.contours(gain * image)
 
     mask = np.zeros((64, 64), dtype=np.bool_)
     mask[16:48, 16:48] = True
-    one = looks.crops(contours(0, (0, 0), 1.0), mask)
-    same_mark, other = (looks.crops(contours(kind, shift, gain), mask) for kind in (0, 1))
-    assert looks.distances(one, same_mark, mask, 1e-6) == pytest.approx(np.zeros((1, 1)), abs=1e-4)
-    assert looks.distances(one, other, mask, 1e-6)[0, 0] > 0.5
-    assert looks.distances(one, looks.crops(contours(0, (9, 0), 1.0), mask), mask, 1e-6)[0, 0] > 0.2, "too far"
+    one = appearance.crops(contours(0, (0, 0), 1.0), mask)
+    same_mark, other = (appearance.crops(contours(kind, shift, gain), mask) for kind in (0, 1))
+    assert appearance.distances(one, same_mark, mask, 1e-6) == pytest.approx(np.zeros((1, 1)), abs=1e-4)
+    assert appearance.distances(one, other, mask, 1e-6)[0, 0] > 0.5
+    assert appearance.distances(one, appearance.crops(contours(0, (9, 0), 1.0), mask), mask, 1e-6)[0, 0] > 0.2, (
+        "too far"
+    )
     nothing = np.zeros_like(one)
-    assert looks.distances(nothing, nothing, mask, 1e-6)[0, 0] == 0.0, "two empty crops are alike"
+    assert appearance.distances(nothing, nothing, mask, 1e-6)[0, 0] == 0.0, "two empty crops are alike"
 
 
 def test_the_widest_gap_parts_the_groups() -> None:
@@ -228,11 +230,11 @@ def test_the_widest_gap_parts_the_groups() -> None:
     truth = rng.integers(3, size=30)
     apart = np.where(truth[:, None] == truth, rng.uniform(0.05, 0.2, (30, 30)), rng.uniform(0.4, 0.5, (30, 30)))
     apart = np.minimum(apart, apart.T) * (1.0 - np.eye(30))
-    label, cut = looks.groups(apart)
+    label, cut = appearance.groups(apart)
     assert len(set(zip(label.tolist(), truth.tolist(), strict=True))) == 3 and 0.15 < cut < 0.45
-    alike, _ = looks.groups(np.where(np.eye(30) > 0, 0.0, 0.1))
+    alike, _ = appearance.groups(np.where(np.eye(30) > 0, 0.0, 0.1))
     assert not alike.any(), "jitter alone makes one group"
-    strangers, _ = looks.groups(np.where(np.eye(4) > 0, 0.0, 0.5))
+    strangers, _ = appearance.groups(np.where(np.eye(4) > 0, 0.0, 0.5))
     assert len(set(strangers.tolist())) == 4, "and crops that are all unlike make as many"
 
 
@@ -244,8 +246,8 @@ def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
         images = np.ones((120, 64, 64, 3), dtype=np.float32)
         images[:, 20:40, 10:30] += left[:, None, None, None]
         images[:, 20:40, 30:50] += right[:, None, None, None]  # they touch
-        change = looks.changes(images)
-        return looks.regions(change, change.any(axis=0))
+        change = appearance.changes(images)
+        return appearance.regions(change, change.any(axis=0))
 
     found = regions(bits[:, 0], bits[:, 1])
     assert len(found) == 2 and not (found[0] & found[1]).any()
@@ -258,7 +260,7 @@ def test_what_falls_into_crumbs_stays_whole() -> None:
     """Every pixel changes at times of its own: no part covers the square, so that it is one region, and is not lost."""
     change = np.zeros((400, 64, 64), dtype=np.bool_)
     change[:, 20:30, 20:30] = np.random.default_rng(0).random((400, 10, 10)) < 0.2
-    (found,) = looks.regions(change, change.any(axis=0))
+    (found,) = appearance.regions(change, change.any(axis=0))
     assert found.sum() == 100 and found[20:30, 20:30].all()
 
 
@@ -269,19 +271,21 @@ def test_a_small_thing_that_a_large_one_touches_is_not_lost() -> None:
     large[10:30, 20:50] = small[30:37, 30:37] = crumbs[30:33, 45:48] = crumbs[9, :60] = True
     change[:, large] = (rng.random(400) < 0.2)[:, None]
     change[:, small | crumbs] = rng.random((400, int((small | crumbs).sum()))) < 0.2
-    found = looks.regions(change, change.any(axis=0))
+    found = appearance.regions(change, change.any(axis=0))
     assert len(found) == 2 and (found[0] == large).all() and (found[1] == small).all()
 
 
 def test_what_does_not_vary_freely_is_one_factor() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.integers(3, size=(2, 200))
-    assert not looks.bound(one, other)
-    assert looks.bound(one, (one + 1) % 3), "a copy"
-    assert looks.bound(one, (one > 0).astype(np.int64)), "a coarser copy"
+    assert not appearance.bound(one, other)
+    assert appearance.bound(one, (one + 1) % 3), "a copy"
+    assert appearance.bound(one, (one > 0).astype(np.int64)), "a coarser copy"
     turns = rng.integers(3, size=200)
-    assert looks.bound((turns == 1).astype(np.int64), (turns == 2).astype(np.int64)), "one excludes the other"
-    assert not looks.bound((turns == 1).astype(np.int64)[:9], (turns == 2).astype(np.int64)[:9]), "chance may be why"
+    assert appearance.bound((turns == 1).astype(np.int64), (turns == 2).astype(np.int64)), "one excludes the other"
+    assert not appearance.bound((turns == 1).astype(np.int64)[:9], (turns == 2).astype(np.int64)[:9]), (
+        "chance may be why"
+    )
 
 
 def test_it_learns_to_see_and_to_act_from_nothing() -> None:

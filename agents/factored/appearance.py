@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Frame
 
-from ..factored.factors import Codes
+from .factors import Codes
 
 Images = NDArray[np.float32]
 Mask = NDArray[np.bool_]

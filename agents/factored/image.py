@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame
 
-from . import looks
+from . import appearance
 
 _SCALE, _CELL_PX, _GAP_PX, _MOST = 5, 56, 8, 8
 """Times that frames are drawn larger; edge of a look; space between them; most factors, and values, that are drawn."""
@@ -19,12 +19,12 @@ _COLORS = np.array(
 """Told apart by the colour-blind (Okabe and Ito 2008)."""
 
 
-def picture(found: Sequence[looks.Factor], frames: Frame) -> NDArray[np.uint8]:
+def image(found: Sequence[appearance.Factor], frames: Frame) -> NDArray[np.uint8]:
     """Factors that were found in ``frames`` (N, 64, 64, 3). Shape (320, 832, 3) or, of many factors, higher."""
     gray = np.repeat(frames.mean(axis=(0, 3))[..., None], 3, axis=2)
     rows = max(_SCALE * 64, (min(len(found), len(_COLORS)) * (_CELL_PX + _GAP_PX)))
     sheet = np.full((rows, _SCALE * 64 + _MOST * (_CELL_PX + _GAP_PX), 3), 255.0)
-    codes = looks.read(list(found), frames)[0] if found else np.zeros((len(frames), 0), dtype=np.int64)
+    codes = appearance.read(list(found), frames)[0] if found else np.zeros((len(frames), 0), dtype=np.int64)
     for index, (factor, color) in enumerate(zip(found, _COLORS, strict=False)):
         mask = np.any([part.mask for part in factor.parts], axis=0)
         gray[mask] = 0.55 * gray[mask] + 0.45 * color

@@ -1,0 +1,162 @@
+"""The agent ``factored``: it begins with nothing, and learns to see from its own frames while it acts.
+
+All that it sees is remembered, up to a bound. As soon as something has no known value, or much more was seen, factors
+and values are found anew (:mod:`.appearance`), remembered transitions get their codes anew, and dynamics and outcomes
+are learned from them once more: nothing that happened is lost. Then it also decides what it had better remember of an
+episode (:mod:`.memory`). Once as many frames are remembered as may be, perception stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import compress
+
+import numpy as np
+
+from imagine_bench.capabilities import Perceived
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+
+from .. import snapshot
+from ..encoders.perception import prepare_torch
+from . import appearance
+from .agent import CodeAgent
+from .factors import CodeTransition, Memory
+from .image import image
+from .learned_perception import LearnedPerception
+from .memory import choose, contradictions, remembering
+from .settings import LEARNED, LearnedSettings
+
+_CONTRADICTIONS = 0.01
+"""Share of transitions that may contradict one another by a misread frame."""
+
+
+class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
+    """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
+
+    settings: LearnedSettings
+    _acted = 0
+    """Macro-actions that the agent itself chose in this episode."""
+    _observed = 0
+    """Transitions of this episode that it was shown, its own or another's."""
+    _longest: int | None = None
+    """After how many macro-actions an episode was cut, if any was."""
+
+    def begin_episode(self) -> None:
+        """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
+        self._acted = 0
+        self._observed = 0
+        self.perception.begin_episode()
+
+    @property
+    def _memory(self) -> Memory | None:
+        return self.perception.memory
+
+    @property
+    def _left(self) -> int | None:
+        if self._longest is None:
+            return None
+        return self._longest - max(self._acted, self._observed)
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act as on any codes, and count."""
+        action = super().act(observation, explore=explore)
+        self._acted += 1
+        return action
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Remember what was seen, see anew if that is due, and learn as from any codes."""
+        eyes = self.perception
+        self._observed += 1
+        if transition.truncated:
+            self._longest = max(self._observed, self._longest or 0)
+        if not eyes.full:
+            with self.meters.cpu_time("time/perception_s"):
+                before, after = transition.observation.frame, transition.next_observation.frame
+                eyes.remember(before, transition.action, after, begins=self._observed == 1)
+                found = (eyes.found, eyes.found_in)
+                if eyes.renew():
+                    self._recode(*found)
+                    eyes.history += [eyes.found_in] if eyes.found_in not in eyes.history else []
+            self.meters.count("time/perception_s")
+        super().observe(transition, episode=episode)
+        if transition.terminated or transition.truncated:
+            self.begin_episode()
+
+    def _recode(self, found: list[appearance.Factor], found_in: int) -> None:
+        """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
+
+        What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.
+        """
+        eyes, count = self.perception, len(self.replay)
+        of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
+        rows, few = self._rows(), _CONTRADICTIONS * (count - of_task.start)
+        if found and contradictions(rows[of_task]) > few:
+            now = (eyes.found, eyes.found_in)
+            eyes.take(found, found_in)
+            earlier = self._rows()
+            if contradictions(earlier[of_task]) > few:
+                eyes.take(*now)
+            else:
+                rows = earlier
+        eyes.memory = choose(rows[of_task], eyes.begins[of_task], eyes.seen_sizes, self.n_actions, self.settings)
+        rows = remembering(rows, eyes.begins[:count], eyes.memory)
+        self.replay.recode([(row.code, row.following) for row in rows], len(eyes.sizes))
+        self._relearn(self.tasks, count)
+        eyes.begin_episode()
+        if rows and eyes.memory and not eyes.begins[count]:
+            eyes.recall(rows[-1].following[-1])
+
+    def _rows(self) -> list[CodeTransition]:
+        """What is replayed, with the codes that its frames have now, as far as they are seen."""
+        codes, _ = self.perception.codes(np.stack(self.perception.frames))
+        return [
+            row._replace(code=codes[before], following=codes[after])
+            for row, (before, after) in zip(self.replay.rows(), self.perception.transitions, strict=False)
+        ]
+
+    def perceived(self) -> Iterator[Perceived]:
+        """What it saw whenever that changed; see :class:`imagine_bench.capabilities.SeeingLearner`."""
+        eyes = self.perception
+        for count in eyes.history:
+            seen = eyes.first(count)
+            found = appearance.find(*seen)
+            begun = sum(compress(eyes.begins, [after < count for _, after in eyes.transitions]))
+            yield Perceived(begun, tuple(len(factor.joint) for factor in found), image(found, seen[0]))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Also what it sees."""
+        return {**super().diagnostics(), **self.perception.diagnostics()}
+
+    def state(self) -> AgentState:
+        """A snapshot: also the frames that it remembers."""
+        eyes, common = self.perception, super().state()
+        values = {key: value for key, value in common.values.items() if key != "code_sizes"}
+        return AgentState(
+            arrays={**common.arrays, **eyes.arrays()}, values={**values, **eyes.values(), "longest": self._longest}
+        )
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot: find the same factors in the same frames, and learn from all that is replayed.
+
+        ArtefactError if it does not fit this agent, and then nothing was changed.
+        """
+        snapshot.require_fit(_flat(state), _flat(self.state()), equal=("settings", "n_actions"))
+        self.perception.load(state)
+        self._longest = state.values["longest"]
+        self._take_up(state)
+
+
+def _flat(state: AgentState) -> AgentState:
+    """A snapshot whose codes are in one row: how many factors they are of changes as it learns."""
+    codes: snapshot.Arrays = {
+        name: state.arrays[name].ravel() for name in ("replay/code", "replay/following") if name in state.arrays
+    }
+    return AgentState(arrays={**state.arrays, **codes}, values=state.values)
+
+
+def make(context: AgentContext) -> LearnedPerceptionAgent:
+    """The agent ``factored``, of whatever frames are 64 x 64."""
+    settings = LEARNED.resolve(context.hyperparameters, context.overrides, context.config_group)
+    prepare_torch(context.device)
+    perception = LearnedPerception(settings.perception, factored=settings.dynamics.factored)
+    return LearnedPerceptionAgent(perception, context.n_actions, settings, context.seeds)
