@@ -1,7 +1,8 @@
 """What can be registered; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
-The text is an entrant's name in protocols, tables and files; one agent, regressor or world model may enter with
-several settings.
+An agent that comes in variants has a registered name for each, such as ``factored:given``; settings follow after a
+comma: ``factored:given,planning.depth=1``. The text is an entrant's name in protocols, tables and files; one agent,
+regressor or world model may enter with several settings.
 """
 
 from __future__ import annotations
@@ -95,7 +96,10 @@ class Entrant(NamedTuple):
 
     def __str__(self) -> str:
         """The one name of this entrant, however its settings were written."""
-        return ":".join([self.agent, *filter(None, [",".join(f"{n}={_text(v)}" for n, v in self.settings.items())])])
+        if not self.settings:
+            return self.agent
+        settings = ",".join(f"{name}={_text(value)}" for name, value in self.settings.items())
+        return f"{self.agent}{',' if ':' in self.agent else ':'}{settings}"
 
     @property
     def words(self) -> str:
@@ -108,7 +112,10 @@ class Entrant(NamedTuple):
 def entrant(text: str) -> Entrant:
     """Undo ``str(entrant)``. Raises InvalidValueError: settings that are none, or one that is given twice."""
     agent, colon, rest = text.partition(":")
-    return Entrant(agent, dict(parse_settings(_BETWEEN.split(rest), f"entrant {text!r}:")) if colon else {})
+    words = _BETWEEN.split(rest) if colon else []
+    if words and words[0].isidentifier():
+        agent = f"{agent}:{words.pop(0)}"
+    return Entrant(agent, dict(parse_settings(words, f"entrant {text!r}:")))
 
 
 def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Any], ...]:

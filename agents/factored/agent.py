@@ -1,4 +1,4 @@
-"""What ``factored`` and ``factored:given`` share: a structured model of codes, planning in it, exploring the unknown."""
+"""``CodeAgent``: a structured model of codes and plans in it, for ``factored`` and ``factored:given``."""
 
 from __future__ import annotations
 

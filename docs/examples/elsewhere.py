@@ -1,4 +1,4 @@
-"""``factored_own`` in Gymnasium environments that nobody here wrote: 64 x 64 pixels, and nothing beforehand.
+"""``factored`` in Gymnasium environments that nobody here wrote: 64 x 64 pixels, and nothing beforehand.
 
 pip install "gymnasium[toy-text,other]" minigrid
 python elsewhere.py FrozenLake-v1 MiniGrid-Empty-Random-5x5-v0 --seeds 0 1 2 3 4 --out elsewhere.json

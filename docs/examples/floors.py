@@ -1,6 +1,6 @@
 """Transitions until an agent solves 95 % of what can be solved, over the information floor: the ladder's worlds.
 
-python floors.py --agent factored_own --cubes 4 --out floors.json
+python floors.py --agent factored --cubes 4 --out floors.json
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def over_floor(row: dict[str, Any]) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agent", default="factored_own")
+    parser.add_argument("--agent", default="factored")
     parser.add_argument("--cubes", type=int, default=4)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--tests", type=int, default=100)

@@ -25,7 +25,7 @@ from matplotlib import pyplot as plt
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
 COLORS = {
-    "factored": "#882255",
+    "factored:given": "#882255",
     "imagination_uncertainty": "#009e73",
     "imagination": "#d55e00",
     "dqn": "#0072b2",
@@ -111,7 +111,7 @@ LADDER = {
     "arrow_puzzle-controls-tabular": (
         "count_table", "count_table_directed", "count_table_directed_macrostate", "posterior_sampling",
     ),
-    "arrow_puzzle-sample_efficiency": ("factored",),
+    "arrow_puzzle-sample_efficiency": ("factored:given",),
 }  # fmt: skip
 """Agents by the kept bench that tells most exactly when they reach 95 %; none of them was tested beyond the first's."""
 
@@ -220,7 +220,7 @@ def why() -> None:
         for budget, counts in run["failures"].items():
             before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
             found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
-    figure = figures.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored"})
+    figure = figures.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored:given"})
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 

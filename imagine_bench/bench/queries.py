@@ -35,11 +35,12 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     if protocol.after and not isinstance(agent, TransferLearner):
         raise InvalidValueError(
             f"Agent {name!r} has no model of the world to carry over from {', '.join(protocol.after)}; leave --after "
-            "out, or give agents that have one, such as factored or imagination."
+            "out, or give agents that have one, such as factored:given or imagination."
         )
     if protocol.queries and not isinstance(agent, QueryingAgent):
         raise InvalidValueError(
-            f"Agent {name!r} cannot query an oracle; leave --queries out, or give an agent that can, such as factored."
+            f"Agent {name!r} cannot query an oracle; leave --queries out, or give an agent that can, such as "
+            "factored:given."
         )
 
     if protocol.feedback and isinstance(agent, ExternalTrainer):

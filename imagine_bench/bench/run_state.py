@@ -117,7 +117,7 @@ class Run:
         return {
             "protocol": self.protocol.as_dict(),
             "protocol_hash": self.protocol.hash,
-            "agent": self.spec.agent,
+            "agent": self.protocol.written_name(self.spec.agent),
             "seed": self.spec.seed,
             "settings": {} if settings is None else dataclasses.asdict(settings),
         }

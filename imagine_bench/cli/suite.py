@@ -19,7 +19,9 @@ class Suite:
 
     experiment: Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], listed("STR", "(default: all)")] = ()
     """Only these experiments, such as memory."""
-    agents: Annotated[tuple[str, ...] | None, listed("STR", "(default: dqn imagination_uncertainty factored)")] = None
+    agents: Annotated[
+        tuple[str, ...] | None, listed("STR", "(default: dqn imagination_uncertainty factored:given)")
+    ] = None
     """Agents to compare, also of other packages."""
     seeds: Annotated[tuple[int, ...] | None, listed("INT", "(default: 0 1)")] = None
     """Seeds; each agent has one run a seed and level."""

@@ -204,7 +204,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "hyperparameters": "minimal", "seeds": (0,), "budgets": (10, 20), "evaluation_episodes": 20,
         "open_loop_starts": 20, "recorded_episodes": 2,
     },
-    "quick": {"agents": (*_ALL_AGENTS, "factored")},
+    "quick": {"agents": (*_ALL_AGENTS, "factored:given")},
     "thesis": {
         "hyperparameters": "published", "agents": _THESIS_AGENTS, "seeds": tuple(range(5)),
         "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
@@ -214,11 +214,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
     },
     "sample_efficiency": {
-        "agents": ("factored",), "seeds": tuple(range(5)), "budgets": tuple(range(20, 201, 20)),
+        "agents": ("factored:given",), "seeds": tuple(range(5)), "budgets": tuple(range(20, 201, 20)),
         "evaluation_episodes": 1000, "recorded_episodes": 2,
     },
     "queries": {
-        "agents": ("factored",), "seeds": tuple(range(5)), "budgets": (10, 20, 30, 40, 60, 80, 100),
+        "agents": ("factored:given",), "seeds": tuple(range(5)), "budgets": (10, 20, 30, 40, 60, 80, 100),
         "evaluation_episodes": 100, "execution": "kinematic",
         "open_loop_starts": 0, "recorded_episodes": 0,
     },

@@ -8,12 +8,13 @@ import itertools
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self, get_type_hints
 
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.registry.old_names import FIRST, TODAY, agent_label, edition_of, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 
 LATER: Mapping[str, Any] = {"later": True}
@@ -43,6 +44,9 @@ class ProtocolData(ABC):
     #: run with it is then another bench. Empty in a protocol that no plan made.
     settings_digest: str = ""
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
+    #: Edition of agents' names that files and the hash of this protocol have; ``agents`` are today's labels in any.
+    #: A file says it only where names would be taken for older ones without it. See :mod:`.registry.old_names`.
+    agent_names: int = field(default=TODAY, metadata=LATER)
 
     def __post_init__(self) -> None:
         """Lists become tuples. Raises InvalidValueError: a value of another type than its field's."""
@@ -52,12 +56,22 @@ class ProtocolData(ABC):
         """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""
         later = {field.name: field.default for field in dataclasses.fields(self) if field.metadata == LATER}
         values = {n: value for n, value in dataclasses.asdict(self).items() if n not in later or value != later[n]}
+        values.pop("agent_names", None)
+        values["agents"] = [self.written_name(agent) for agent in self.agents]
+        if self.agent_names == TODAY and edition_of(values["agents"]) == FIRST:
+            values["agent_names"] = TODAY
         return json.loads(json.dumps(values))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """The inverse of :meth:`as_dict`."""
-        return cls(**data)
+        """The inverse of :meth:`as_dict`; names of an earlier edition become today's labels."""
+        edition = edition_of(data["agents"], data.get("agent_names", FIRST))
+        agents = [agent_label(agent, {"agent_names": edition}) for agent in data["agents"]]
+        return cls(**{**data, "agents": agents, "agent_names": edition})
+
+    def written_name(self, agent: str) -> str:
+        """The name that files of this protocol have for an agent, which is given by today's label."""
+        return name_in_edition_1(agent) if self.agent_names == FIRST else agent
 
     @property
     def hash(self) -> str:

@@ -31,6 +31,7 @@ from imagine_bench.errors import (
     require_known,
 )
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
 from imagine_bench.registry.own import AGENTS as AGENTS
 from imagine_bench.registry.own import DEMONSTRATOR as DEMONSTRATOR
 from imagine_bench.registry.own import REGRESSIONS as REGRESSIONS
@@ -165,6 +166,8 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
     if isinstance(name, str) and name in own:
         return own[name]
     there = offers(group)
+    if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
+        raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
     entry = there[require_known(_GROUPS[group].what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
@@ -261,6 +264,8 @@ def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
         return offered(name, own, group)
     one = entrant(name)
     entry = offered(one.agent, own, group)
+    if not one.settings:
+        return entry
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 

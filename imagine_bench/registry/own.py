@@ -72,15 +72,16 @@ AGENTS: dict[str, AgentEntry] = {
         "what it remembers.",
     ),
     "factored": AgentEntry(
-        make="imagine_bench.agents.factored.agent:make", encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
-        description="Sees discrete factors, learns which of them an action changes and what is rewarded, imagines "
-        "every future within reach, explores where it is uncertain, and plans in its model when it is tested.",
+        make="imagine_bench.agents.factored.learned:make", needs_encoder=False,
+        settings="imagine_bench.agents.factored.settings:LEARNED",
+        description="Begins with nothing: from its own frames it learns discrete factors, which of them an action "
+        "changes and what is rewarded; it explores where it is uncertain and plans in its model.",
     ),
-    "factored_own": AgentEntry(
-        make="imagine_bench.agents.factored_own.agent:make", needs_encoder=False, title="factored, own eyes",
-        settings="imagine_bench.agents.factored.settings:OWN",
-        description="Like factored, but it begins with nothing: it learns to see, too, from its own frames as it acts.",
+    "factored:given": AgentEntry(
+        make="imagine_bench.agents.factored.given:make", encoder_kind="codes",
+        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
+        description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "
+        "also show what it imagines and query an oracle.",
     ),
     "sb3_dqn": AgentEntry(
         make="imagine_bench.agents.library.sb3:make_dqn", needs_encoder=False, settings=_LIBRARY_SETTINGS,
@@ -124,7 +125,7 @@ AGENTS: dict[str, AgentEntry] = {
     "count_table_own": AgentEntry(
         make="imagine_bench.agents.tabular.own:make", needs_encoder=False, title="count table, own eyes",
         settings="imagine_bench.agents.tabular.settings:OWN",
-        description="A control: like count table, directed, but it learns to see from its own frames as factored_own.",
+        description="A control: like count table, directed, but it learns to see from its own frames as factored.",
     ),
     **{
         f"{name}{twin}": AgentEntry(
@@ -178,7 +179,7 @@ AGENTS: dict[str, AgentEntry] = {
     "dqn_codes": AgentEntry(
         make="imagine_bench.agents.dqn:make", settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
         encoder_kind="codes", title="DQN (codes)",
-        description="A control: the DQN, which reads the discrete codes that factored sees in place of latents.",
+        description="A control: the DQN, which reads the discrete codes that factored:given sees in place of latents.",
     ),
     "dqn_swaps": AgentEntry(
         make="imagine_bench.agents.controls.swaps:make", encoder_kind="codes", title="DQN (codes), swaps",

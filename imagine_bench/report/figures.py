@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from imagine_bench.entrants import entrant
 from imagine_bench.judge.causes import CAUSES
 from imagine_bench.registry import AGENTS
 from imagine_bench.report.data import ReportData, Score
@@ -94,7 +95,7 @@ def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg:
 
 def color(agent: str) -> str:
     """The agent's color, the same in every plot."""
-    known, base = list(AGENTS), agent.partition(":")[0]
+    known, base = list(AGENTS), entrant(agent).agent
     place = known.index(base) if base in known else sum(base.encode())
     other = 1 + crc32(agent.encode()) % (len(_COLORS) - 1) if agent != base else 0  # never that of the agent as it is
     return _COLORS[(place + other) % len(_COLORS)]
@@ -263,7 +264,9 @@ def open_loop_figure(data: ReportData) -> Figure:
     panels[1].set(title="Error of the predicted reward", ylabel="mean absolute error")
     _from_zero(panels[1])
     panels[2].set(title="Wrong about the episode's end", ylabel="imagined transitions (%)", ylim=(-3, 106))
-    measure = "variance of latents" + ("\n(“factored”: probability)" if "factored" in data.open_loop else "")
+    measure = "variance of latents" + (
+        "\n(“factored:given”: probability)" if "factored:given" in data.open_loop else ""
+    )
     panels[3].set(title="Uncertainty", ylabel=measure, yscale=_log_if_positive(data))
     for axes in panels:
         axes.set_xlabel("imagined depth (macro-actions)")

@@ -18,6 +18,7 @@ import numpy as np
 from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store.bench_folder import KEPT, read_protocol
 from imagine_bench.store.files import csv_text, json_text, read_json
 from imagine_bench.store.merge import largest_part
@@ -54,10 +55,11 @@ def archive_files(result: BenchResult) -> dict[str, str]:
 def results_csv(result: BenchResult) -> str:
     """One row an agent, seed and budget; every diagnostic the agents report has its column."""
     names = sorted({name for _, checkpoint in result.rows for name in checkpoint.diagnostics})
+    protocol = result.whole or result.protocol
     rows: list[list[object]] = [["agent", "seed", *_COUNTS, *_DERIVED, *_MEANS, *_COSTS, "solved", *names]]
     for run, checkpoint in result.rows:
         low, high = statistics.wilson(checkpoint.successes, checkpoint.test_episodes)
-        row = [run.agent, run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
+        row = [protocol.written_name(run.agent), run.seed, *(getattr(checkpoint, name) for name in _COUNTS)]
         row += [checkpoint.success_rate, low, high]
         row += [getattr(checkpoint, name) for name in (*_MEANS, *_COSTS)] + [checkpoint.solved or ""]
         rows.append(row + [checkpoint.diagnostics.get(name, "") for name in names])
@@ -78,9 +80,10 @@ def load_archive(folder: Path) -> BenchResult:
             f"that act have a report. The command in its {KEPT} makes the bench anew, with one."
         )
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
+    names = {"agent_names": whole.agent_names}
     try:
         for row in csv.DictReader(io.StringIO(path.read_text())):
-            rows.setdefault((row["agent"], int(row["seed"])), []).append(_checkpoint(row))
+            rows.setdefault((agent_label(row["agent"], names), int(row["seed"])), []).append(_checkpoint(row))
     except (KeyError, ValueError, TypeError, OSError) as error:
         raise ArtefactError(
             f"{path} is not the table of a bench of agents: {error!r}. It was left untouched."

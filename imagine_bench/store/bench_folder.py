@@ -66,7 +66,7 @@ class BenchStore:
 
     def run_folder(self, agent: str, seed: int) -> Path:
         """The folder of one run."""
-        return self.folder / file_name(agent) / f"seed_{seed}"
+        return self.folder / file_name(self.protocol.written_name(agent)) / f"seed_{seed}"
 
     def require_own(self, folders: Collection[Path]) -> None:
         """Raise ArtefactError for a run's folder among ``folders`` that says it is of another protocol."""

@@ -24,7 +24,7 @@ from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 _MEANS = ("time/", "loss/", "imagination/")
 """Diagnostics that are means since the test before."""
-_OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes")
+_OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes", "agent_names")
 """Fields in which such benches may differ; their encoders must agree where both have one."""
 
 
@@ -193,6 +193,7 @@ def _merged(results: Sequence[BenchResult]) -> Protocol:
     seeds = [protocol.seeds for protocol in protocols]
     return dataclasses.replace(
         first,
+        agent_names=max(protocol.agent_names for protocol in protocols),
         agents=first.agents if same else _all([protocol.agents for protocol in protocols], "an agent"),
         settings_digest=_one(digests, "are of different settings") or "" if same else digest(digests),
         seeds=tuple(sorted(_all(seeds, "a seed"))) if same else _common(seeds, "seeds"),

@@ -19,6 +19,7 @@ import numpy as np
 
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.data import ProtocolData, digest
+from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.codec import Arrays, pack, read_arrays, table_rows, table_text, unpack, write_arrays
 from imagine_bench.store.counters import Counters
@@ -85,7 +86,12 @@ def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) 
     config = _config(folder)
     difference = first_difference(
         {name: config.get(name) for name in ("agent", "seed", "protocol_hash", "protocol")},
-        {"agent": agent, "seed": seed, "protocol_hash": digest(config.get("protocol")), "protocol": protocol.as_dict()},
+        {
+            "agent": protocol.written_name(agent),
+            "seed": seed,
+            "protocol_hash": digest(config.get("protocol")),
+            "protocol": protocol.as_dict(),
+        },
     )
     if difference is not None:
         name, was, would_be = difference
@@ -162,7 +168,7 @@ def load_run(folder: Path) -> RunResult:
     training, rollouts = read_arrays(folder / _TRAINING), read_arrays(folder / _IMAGINED)
     recording = recording_path(folder)
     return RunResult(
-        agent=config["agent"],
+        agent=agent_label(config["agent"], config["protocol"]),
         seed=config["seed"],
         checkpoints=_read_checkpoints(folder),
         settings=config["settings"],
@@ -188,7 +194,7 @@ def load_unfinished(folder: Path) -> RunResult:
     training = counters.training()
     with reading(folder / _CONFIG, "a run's configuration"):
         return RunResult(
-            agent=config["agent"],
+            agent=agent_label(config["agent"], config["protocol"]),
             seed=config["seed"],
             checkpoints=tuple(counters.rows),
             settings=config["settings"],

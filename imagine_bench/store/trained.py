@@ -16,6 +16,7 @@ from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.protocols.task_types import Result
+from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import is_archive
 from imagine_bench.store.bench_folder import BenchStore, read_control
@@ -58,7 +59,9 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
     config = read_sealed(path, what)
     with reading(path, what):
-        task, name, seed = config["protocol"]["task"], config["agent"], config["seed"]
+        task = config["protocol"]["task"]
+        name = agent_label(config["agent"], config["protocol"])
+        seed = config["seed"]
         settings = _flat(config["settings"])
     require_control(task, str(folder))
     with reading(path, what):

@@ -13,7 +13,7 @@ from typing import Any
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import digest
 
-AGENTS = ("dqn", "imagination_uncertainty", "factored")
+AGENTS = ("dqn", "imagination_uncertainty", "factored:given")
 """The agents that are compared where none are named."""
 MEASURES = ("success", "auroc")
 """``"success"`` of test episodes, between chance and optimum of the level's certificate; or ``"auroc"``, with which

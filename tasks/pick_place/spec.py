@@ -51,7 +51,7 @@ _COMPARED = ("random", "oracle", *_CHAPTER_3)
 _FILTERED = "imagination_only_uncertainty"  # not in `quick`: there its filter was seen to discard nothing
 _PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"agents": (*_COMPARED, _FILTERED)},
-    "quick": {"agents": (*_COMPARED, "factored"), "evaluation_episodes": 100},
+    "quick": {"agents": (*_COMPARED, "factored:given"), "evaluation_episodes": 100},
     "thesis": {  # section 3.2.3: 10 runs of 1000 episodes, each tested on 100
         "agents": _CHAPTER_3,
         "seeds": tuple(range(10)),
@@ -60,7 +60,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
     "full": {
         "hyperparameters": "fast",  # without dropout the published values leave the filter nothing to compare
-        "agents": (*_COMPARED, _FILTERED, "factored"),
+        "agents": (*_COMPARED, _FILTERED, "factored:given"),
         "budgets": (100, 250, 500, 1000),
     },
 }

@@ -78,7 +78,7 @@ def learner(name: str, spec: TaskSpec) -> Agent:
     return registry.make_agent(name, context)
 
 
-@pytest.mark.parametrize("name", ["dqn", "imagination", "imagination_uncertainty", "factored", "count_table"])
+@pytest.mark.parametrize("name", ["dqn", "imagination", "imagination_uncertainty", "factored:given", "count_table"])
 def test_an_agent_says_what_it_reads_and_expects(name: str) -> None:
     agent, states = learner(name, SPEC), np.array(states_of(SPEC.rules))
     before = agent.state()

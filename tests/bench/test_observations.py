@@ -101,7 +101,7 @@ def test_choices_in_any_order_are_one_bench() -> None:
             InvalidValueError,
             "Agent 'dqn' takes 64 x 64 frames alone; leave",
         ),
-        ({"observation_size": 96, "agents": ("factored",)}, InvalidValueError, "takes 64 x 64 frames alone"),
+        ({"observation_size": 96, "agents": ("factored:given",)}, InvalidValueError, "takes 64 x 64 frames alone"),
     ],
 )
 @pytest.mark.usefixtures("witness")

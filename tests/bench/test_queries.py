@@ -207,7 +207,7 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
 
 
 def test_who_can_carry_over_or_ask_is_known() -> None:
-    for agent, carries, asks in (("factored", True, True), ("imagination", True, False), ("dqn", False, False)):
+    for agent, carries, asks in (("factored:given", True, True), ("imagination", True, False), ("dqn", False, False)):
         kind = registry.agent_entry(agent).encoder_kind
         encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
         spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=encoder)
@@ -252,7 +252,7 @@ class _KilledError(Exception):
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
-        ("factored", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "queries": 2}),
+        ("factored:given", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "queries": 2}),
         (
             "imagination",
             {

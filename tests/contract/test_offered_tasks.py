@@ -65,7 +65,7 @@ def test_it_goes_from_list_to_recording(guest: Path, tmp_path: Path, capsys: pyt
     assert main(["describe", "lights_out"]) == 0 and "16, 15 of them starts" in capsys.readouterr().out
     assert main(["check", "--task", "lights_out"]) == 0 and capsys.readouterr().out.count("ok  ") == 7
     wanted, paths = plan(
-        "lights_out", "smoke", agents=("oracle", "dqn", "factored"), execution="kinematic", budgets=(5,),
+        "lights_out", "smoke", agents=("oracle", "dqn", "factored:given"), execution="kinematic", budgets=(5,),
         evaluation_episodes=4, open_loop_starts=2, recorded_episodes=1,
     )  # fmt: skip
     assert capsys.readouterr().out.count("one is trained into") == 2, "latents for one, codes for the other"

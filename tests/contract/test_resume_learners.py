@@ -72,7 +72,7 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
             do(tmp_path / "run", agent, 0.0)
     resumed = do(tmp_path / "run", agent, 0.0)
     assert measured(whole) == measured(resumed)
-    tables = agent in ("factored_own", "count_table_own") or registry.AGENTS[agent].encoder_kind == "codes"
+    tables = agent in ("factored", "count_table_own") or registry.AGENTS[agent].encoder_kind == "codes"
     assert tables or any(name.startswith("loss/") for name in whole.checkpoints[-1].diagnostics)
     assert own_values(tmp_path / "whole") == own_values(tmp_path / "run")
     before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")

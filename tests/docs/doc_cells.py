@@ -15,6 +15,7 @@ import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.certificates.certificate import Certificate, certificate
+from imagine_bench.registry.old_names import label_today
 from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
@@ -270,7 +271,8 @@ def _json(path: str) -> Any:
 
 
 def _answers(folder: str, agent: str, path: str) -> np.ndarray:
-    values: list[Any] = [run for run in _json(f"{folder}/generalisation.json")["runs"] if run["agent"] == agent]
+    runs = _json(f"{folder}/generalisation.json")["runs"]
+    values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
     for name in path.split("/"):
         values = [value[name] for value in values]
     return np.array(values, dtype=float)
@@ -315,7 +317,7 @@ def caused(agent: str, episodes: str, cause: str) -> str:
 
 def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
     """A count over the plans of an agent; ``solved`` with Wilson's interval where they are of one run."""
-    found = [each for each in _json(f"{folder}/plans.json") if each["agent"] == agent]
+    found = [each for each in _json(f"{folder}/plans.json") if label_today(each["agent"]) == agent]
     found = [each for each in found if episodes in ("", str(each["episodes"]))]
     if key == "as_imagined":
         return f"{sum(each['steps_as_imagined'] for each in found):,} of {sum(each['steps'] for each in found):,}"

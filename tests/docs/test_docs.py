@@ -107,7 +107,7 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     code = f"import matplotlib\nmatplotlib.use('agg')\nif __name__ == '__main__':\n{textwrap.indent(code, '    ')}\n"
-    code = code.replace("--agents random dqn factored", "--agents random")
+    code = code.replace("--agents random dqn factored:given", "--agents random")
     (tmp_path / "notebook.py").write_text(code + "    assert exit_code == 0\n")
     subprocess.run([sys.executable, "notebook.py"], cwd=tmp_path, check=True, capture_output=True, timeout=240)
 

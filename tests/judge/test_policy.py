@@ -248,9 +248,9 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
     shutil.copy(encoders.resolve(HARD, "clean"), own)
     codes = encoders.resolve(HARD, "clean", kind="codes")
     names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
-    wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "factored"), **names)
+    wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "factored:given"), **names)
     config = {"protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
-    for agent, complaint in (("dqn", "has no checkpoint"), ("factored", "has no checkpoint")):
+    for agent, complaint in (("dqn", "has no checkpoint"), ("factored:given", "has no checkpoint")):
         (tmp_path / "config.json").write_text(json.dumps(sealed({**config, "agent": agent})))
         with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
             load_trained(tmp_path, encoder=str(own))

@@ -340,11 +340,11 @@ def test_summary_table_for_the_terminal(result: BenchResult) -> None:
 
 def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult) -> None:
     both = dataclasses.replace(
-        result.protocol, agents=("random", "dqn", "factored"), encoder="a@0123456789ab", codes="b@0123456789ab"
+        result.protocol, agents=("random", "dqn", "factored:given"), encoder="a@0123456789ab", codes="b@0123456789ab"
     )
     views = encoder_views(SimpleNamespace(protocol=both))  # type: ignore[arg-type]
     assert [(view.identity, view.agents) for view in views] == [
-        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("factored",)),
+        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("factored:given",)),
     ]  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def test_without_any_difference_it_is_about_the_last_budget(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("seeds", [pytest.param((0,), marks=pytest.mark.slow), (0, 1, 2)])
 def test_the_widest_report_can_be_read(seeds: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    others = ("sb3_dqn", "sb3_qrdqn", "sb3_dqn_latents", "imagination_only_uncertainty", "factored")
+    others = ("sb3_dqn", "sb3_qrdqn", "sb3_dqn_latents", "imagination_only_uncertainty", "factored:given")
     for agent in others:
         monkeypatch.setitem(LEVELS, agent, (0.1, 0.9))
     agents = (*(name for name in LEVELS if name not in others), *others)

@@ -224,7 +224,7 @@ def command(rng: np.random.Generator, root: Path) -> str:
 
 
 def setting(rng: np.random.Generator) -> None:
-    agents = ("imagination", "factored", "sb3_dqn")
+    agents = ("imagination", "factored:given", "sb3_dqn")
     names = sorted(set().union(*map(registry.setting_names, agents)))
     plan("arrow_puzzle", "smoke", overrides=((str(rng.choice(names)), hostile(rng)),), agents=agents)
 
