@@ -38,11 +38,6 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def words(page: Path) -> int:
-    """Words of a page, what its comments say to machines apart."""
-    return len(re.sub(r"<!--.*?-->", "", page.read_text(), flags=re.DOTALL).split())
-
-
 @pytest.mark.parametrize("page", WRITTEN, ids=name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)", page.read_text()):
@@ -110,14 +105,6 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     code = code.replace("--agents random dqn factored:given", "--agents random")
     (tmp_path / "notebook.py").write_text(code + "    assert exit_code == 0\n")
     subprocess.run([sys.executable, "notebook.py"], cwd=tmp_path, check=True, capture_output=True, timeout=240)
-
-
-def test_pages_are_short() -> None:
-    assert words(ROOT / "README.md") <= 900
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
-    read = [page for page in PAGES[1:] if page != thesis_elements.PAGE]  # that one is looked up
-    assert not [page for page in read if words(page) > 1200]
-    assert sum(words(page) for page in read) <= 20_100
 
 
 def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:
