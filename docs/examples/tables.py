@@ -1,4 +1,4 @@
-"""How far what `factored:given` learned of actions is from the exact rules, after as many transitions as the floor says.
+"""How far what `factored:given` learned of actions is from the exact rules, after the floor's number of transitions.
 
 python tables.py slip=0.1 slip=0.2 fickle=0.2 --out tables.json
 """

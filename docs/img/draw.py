@@ -17,6 +17,7 @@ from imagine_bench.certificates.certificate import certificate
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
 from imagine_bench.report.radar import radar_figure
+from imagine_bench.registry.old_names import label_today
 from imagine_bench.store.archive import load_archive
 
 mpl.use("agg")
@@ -218,9 +219,10 @@ def why() -> None:
     found: figures.Failures = {}
     for run in json.loads((kept / "why.json").read_text())["runs"]:
         for budget, counts in run["failures"].items():
-            before, causes = found.setdefault(run["agent"], {}).get(int(budget), (0, Counter()))
-            found[run["agent"]][int(budget)] = (before + tests, causes + Counter(counts))
-    figure = figures.causes_figure({agent: by_budget for agent, by_budget in found.items() if agent != "factored:given"})
+            before, causes = found.setdefault(label_today(run["agent"]), {}).get(int(budget), (0, Counter()))
+            found[label_today(run["agent"])][int(budget)] = (before + tests, causes + Counter(counts))
+    shown = {agent: by_budget for agent, by_budget in found.items() if agent != "factored:given"}
+    figure = figures.causes_figure(shown)
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
