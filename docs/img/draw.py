@@ -14,10 +14,10 @@ import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.certificates.certificate import certificate
+from imagine_bench.registry.old_names import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
 from imagine_bench.report.radar import radar_figure
-from imagine_bench.registry.old_names import label_today
 from imagine_bench.store.archive import load_archive
 
 mpl.use("agg")
