@@ -41,7 +41,7 @@ def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
     found: dict[int, list[float]] = {}
     with (RESULTS / folder / "results.csv").open() as file:
         for row in csv.DictReader(file):
-            if row["agent"] == agent:
+            if label_today(row["agent"]) == agent:
                 share = int(row["successes"]) / int(row["test_episodes"])
                 found.setdefault(int(row["episodes"]), []).append(share)
     return {budget: np.array(values) for budget, values in sorted(found.items())}
@@ -233,7 +233,7 @@ def radar() -> None:
         with (RESULTS / kept / "scores.csv").open() as file:
             for row in csv.DictReader(file):
                 values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
-                scores.setdefault(row["agent"], {})[row["experiment"]] = statistics.Estimate(*values)
+                scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = statistics.Estimate(*values)
     spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
     figure = radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
     figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")

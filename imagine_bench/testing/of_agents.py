@@ -75,14 +75,15 @@ def _acts(one: CheckedAgent) -> None:
         for frame, state in zip(frames, states, strict=True)
     ]
     before = copy.deepcopy(agent.state())
-    once, again = (_first_actions(agent, given) for _ in range(2))
+    once, again = (greedy(agent, given) for _ in range(2))
     if one.entry.learns:
         require(once == again, "asked twice with explore=False, it acts otherwise")
-        require(_same(before, agent.state()), "acting with explore=False changes its state")
+        require(same_arrays(before, agent.state()), "acting with explore=False changes its state")
     require(all(isinstance(value, (int, float)) for value in agent.diagnostics().values()), "diagnostics: no numbers")
 
 
-def _first_actions(agent: Agent, given: Sequence[Observation]) -> list[int]:
+def greedy(agent: Agent, given: Sequence[Observation]) -> list[int]:
+    """The greedy action in each observation, as the first of an episode."""
     actions = []
     for each in given:
         begin_episode(agent)
@@ -96,11 +97,11 @@ def _goes_on(one: CheckedAgent) -> None:
     snapshot = agent.state()
     kept = copy.deepcopy(snapshot)
     here = _play(spec, agent, privileged, range(3, 6))
-    require(_same(kept, snapshot), "what it learns later alters a state that it gave before")
+    require(same_arrays(kept, snapshot), "what it learns later alters a state that it gave before")
     twin = one.make()
     twin.restore(kept)
     require(_play(spec, twin, privileged, range(3, 6)) == here, "it acts otherwise")
-    require(_same(agent.state(), twin.state()), "its later state differs")
+    require(same_arrays(agent.state(), twin.state()), "its later state differs")
 
 
 def _trainee(one: CheckedAgent) -> Agent:
@@ -109,7 +110,7 @@ def _trainee(one: CheckedAgent) -> Agent:
     return one.make()
 
 
-def _same(one: AgentState, other: AgentState) -> bool:
+def same_arrays(one: AgentState, other: AgentState) -> bool:
     """Whether two states have equal arrays, to the bit."""
     if one.arrays.keys() != other.arrays.keys():
         return False

@@ -15,7 +15,7 @@ import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.certificates.certificate import Certificate, certificate
-from imagine_bench.registry.old_names import label_today
+from imagine_bench.registry.old_names import agent_label, label_today
 from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
@@ -46,7 +46,7 @@ def runs(where: str) -> Runs:
     found: Runs = {}
     with (RESULTS / folder / "results.csv").open() as file:
         for row in csv.DictReader(file):
-            if row["agent"] == agent:
+            if agent_label(row["agent"], _json(f"{folder}/bench.json")["protocol"]) == agent:
                 found.setdefault(int(row["episodes"]), []).append(row)
     if not found:
         raise ValueError(f"{where}: no such runs")
@@ -292,7 +292,9 @@ def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
 def policy(agent: str, episodes: str, length: str) -> str:
     """Starts so many turns from a goal that a greedy policy solves, %: mean over seeds and starts."""
     with (RESULTS / "arrow_puzzle_hard-policy" / "by_length.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["agent"], row["episodes"]) == (agent, episodes)]
+        rows = [
+            row for row in csv.DictReader(file) if (label_today(row["agent"]), row["episodes"]) == (agent, episodes)
+        ]
     return percent(float(np.mean([float(row["success"]) for row in rows if row["optimal_length"] == length])))
 
 
@@ -300,14 +302,18 @@ def policy_failure(agent: str, episodes: str) -> str:
     """Starts from which it breaks a rule, %: mean [95 % over seeds]."""
     groups = _json("arrow_puzzle_hard-policy/policy.json")
     chosen = [run for group in groups for run in group["runs"]]
-    values = np.array([run["failure"] for run in chosen if (run["agent"], str(run["episodes"])) == (agent, episodes)])
+    values = np.array(
+        [run["failure"] for run in chosen if (label_today(run["agent"]), str(run["episodes"])) == (agent, episodes)]
+    )
     return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
 
 
 def caused(agent: str, episodes: str, cause: str) -> str:
     """Failed tests of all seeds, or the share of them that has a cause, %."""
     runs = [
-        run["failures"][episodes] for run in _json("arrow_puzzle-mild-why/why.json")["runs"] if run["agent"] == agent
+        run["failures"][episodes]
+        for run in _json("arrow_puzzle-mild-why/why.json")["runs"]
+        if label_today(run["agent"]) == agent
     ]
     count = sum(sum(run.values()) for run in runs)
     if cause == "all":
@@ -342,7 +348,7 @@ def thesis_plans(key: str) -> str:
 def futures(folder: str, agent: str, measure: str, depth: str) -> str:
     """Imagined against exact distributions at a depth, mean over runs."""
     with (RESULTS / folder / "futures.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["agent"], row["depth"]) == (agent, depth)]
+        rows = [row for row in csv.DictReader(file) if (label_today(row["agent"]), row["depth"]) == (agent, depth)]
     value = float(np.mean([float(row[measure]) for row in rows]))
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
 

@@ -1,0 +1,264 @@
+"""What must hold of an agent and every option of a protocol: the option has an effect on it, or is refused.
+
+A row for each option: two short runs from equal seeds, with it and without, must differ in what the agent did, earned
+or learned. Fields of the protocol without a row are in :data:`WITHOUT_ROW`, each with the reason; a new field that is
+in neither fails the contract.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import functools
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.bench import phases
+from imagine_bench.bench.control import plan_control
+from imagine_bench.bench.evaluation import play
+from imagine_bench.bench.run_state import Run, environments
+from imagine_bench.capabilities import begin_episode
+from imagine_bench.data.collect import collect, policy_of
+from imagine_bench.data.folder import write_dataset
+from imagine_bench.errors import ImagineBenchError
+from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.store.counters import Counters
+from imagine_bench.testing.common import NotOffered, make_env, require
+from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
+
+_EPISODES = 2
+Changes = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionRow:
+    """One option of a bench."""
+
+    fields: tuple[str, ...]  #: Fields of the protocol that it stands for
+    changes: Changes  #: What the bench with the option has
+    without: Changes = field(default_factory=dict)  #: What the bench that it is compared with has
+    world: str = ""  #: An option of the task's world, ``key=value``, in place of a field
+
+
+_TASK = "the task that is checked"
+OPTION_ROWS: Mapping[str, OptionRow] = {
+    "dataset": OptionRow(fields=("dataset",), changes={"dataset": "a folder of two episodes"}),
+    "demonstrations": OptionRow(fields=("demonstrations",), changes={"demonstrations": _EPISODES}),
+    "queries": OptionRow(fields=("queries",), changes={"queries": 1}),
+    "feedback": OptionRow(fields=("feedback",), changes={"feedback": 1.0}),
+    "feedback error": OptionRow(
+        fields=("feedback_error",), without={"feedback": 1.0}, changes={"feedback": 1.0, "feedback_error": 0.5}
+    ),
+    "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
+    "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}),
+    "physics": OptionRow(
+        fields=("physics", "execution"),
+        without={"execution": "physics"},
+        changes={"execution": "physics", "physics": (("plan_error_mm", 10.0),)},
+    ),
+    "observation": OptionRow(fields=("observation",), changes={"observation": "human"}),
+    "observation size": OptionRow(fields=("observation_size",), changes={"observation_size": 96}),
+    "appearance": OptionRow(fields=("appearance",), changes={"appearance": "mild"}),
+    "gesture": OptionRow(fields=(), changes={}, world="gesture=0.5"),
+    "lag": OptionRow(fields=(), changes={}, world="lag=1"),
+}
+"""The options, by what the contract calls them."""
+
+WITHOUT_ROW: Mapping[str, str] = {
+    "task": "names the world",
+    "preset": "names the protocol",
+    "agents": "the other side of each pair",
+    "agent_names": "says how names are spelled in files",
+    "seeds": "the runs that are compared have equal ones",
+    "budgets": "how long is trained",
+    "evaluation_episodes": "how often is tested",
+    "test_appearance": "the appearance in tests, which change no agent",
+    "open_loop_starts": "what observers ask, which changes no agent",
+    "sampled_futures": "read in older files only",
+    "recorded_episodes": "what a recording shows",
+    "encoder": "found by the bench",
+    "codes": "found by the bench",
+    "overrides": "settings of an agent, each tested with it",
+    "config_group": "settings of an agent, named by the task",
+    "hyperparameters": "settings of an agent, each tested with it",
+    "settings_digest": "follows from the settings",
+    "device": "where is computed",
+}
+"""Why no pair of runs is compared for the other fields of a protocol."""
+
+
+def require_every_field() -> None:
+    """Raise InvalidValueError for a field of the protocol that is neither in a row nor in :data:`WITHOUT_ROW`."""
+    known = {name for row in OPTION_ROWS.values() for name in row.fields} | WITHOUT_ROW.keys()
+    fields = {each.name for each in dataclasses.fields(Protocol)}
+    require(fields == known, f"these fields of a protocol have no row, or are none: {sorted(fields ^ known)}")
+
+
+class CheckedOptions:
+    """An agent whose options are checked in a task; each run is carried out once."""
+
+    def __init__(self, agent: str, task: str) -> None:
+        self.agent = agent
+        self.task = task
+        self.entry = registry.agent_entry(agent)
+        self.run = functools.cache(self._run)
+
+    def check(self, option: str) -> None:
+        """Raise InvalidValueError if the option changes nothing; NotOffered, with the sentence, if it is refused."""
+        row = OPTION_ROWS[option]
+        base = self.run(self.task, tuple(row.without.items()))
+        try:
+            changed = self.run(self._task_of(row), tuple(self._given(row).items()))
+        except ImagineBenchError as refusal:
+            raise NotOffered(f"it is refused: {refusal}") from refusal
+        require(base != changed, f"{option} changes nothing that {self.agent} does, earns or learns")
+
+    def _given(self, row: OptionRow) -> Changes:
+        if "dataset" in row.changes:
+            return {"dataset": _dataset(self.task)}
+        if "after" in row.changes:
+            return {**row.changes, "after": (self.task,)}
+        return row.changes
+
+    def _task_of(self, row: OptionRow) -> str:
+        if not row.world:
+            return self.task
+        base = self.task.partition(":")[0]
+        world = registry.task_entry(base).world
+        names = {each.name for each in dataclasses.fields(registry.load(world))} if world else set()
+        if row.world.partition("=")[0] not in names:
+            raise NotOffered(f"{base} has no such option")
+        return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
+
+    def _run(self, task: str, changes: tuple[tuple[str, Any], ...]) -> str:
+        """What two episodes of training, and of tests for one that learns nothing, left: a digest."""
+        given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
+        wanted, paths = plan_control(
+            task, "smoke", agents=(self.agent,), seeds=(0,), budgets=(_EPISODES,), evaluation_episodes=_EPISODES,
+            open_loop_starts=0, recorded_episodes=0, **given,
+        )  # fmt: skip
+        encoder = paths[self.entry.encoder_kind] if self.entry.needs_encoder else None
+        spec = RunSpec(
+            protocol=wanted, agent=self.agent, seed=0, encoder=encoder, dataset=paths.get("dataset"),
+            checkpoint_every_s=1e9,
+        )  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder, environments(wanted) as (env, test_env):
+            return _carried_out(Run(spec, Path(folder), _silent, env, test_env))
+
+
+def _silent(progress: Progress) -> None:
+    del progress
+
+
+def _carried_out(run: Run) -> str:
+    """Train, or test one that learns nothing; a digest of what it did and earned, and of what it is then."""
+    watched = _WatchedAgent(run.agent, sees=not run.entry.learns)
+    if run.entry.external_training_loop:
+        phases.train_externally(run, run.agent, lambda budget: None)  # type: ignore[arg-type]
+    elif run.entry.learns:
+        run.agent = watched
+        phases.transfer(run)
+        phases.train(run, _EPISODES)
+        episodes = run.protocol.episodes_before + _EPISODES
+        require(watched.begun >= episodes, f"told of {watched.begun} beginnings of {episodes} training episodes")
+    else:
+        run.agent = watched
+        phases.test(run)
+    return watched.digest(run.counters)
+
+
+class _WatchedAgent:
+    """An agent, what it did and was rewarded with, and how often it was told that an episode begins."""
+
+    def __init__(self, agent: Agent, *, sees: bool) -> None:
+        self._agent = agent
+        self._sees = sees
+        self._lived = hashlib.sha256()
+        self.begun = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._agent, name)
+
+    def begin_episode(self) -> None:
+        """Count, and tell the agent."""
+        self.begun += 1
+        begin_episode(self._agent)
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        """Act as the agent does."""
+        if self._sees:
+            for part in (observation.frame, observation.macrostate):
+                self._lived.update(np.asarray(part).tobytes() if part is not None else b"")
+            for name in sorted(observation.more):
+                self._lived.update(observation.more[name].tobytes())
+        action = self._agent.act(observation, explore=explore)
+        self._lived.update(str(action).encode())
+        return action
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Learn as the agent does."""
+        self._lived.update(f"{transition.action} {transition.reward}".encode())
+        self._agent.observe(transition, episode=episode)
+
+    def diagnostics(self) -> dict[str, float]:
+        """As the agent."""
+        return self._agent.diagnostics()
+
+    def state(self) -> AgentState:
+        """As the agent."""
+        return self._agent.state()
+
+    def restore(self, state: AgentState) -> None:
+        """As the agent."""
+        self._agent.restore(state)
+
+    def digest(self, counters: Counters) -> str:
+        """A digest of actions, rewards and learned arrays; times are in none of them."""
+        found = self._lived.copy()
+        for arrays in (self._agent.state().arrays, counters.training()):
+            for name in sorted(arrays):
+                found.update(f"{name} {arrays[name].shape}".encode())
+                found.update(arrays[name].tobytes())
+        return found.hexdigest()
+
+
+@functools.cache
+def _dataset(task: str) -> Path:
+    """A dataset of two episodes of an optimal policy, kept until the process ends."""
+    spec = registry.task(task)
+    folder = Path(tempfile.mkdtemp(prefix="imagine-bench-check-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    policy = policy_of("mixed", spec, seed=1)
+    episodes, files, card = collect(
+        spec, policy, episodes=_EPISODES, seed=1, execution=spec.executions[-1], appearance="clean"
+    )
+    write_dataset(folder / "episodes", episodes, files, card, "npz")
+    return folder / "episodes"
+
+
+def watching_teaches_as_living(one: CheckedAgent) -> None:
+    """Raise InvalidValueError if an agent learns otherwise from episodes that it was only shown than from its own."""
+    if one.entry.external_training_loop or not one.entry.learns:
+        raise NotOffered("it does not learn from episodes that are shown to it")
+    actor, watcher = one.make(), one.make()
+    starts: list[Observation] = []
+    with closing(make_env(one.spec)) as env:
+        for episode in range(_EPISODES):
+            begin_episode(watcher)
+            for transition, _ in play(env, actor, seed=episode, explore=True, privileged=one.entry.privileged):
+                starts.append(transition.observation)
+                actor.observe(transition, episode=episode)
+                watcher.observe(transition, episode=episode)
+    require(same_arrays(actor.state(), watcher.state()), "it learned otherwise from episodes that it was only shown")
+    require(greedy(actor, starts) == greedy(watcher, starts), "it then acts otherwise")
