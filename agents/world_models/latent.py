@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
-from imagine_bench.world_models import UNCERTAINTIES, Imagined
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch

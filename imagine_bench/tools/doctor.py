@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.machine import commit, gl_renderer, installed, machine, versions
+from imagine_bench.registry.machine import commit, gl_renderer, installed, machine, versions
 
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
 _FRAMES = 200

@@ -12,9 +12,9 @@ from imagine_bench.agents.factored_own import looks
 from imagine_bench.agents.factored_own.agent import OwnPerceptionAgent
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import begin_episode
 
 
 def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[Code], Frame]:
