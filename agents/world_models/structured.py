@@ -39,7 +39,7 @@ class StructuredModel:
         self.model.outcomes.fit()
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """Futures drawn code by code; see :class:`imagine_bench.world_models.WorldModel`.
+        """Futures drawn code by code; see :class:`.interfaces.model.WorldModel`.
 
         ``epistemic`` is the probability that something untested decides, ``modal`` that something else happens than
         what is likeliest.
