@@ -219,7 +219,7 @@ def test_the_arrows_hold(path: Path) -> None:
             "running may import only",
         ),
         ("imagine_bench/running", "from imagine_bench import report", "running may import only"),
-        ("imagine_bench/store", "from ..bench import runner", "store may import only"),
+        ("imagine_bench/store", "from ..running import runner", "store may import only"),
         ("imagine_bench/judge", "from imagine_bench.cli import main", "judge may import only"),
         ("imagine_bench/attic", "from imagine_bench.store import files", "attic is a new room"),
         ("agents", "x = np.random.rand(3)", "draws from a global generator"),
