@@ -18,6 +18,7 @@ _VOCABULARY = {
     "interfaces",
     "rules",
     "preprocessing",
+    "version",
 }
 """What every room may import, and all that tasks and agents may take from imagine_bench."""
 _DATA = {"registry", "protocols", "store"}
@@ -54,8 +55,8 @@ ARROWS: dict[str, set[str]] = {
         "testing",
         "tools",
     },
-    "__init__": {"registry", "moved"},
-    "moved": set(),
+    "__init__": {"registry", "version"},
+    "version": set(),
     "__main__": {"cli"},
 }
 """The rooms of imagine_bench, and what each may import beside itself and the vocabulary."""

@@ -15,9 +15,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import imagine_bench
 from imagine_bench import registry
 from imagine_bench.errors import SetupError
+from imagine_bench.version import PACKAGE_FOLDER, __version__
 
 PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
 OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3", "torch-world")
@@ -49,7 +49,7 @@ def command() -> str:
 
 def commit() -> str | None:
     """The checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
-    top = Path(imagine_bench.__file__).parent.parent
+    top = PACKAGE_FOLDER.parent
     if not (top / ".git").exists() or shutil.which("git") is None:
         return None
     head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")
@@ -74,7 +74,7 @@ def versions() -> dict[str, str]:
 
     One that offers agents is likely still being written: the beginning of its sources' digest follows its version.
     """
-    found = {"python": platform.python_version(), "imagine-bench": imagine_bench.__version__}
+    found = {"python": platform.python_version(), "imagine-bench": __version__}
     found |= {package: installed(package) for package in PACKAGES}
     optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
     found |= {name: version for name, version in optional.items() if version != "missing"}

@@ -42,9 +42,7 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
 
-    monkeypatch.setattr(
-        "imagine_bench.registry.machine.imagine_bench.__file__", str(tmp_path / "imagine_bench/__init__.py")
-    )
+    monkeypatch.setattr("imagine_bench.registry.machine.PACKAGE_FOLDER", tmp_path / "imagine_bench")
     git("init", "-q")
     write("agents/a.py", "1")
     git("add", ".")
