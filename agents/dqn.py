@@ -133,7 +133,7 @@ class DQN:
         return self._values(self.tested, observation)
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
-        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        """What a probe reads; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
         encoder = self.perception.encoder
         return encoder.read_macrostate(encoder.encode(frames)[0])
 

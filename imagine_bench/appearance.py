@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
-from imagine_bench.interfaces import APPEARANCES
 
+APPEARANCES = ("clean", "mild", "strong", "photo")
+HELD_OUT: Mapping[str, str] = {"photo": "photo_held_out"}
+"""By each appearance that is drawn from finitely many images, the appearance of the images kept for tests."""
 FACTORS = ("light", "colors", "camera", "pose", "hand")
 """Brightness; colors; the camera's pose; how objects lie at the start; the hand's pose."""
 POINTS: Mapping[str, Mapping[str, float]] = {
@@ -58,3 +60,8 @@ def _pairs(text: str) -> Iterator[tuple[str, str]]:
         if not equals:
             raise InvalidValueError(f"Appearance {brief(text)} is not of the form {_EXAMPLE}.")
         yield name, share
+
+
+def appearance_of_tests(appearance: str) -> str:
+    """The appearance that tests have where training has ``appearance``."""
+    return HELD_OUT.get(appearance, appearance)

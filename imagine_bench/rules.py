@@ -1,4 +1,4 @@
-"""Exact facts about any macrostate machine, by dynamic programming over its (possibly stochastic) outcomes.
+"""The macrostate machine of a task, and exact facts about it by dynamic programming over its outcomes.
 
 Shapes: ``S`` macrostates, ``A`` macro-actions.
 """
@@ -6,13 +6,13 @@ Shapes: ``S`` macrostates, ``A`` macro-actions.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Floats, State
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Floats, RuleFacts, Rules, State
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -20,6 +20,58 @@ if TYPE_CHECKING:
 _SWEEPS = 10_000
 _VALUE_TOLERANCE = 1e-12
 _TIE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One possible result of a macro-action according to the rules."""
+
+    probability: float  #: in (0, 1]; those of one (macrostate, action) sum to 1
+    macrostate: State  #: the next macrostate, a tuple of M integers
+    reward: float  #: the reward of this transition
+    terminated: bool  #: whether the episode ends here
+    success: bool  #: whether it ends as a success
+
+
+class Rules(Protocol):
+    """The macrostate machine of a task: no physics, no pixels, exact."""
+
+    @property
+    def n_actions(self) -> int:
+        """Number of macro-actions A."""
+
+    @property
+    def states(self) -> tuple[State, ...] | None:
+        """Every macrostate the machine knows, terminal ones included; None: those that are reached from the starts."""
+
+    @property
+    def start_states(self) -> tuple[State, ...]:
+        """The macrostates an episode may start in, equally likely."""
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        """Every possible result of ``action``, also out of a terminal macrostate: there its dynamics hold too."""
+
+    def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
+        """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
+
+    def is_legal(self, macrostate: State) -> bool:
+        """Whether ``macrostate`` breaks no rule."""
+
+    def is_terminal(self, macrostate: State) -> bool:
+        """Whether no episode goes on from ``macrostate``."""
+
+    def optimal_action(self, macrostate: State) -> int:
+        """An action of an optimal policy (the lowest index among equals)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuleFacts:
+    """What the rules alone say about a task, computed by enumeration."""
+
+    chance_level: float  #: success probability of a uniformly random agent within the horizon
+    optimum: float  #: largest success probability of any policy within the horizon
+    optimal_return: float  #: mean undiscounted return of an optimal agent over the start states
+    mean_plan_length: float  #: mean number of actions of an optimal agent over the start states
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,8 @@ import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 from numpy.typing import ArrayLike
 
+from imagine_bench.arrays import Floats
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Floats
 
 LEVEL = 0.95  #: coverage of every interval
 POWER = 0.8  #: probability with which :func:`detectable` would be found

@@ -14,43 +14,39 @@ _VOCABULARY = {
     "errors",
     "seeding",
     "appearance",
+    "arrays",
     "interfaces",
-    "capabilities",
     "rules",
     "preprocessing",
-    "regression.interfaces",
-    "world_models",
-    "data.episodes",
+    "version",
 }
 """What every room may import, and all that tasks and agents may take from imagine_bench."""
-_DATA = {"entrants", "registry", "protocols", "store"}
+_DATA = {"registry", "protocols", "store"}
 ARROWS: dict[str, set[str]] = {
     "statistics": set(),
     "reference": set(),
-    "entrants": set(),
-    "registry": {"entrants"},
-    "certificates": {"registry"},
-    "machine": {"registry"},
-    "protocols": {"entrants", "registry", "certificates"},
-    "store": {"entrants", "registry", "protocols", "certificates", "statistics"},
-    "data": {*_DATA, "certificates", "machine", "statistics"},
-    "bench": {*_DATA, "machine", "data"},
-    "judge": {*_DATA, "bench", "data", "machine", "statistics"},
+    "registry": set(),
+    "exact": {"registry"},
+    "protocols": {"registry", "exact"},
+    "store": {"registry", "protocols", "exact", "statistics"},
+    "data": {*_DATA, "exact", "statistics"},
+    "running": {*_DATA, "data"},
+    "judge": {*_DATA, "running", "data", "statistics"},
     "recording": {*_DATA, "judge"},
-    "studies": {*_DATA, "bench", "judge", "statistics"},
-    "suite": {*_DATA, "bench", "statistics"},
-    "report": {*_DATA, "certificates", "bench", "judge", "studies", "suite", "machine", "statistics", "reference"},
+    "studies": {*_DATA, "running", "judge", "statistics"},
+    "suite": {*_DATA, "running", "statistics"},
+    "report": {*_DATA, "exact", "running", "judge", "studies", "suite", "statistics", "reference"},
     "regression": {*_DATA, "judge", "report", "statistics", "reference"},
     "adapters": {"registry", "store"},
-    "tools": {"registry", "certificates", "machine", "store", "statistics", "bench", "data"},
-    "testing": {*_DATA, "bench", "certificates", "data", "judge"},
-    "audit": {*_DATA, "bench", "judge", "report"},
+    "tools": {"registry", "exact", "store", "statistics", "running", "data"},
+    "testing": {*_DATA, "running", "exact", "data", "judge"},
+    "audit": {*_DATA, "running", "judge", "report"},
     "cli": {
         *_DATA,
         "adapters",
         "audit",
         "data",
-        "bench",
+        "running",
         "judge",
         "recording",
         "studies",
@@ -59,7 +55,8 @@ ARROWS: dict[str, set[str]] = {
         "testing",
         "tools",
     },
-    "__init__": {"registry"},
+    "__init__": {"registry", "version"},
+    "version": set(),
     "__main__": {"cli"},
 }
 """The rooms of imagine_bench, and what each may import beside itself and the vocabulary."""
@@ -186,7 +183,7 @@ def _undirected(call: ast.Call, function: ast.Attribute) -> Iterator[str]:
 
 def test_the_arrows_go_one_way() -> None:
     order = list(TopologicalSorter(ARROWS).static_order())
-    assert order.index("store") < order.index("bench") < order.index("cli")
+    assert order.index("store") < order.index("running") < order.index("cli")
     house = _TOP / "imagine_bench"
     rooms = {path.relative_to(house).parts[0] for path in _SOURCES if path.is_relative_to(house)}
     assert {room.removesuffix(".py") for room in rooms} <= {*ARROWS, *_VOCABULARY}, "a room is missing in the table"
@@ -210,16 +207,20 @@ def test_the_arrows_hold(path: Path) -> None:
         ("agents", "from ..registry import task", "may take only"),
         ("agents", "from imagine_bench.store import files", "may take only"),
         ("tasks", "from imagine_bench.regression.runner import run", "may take only"),
-        ("imagine_bench/bench", "def f():\n    from imagine_bench.tasks import frames", "reaches tasks and agents by"),
-        ("imagine_bench", "import agents", "installed inside imagine_bench"),
-        ("imagine_bench/bench", "from imagine_bench.judge import plans", "bench may import only"),
         (
-            "imagine_bench/bench",
-            "def f():\n    from imagine_bench.recording import record_run",
-            "bench may import only",
+            "imagine_bench/running",
+            "def f():\n    from imagine_bench.tasks import frames",
+            "reaches tasks and agents by",
         ),
-        ("imagine_bench/bench", "from imagine_bench import report", "bench may import only"),
-        ("imagine_bench/store", "from ..bench import runner", "store may import only"),
+        ("imagine_bench", "import agents", "installed inside imagine_bench"),
+        ("imagine_bench/running", "from imagine_bench.judge import plans", "running may import only"),
+        (
+            "imagine_bench/running",
+            "def f():\n    from imagine_bench.recording import record_run",
+            "running may import only",
+        ),
+        ("imagine_bench/running", "from imagine_bench import report", "running may import only"),
+        ("imagine_bench/store", "from ..running import runner", "store may import only"),
         ("imagine_bench/judge", "from imagine_bench.cli import main", "judge may import only"),
         ("imagine_bench/attic", "from imagine_bench.store import files", "attic is a new room"),
         ("agents", "x = np.random.rand(3)", "draws from a global generator"),
@@ -253,7 +254,7 @@ def test_each_offence_within_agents_would_be_seen(file: str, line: str, offence:
     [
         ("agents", "import torch\nx = torch.randn(3, generator=g)\nfrom .networks import mlp"),
         ("tasks/scenes", "import mujoco\nfrom imagine_bench.rules import facts\nfrom ..frames import frames_of"),
-        ("agents", "from imagine_bench.rules import facts\nfrom imagine_bench.regression.interfaces import Dataset"),
+        ("agents", "from imagine_bench.rules import facts\nfrom imagine_bench.interfaces.regression import Dataset"),
         ("imagine_bench/store", "from imagine_bench import registry\nrng = np.random.default_rng(7)"),
         ("imagine_bench/recording", "import rerun\nfrom imagine_bench.judge import plans\nfrom . import scene"),
     ],

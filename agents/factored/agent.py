@@ -143,7 +143,7 @@ class CodeAgent(Generic[PerceptionT]):
         return self._values(self.perception.code(observation.frame)).astype(np.float32)
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
-        """Where it would explore; see :class:`imagine_bench.capabilities.NoveltyReader`. None before it learned."""
+        """Where it would explore; see :class:`.capabilities.NoveltyReader`. None before it learned."""
         del rng
         if not self._ready:
             return None

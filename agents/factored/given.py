@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.interfaces import AgentContext, Frame, Observation
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 
 from ..encoders.perception import prepare_torch
 from .agent import CodeAgent
@@ -26,7 +26,7 @@ class GivenPerceptionAgent(CodeAgent[CodePerception]):
     """Sees with an encoder, and so can show what it imagines, be read by a probe, and ask an oracle."""
 
     def query(self, observation: Observation) -> NDArray[np.int64] | None:
-        """What to ask; see :class:`imagine_bench.capabilities.QueryingAgent` and :mod:`.exploration`."""
+        """What to ask; see :class:`.capabilities.QueryingAgent` and :mod:`.exploration`."""
         with self.meters.cpu_time("time/model_s"):
             code = self.perception.code(observation.frame)
             return query(self.model, code, self.settings.planning, without=self.replay.without_label)
@@ -43,7 +43,7 @@ class GivenPerceptionAgent(CodeAgent[CodePerception]):
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.capabilities.Imaginer`.
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`.capabilities.Imaginer`.
 
         ``epistemic`` is the probability that something untested decides the transition, ``modal`` that it does not
         lead where it most probably leads; a categorical model knows no Gaussian noise, so ``aleatoric`` is 0.
@@ -70,11 +70,11 @@ class GivenPerceptionAgent(CodeAgent[CodePerception]):
         return ImaginedStep(chosen, following, reward, p_terminated, values, unknown, 1.0 - p_likeliest)
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
-        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        """What a probe reads; see :class:`.capabilities.FrameReader`."""
         return self.perception.macrostates(self.perception.codes(frames))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """What its planner plans with; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        """What its planner plans with; see :class:`.capabilities.OutcomePredictor`."""
         codes = self.perception.codes(frames)
         if not self._ready:
             nothing = np.zeros((len(codes), self.n_actions))

@@ -13,8 +13,8 @@ from itertools import compress
 
 import numpy as np
 
-from imagine_bench.capabilities import Perceived
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.interfaces.capabilities import Perceived
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
@@ -42,7 +42,7 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
     """After how many macro-actions an episode was cut, if any was."""
 
     def begin_episode(self) -> None:
-        """The next frame is the first of an episode; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
+        """The next frame is the first of an episode; see :class:`.capabilities.EpisodeRememberer`."""
         self._acted = 0
         self._observed = 0
         self.perception.begin_episode()
@@ -115,7 +115,7 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
         ]
 
     def perceived(self) -> Iterator[Perceived]:
-        """What it saw whenever that changed; see :class:`imagine_bench.capabilities.SeeingLearner`."""
+        """What it saw whenever that changed; see :class:`.capabilities.SeeingLearner`."""
         eyes = self.perception
         for count in eyes.history:
             seen = eyes.first(count)

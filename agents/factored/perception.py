@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception

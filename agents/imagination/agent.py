@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -118,7 +118,7 @@ class ImaginingAgent(DQN):
         self.imagination.load(snapshot.below("imagination", state.arrays), state.values["imagined_added"])
 
     def reset_for_new_task(self) -> None:
-        """Keep the network of the dynamics; see :class:`imagine_bench.capabilities.TransferLearner`.
+        """Keep the network of the dynamics; see :class:`.capabilities.TransferLearner`.
 
         Reward, termination, controller, memories and the schedule of exploration begin anew.
         """
@@ -129,7 +129,7 @@ class ImaginingAgent(DQN):
         self.steps = self.updates = 0
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
-        """What curiosity pays for; see :class:`imagine_bench.capabilities.NoveltyReader`. None of a single network."""
+        """What curiosity pays for; see :class:`.capabilities.NoveltyReader`. None of a single network."""
         if weight_samples(self.settings) * self.settings.model.members == 1:
             return None
         z = self.perceive(observation.frame).expand(self.n_actions, -1)
@@ -139,7 +139,7 @@ class ImaginingAgent(DQN):
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        """Imagine up to ``depth`` transitions from ``frame``; see :class:`imagine_bench.capabilities.Imaginer`.
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`.capabilities.Imaginer`.
 
         InvalidValueError if there is no depth to imagine, or actions are none.
         """
@@ -148,7 +148,7 @@ class ImaginingAgent(DQN):
         return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """As many samples as :data:`_BRANCHES`; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        """As many samples as :data:`_BRANCHES`; see :class:`.capabilities.OutcomePredictor`."""
         z, shape = self.perception.encoder.encode(frames)[0], (len(frames), self.n_actions, _BRANCHES)
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         action = np.tile(np.repeat(np.arange(self.n_actions), _BRANCHES), len(frames))

@@ -14,9 +14,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from imagine_bench.capabilities import OnEpisode
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.interfaces.capabilities import OnEpisode
 
 from ..encoders.perception import load_perception, prepare_torch
 from ..imagination.agent import ImaginingAgent, build
@@ -52,7 +52,7 @@ class LibraryAgent:
         self._model: Any = None
 
     def train(self, env: gymnasium.Env[Any, Any], *, episodes: int, horizon: int, on_episode: OnEpisode) -> None:
-        """Train in the library's own loop; see :class:`imagine_bench.capabilities.ExternalTrainer`."""
+        """Train in the library's own loop; see :class:`imagine_bench.interfaces.capabilities.ExternalTrainer`."""
         from .training_loop import learn  # noqa: PLC0415 - needs the library
 
         keywords = dataclasses.asdict(self._keywords)

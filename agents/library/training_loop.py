@@ -7,7 +7,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from imagine_bench.capabilities import OnEpisode
+from imagine_bench.interfaces.capabilities import OnEpisode
 
 
 class _EpisodeCounter(BaseCallback):

@@ -51,7 +51,7 @@ class RememberingAgent(DQN, ABC):
         self.begin_episode()
 
     def begin_episode(self) -> None:
-        """Forget what was seen; see :class:`imagine_bench.capabilities.EpisodeRememberer`."""
+        """Forget what was seen; see :class:`.capabilities.EpisodeRememberer`."""
         self._seen, self._lived = Past(), Past()
 
     def new_memory(self, device: torch.device) -> SequenceMemory:
@@ -99,7 +99,7 @@ class RememberingAgent(DQN, ABC):
         return state
 
     def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
-        """What a linear read-out finds in the memory; see :class:`imagine_bench.capabilities.MemoryReader`."""
+        """What a linear read-out finds in the memory; see :class:`.capabilities.MemoryReader`."""
         if self._read_out is None or self._read_out[0] != self.steps:
             self._read_out = self.steps, fit(self.real, self.recurrence, self.perception.plain.encoder, sizes)
         return self._read_out[1](self.perceive(frame)[self.perception.plain.latent_size :])

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentState, Floats
-from imagine_bench.regression.interfaces import Dataset, Mixtures, Prediction, RegressorContext
+from imagine_bench.interfaces.regression import Dataset, Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
@@ -104,7 +104,7 @@ class MixtureRegressor:
         return {"loss/likelihood": float(np.mean(losses))} if losses else {}
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
-        """Predict, with uncertainties; see :class:`imagine_bench.regression.interfaces.Regressor`."""
+        """Predict, with uncertainties; see :class:`imagine_bench.interfaces.regression.Regressor`."""
         self._require_inputs(inputs)
         own, other = (self._generator(int(rng.integers(2**62))) for _ in range(2))
         networks = [

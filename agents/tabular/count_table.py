@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.seeding import SeedTree
 
 from ..factored.perception import CodePerception
@@ -77,11 +77,11 @@ class CodeCountTableAgent(CountTableAgent):
         self.perception, self.code_sizes = perception, perception.sizes
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
-        """What a probe reads; see :class:`imagine_bench.capabilities.FrameReader`."""
+        """What a probe reads; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
         return self.perception.macrostates(self.perception.codes(frames))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """What the table holds; see :class:`imagine_bench.capabilities.OutcomePredictor`."""
+        """What the table holds; see :class:`imagine_bench.interfaces.capabilities.OutcomePredictor`."""
         here = [code for (code,) in self.perception.codes(frames)]
         pairs = [self.table.expected(state, action) for state in here for action in range(self.n_actions)]
         most = max(1, *(len(branches) for branches, _ in pairs))

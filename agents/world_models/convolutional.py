@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
-from imagine_bench.world_models import Imagined
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined
 
 from ..encoders.perception import prepare_torch
 from ..networks.weights import initialise
@@ -72,7 +72,7 @@ class Convolutional:
 
     @torch.no_grad()
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """One future, fed its own pictures; see :class:`imagine_bench.world_models.WorldModel`."""
+        """One future, fed its own pictures; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
         asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :])
         pieces = zip(torch.from_numpy(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
-from imagine_bench.world_models import UNCERTAINTIES, Imagined
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
@@ -79,7 +79,7 @@ class LatentModel:
 
     @torch.no_grad()
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """Futures in closed loop through latents; see :class:`imagine_bench.world_models.WorldModel`."""
+        """Futures in closed loop through latents; see :class:`.interfaces.model.WorldModel`."""
         generator, rows = self._generator(rng), len(frames)
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.interfaces.episodes import Episodes
 
 from ..encoders.perception import load_perception, prepare_torch
 from ..memory.imagination import RecurrentImagination

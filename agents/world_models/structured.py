@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame
-from imagine_bench.world_models import Imagined
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
@@ -39,7 +39,7 @@ class StructuredModel:
         self.model.outcomes.fit()
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """Futures drawn code by code; see :class:`imagine_bench.world_models.WorldModel`.
+        """Futures drawn code by code; see :class:`.interfaces.model.WorldModel`.
 
         ``epistemic`` is the probability that something untested decides, ``modal`` that something else happens than
         what is likeliest.

@@ -21,7 +21,7 @@ from gymnasium.wrappers import AddRenderObservation, ResizeObservation, Transfor
 from imagine_bench.agents.factored.learned import LearnedPerceptionAgent, make
 
 from imagine_bench.interfaces import AgentContext, Observation, Transition
-from imagine_bench.machine import describe_environment
+from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SeedTree
 
 BUDGETS = (5, 10, 20, 40, 80)

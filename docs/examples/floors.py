@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.suite.experiments import LADDER
 

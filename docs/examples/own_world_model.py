@@ -14,10 +14,10 @@ from imagine_bench.agents.encoders.encoder import Encoder
 from numpy.typing import NDArray
 
 from imagine_bench.cli import main
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined
 from imagine_bench.registry import WORLD_MODELS, WorldModelEntry
-from imagine_bench.world_models import Imagined
 
 Outcome = tuple[str, float, bool]  # code of the next frame, reward, whether the episode ended
 

@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
-from imagine_bench.certificates.certificate import certificate
+from imagine_bench.exact.certificate import certificate
 from imagine_bench.registry.old_names import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect

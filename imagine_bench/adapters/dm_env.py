@@ -17,7 +17,6 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-import imagine_bench  # noqa: F401  (registers the Gymnasium ids)
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError
 

@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-import imagine_bench  # noqa: F401  (registers the Gymnasium ids)
 from imagine_bench.errors import InvalidValueError
 
 

@@ -23,7 +23,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import imagine_bench  # noqa: F401  (registers the Gymnasium ids)
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 

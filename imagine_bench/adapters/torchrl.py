@@ -15,8 +15,6 @@ from typing import Any
 
 import gymnasium
 
-import imagine_bench  # noqa: F401  (registers the Gymnasium ids)
-
 
 class NumericInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
     """The environment without the texts of its infos, such as ``fault_reason``."""

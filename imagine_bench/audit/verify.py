@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Env, replay
-from imagine_bench.bench.progress import counted
-from imagine_bench.bench.run_state import environments
 from imagine_bench.errors import ArtefactError, brief
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.page import report_page, texts
+from imagine_bench.running.evaluation import Env, replay
+from imagine_bench.running.progress import counted
+from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.archive import is_archive

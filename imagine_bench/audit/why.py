@@ -11,9 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import Env
-from imagine_bench.bench.progress import counted
-from imagine_bench.bench.run_state import make_env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.judge.causes import Attribution, FailedEpisode, frames_to_ask_with, misread
@@ -22,6 +19,9 @@ from imagine_bench.report.page import write_report
 from imagine_bench.report.sections.causes import HEAD, causes_table, failures
 from imagine_bench.report.text import origin
 from imagine_bench.rules import states_of
+from imagine_bench.running.evaluation import Env
+from imagine_bench.running.progress import counted
+from imagine_bench.running.run_state import make_env
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import csv_text, lock, make_folder, write_bytes, write_json

@@ -13,7 +13,6 @@ from typing import Any
 
 import tyro
 
-from imagine_bench import __version__
 from imagine_bench.cli.analysis import Judge, Plan, Verify, Why
 from imagine_bench.cli.benches import Bench, List, Report, Study
 from imagine_bench.cli.data import Dataset
@@ -21,6 +20,7 @@ from imagine_bench.cli.suite import Suite
 from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
 from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
 from imagine_bench.store.files import reason
+from imagine_bench.version import __version__
 
 _LONGEST_WORD = 1000
 INTERRUPTED = 130

@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
-from imagine_bench.entrants import file_name, parse_settings
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Encoders, Result, task_types, type_of
+from imagine_bench.registry.entries import file_name, parse_settings
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.store.archive import is_archive, load_archive
 from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol
 from imagine_bench.store.encoders import bundled

@@ -10,9 +10,9 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.cli.options import shown
-from imagine_bench.entrants import file_name
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.registry.entries import file_name
 from imagine_bench.store.files import require_writable
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from contextlib import closing
 
-from imagine_bench.bench.run_state import Run, make_env
-from imagine_bench.bench.runner import AtBudget, AtEnd, RunObserver
-from imagine_bench.capabilities import Imaginer
 from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces.capabilities import Imaginer
 from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
 from imagine_bench.judge.imagination_quality import (
     OPEN_LOOP_DEPTH,
@@ -18,6 +16,8 @@ from imagine_bench.judge.imagination_quality import (
     open_loop_starts,
 )
 from imagine_bench.rules import states_of
+from imagine_bench.running.run_state import Run, make_env
+from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
 

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.cli.options import added_up, listed, require_values, shown
 from imagine_bench.errors import RunFailedError
+from imagine_bench.running.launchers.jobs import launcher
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,13 +16,13 @@ from tqdm import tqdm
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
-from imagine_bench.capabilities import begin_episode
-from imagine_bench.certificates.beliefs import optimal_policy_of
-from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, Observation, TaskSpec
-from imagine_bench.machine import describe_environment
+from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.interfaces.episodes import Episodes, joined
+from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
 from imagine_bench.store.trained import load_trained

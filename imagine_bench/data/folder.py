@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.data.episodes import Episodes, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
 from imagine_bench.interfaces import TaskSpec
+from imagine_bench.interfaces.episodes import Episodes, content_hash
 from imagine_bench.store.codec import write_arrays
 from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_json, writing
 

@@ -22,9 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from imagine_bench.data.episodes import FRAME_SHAPE, Episodes
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
 
 _VERSION, _INFO, _FINAL = "v3.0", "meta/info.json", "final_frames.parquet"

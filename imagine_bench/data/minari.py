@@ -20,8 +20,8 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 from imagine_bench import registry
-from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.store.files import reading
 
 _ROOT = "MINARI_DATASETS_PATH"

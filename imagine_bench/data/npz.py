@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.data.episodes import Episodes
+from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.store.codec import write_arrays
 from imagine_bench.store.files import reading
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.regression.interfaces import Mixtures
+from imagine_bench.interfaces.regression import Mixtures
 
 LEVELS = (0.5, 0.8, 0.95)  # central intervals whose coverage is reported
 _LOG_2PI = math.log(2.0 * math.pi)

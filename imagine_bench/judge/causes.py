@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.judge.models.outcomes import total_variation
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import Purpose, SeedTree

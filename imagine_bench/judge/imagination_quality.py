@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.judge.calibration import auroc
 from imagine_bench.judge.models.truth import Outcomes, advance, expected_reward, shares
 from imagine_bench.rules import is_random

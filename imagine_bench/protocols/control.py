@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.certificates.splits import StartingFrom, split_of
-from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.exact.splits import StartingFrom, split_of
 from imagine_bench.interfaces import (
     DEVICES,
     EXECUTIONS,
@@ -24,6 +23,7 @@ from imagine_bench.interfaces import (
 from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
+from imagine_bench.registry.entries import entrant
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -44,7 +44,7 @@ class Protocol(ProtocolData):
     config_group: str = "chapter_5"  #: config group of the agents' settings, as the task names it
     #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
-    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entrants`)
+    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entries`)
     seeds: tuple[int, ...] = (0, 1, 2)
     #: Real training episodes at which the agent is evaluated, ascending.
     budgets: tuple[int, ...] = (100, 250, 500)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from imagine_bench import registry
-from imagine_bench.certificates.beliefs import optimal_policy_of
+from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import PROPRIO_SIZE, AgentContext, ExactWorld, TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData

@@ -16,7 +16,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import (
+from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
+from imagine_bench.interfaces.capabilities import (
     Imaginer,
     MemoryReader,
     NoveltyReader,
@@ -24,7 +25,6 @@ from imagine_bench.capabilities import (
     ValueReader,
     begin_episode,
 )
-from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.judge.imagination_quality import compare_rollout, sampled_rollouts_from
 from imagine_bench.recording.blueprint import blueprint

@@ -13,10 +13,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench import registry
-from imagine_bench.entrants import file_name
 from imagine_bench.judge.models.study import Judgement, shown
 from imagine_bench.judge.models.trained import model_entry
 from imagine_bench.recording.stream import recording_file
+from imagine_bench.registry.entries import file_name
 
 
 def record_judgement(folder: Path, judgement: Judgement) -> Path | None:

@@ -16,9 +16,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import RegressionSpec
 from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
 from imagine_bench.recording.stream import Recording, recording_file
-from imagine_bench.regression.interfaces import RegressionSpec
 
 CHOICES = 6  # decisions of the first network that are shown: the first ones, not the best
 _HZ, _STILL_S, _LOOK_S = 25.0, 1.5, 1.0

@@ -15,8 +15,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import RegressionSpec
 from imagine_bench.recording.stream import Recording, recording_file
-from imagine_bench.regression.interfaces import RegressionSpec
 
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
 _PREDICTION, _TRAINING, _TRUE = (0, 114, 178), (150, 150, 150), (190, 190, 196)

@@ -13,12 +13,6 @@ from typing import Any, NamedTuple
 
 import gymnasium
 
-from imagine_bench.entrants import AgentEntry as AgentEntry
-from imagine_bench.entrants import EncoderEntry as EncoderEntry
-from imagine_bench.entrants import RegressorEntry as RegressorEntry
-from imagine_bench.entrants import TaskEntry as TaskEntry
-from imagine_bench.entrants import WorldModelEntry as WorldModelEntry
-from imagine_bench.entrants import entrant, parse_options, read_mapping
 from imagine_bench.errors import (
     EXTRAS,
     ImagineBenchError,
@@ -31,15 +25,21 @@ from imagine_bench.errors import (
     require_known,
 )
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
+from imagine_bench.registry.builtin import AGENTS as AGENTS
+from imagine_bench.registry.builtin import DEMONSTRATOR as DEMONSTRATOR
+from imagine_bench.registry.builtin import REGRESSIONS as REGRESSIONS
+from imagine_bench.registry.builtin import REGRESSORS as REGRESSORS
+from imagine_bench.registry.builtin import TASKS as TASKS
+from imagine_bench.registry.builtin import WORLD_MODELS as WORLD_MODELS
+from imagine_bench.registry.entries import AgentEntry as AgentEntry
+from imagine_bench.registry.entries import EncoderEntry as EncoderEntry
+from imagine_bench.registry.entries import RegressorEntry as RegressorEntry
+from imagine_bench.registry.entries import TaskEntry as TaskEntry
+from imagine_bench.registry.entries import WorldModelEntry as WorldModelEntry
+from imagine_bench.registry.entries import entrant, parse_options, read_mapping
 from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
-from imagine_bench.registry.own import AGENTS as AGENTS
-from imagine_bench.registry.own import DEMONSTRATOR as DEMONSTRATOR
-from imagine_bench.registry.own import REGRESSIONS as REGRESSIONS
-from imagine_bench.registry.own import REGRESSORS as REGRESSORS
-from imagine_bench.registry.own import TASKS as TASKS
-from imagine_bench.registry.own import WORLD_MODELS as WORLD_MODELS
-from imagine_bench.regression.interfaces import RegressionSpec, Regressor, RegressorContext
-from imagine_bench.world_models import WorldModel
 
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
 REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP, WORLD_MODEL_GROUP = (
@@ -69,7 +69,7 @@ _GROUPS = {
     WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
 }
 TASK_TYPES = {
-    "control": "imagine_bench.bench.control:CONTROL",
+    "control": "imagine_bench.running.control:CONTROL",
     "regression": "imagine_bench.regression.task_type:REGRESSION",
 }
 """The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
@@ -79,7 +79,7 @@ OBSERVERS = tuple(
     for name in ("OpenLoopObserver", "BeliefsObserver", "ExamplesObserver", "RecordingObserver")
 )
 """What looks at every control run, in this order, each the ``"module:attr"`` of a
-:class:`.bench.runner.RunObserver` without arguments."""
+:class:`.running.runner.RunObserver` without arguments."""
 
 
 def load(target: str) -> Any:

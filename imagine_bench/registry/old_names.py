@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from imagine_bench.entrants import Entrant, entrant
+from imagine_bench.registry.entries import Entrant, entrant
 
 FIRST, TODAY = 1, 2
 """Editions of agents' names: that of files that name none, and that of every new protocol."""

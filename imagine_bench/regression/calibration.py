@@ -7,9 +7,9 @@ from operator import itemgetter
 import numpy as np
 
 from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import SCORES, RegressionSpec, Regressor
 from imagine_bench.judge import calibration as measures
 from imagine_bench.judge.calibration import LEVELS, auroc, coverage, crps, log_score, transform_distance
-from imagine_bench.regression.interfaces import SCORES, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.codec import Arrays

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import DEVICES
 from imagine_bench.protocols.data import ProtocolData, digest, require_different, require_seeds
+from imagine_bench.registry.entries import entrant
 
 _SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
+from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.judge.calibration import LEVELS
 from imagine_bench.regression.calibration import CRPS_POINTS
-from imagine_bench.regression.interfaces import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.figures import image
 from imagine_bench.report.page import aligned, made, write_page

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.regression.interfaces import SCORES
+from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.figures import image
 from imagine_bench.report.tables import DASH, Image, Section, Table, mean_std

@@ -14,9 +14,9 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import Prediction, Regressor, RegressorContext
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.interfaces import Prediction, Regressor, RegressorContext
 from imagine_bench.regression.protocol import RegressionProtocol, overrides_of
 from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
 from imagine_bench.seeding import SeedTree

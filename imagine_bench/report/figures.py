@@ -17,9 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from imagine_bench.entrants import entrant
 from imagine_bench.judge.causes import CAUSES
 from imagine_bench.registry import AGENTS
+from imagine_bench.registry.entries import entrant
 from imagine_bench.report.data import ReportData, Score
 from imagine_bench.report.tables import Image
 from imagine_bench.report.text import agent_words

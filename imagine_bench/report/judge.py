@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
-from imagine_bench.entrants import file_name
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import png, transition_sheet
 from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
@@ -25,6 +24,7 @@ from imagine_bench.judge.models.scores import COVERAGES
 from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
 from imagine_bench.judge.models.trained import model_entry, runs_of
 from imagine_bench.judge.models.truth import shares
+from imagine_bench.registry.entries import file_name
 from imagine_bench.report.figures import image
 from imagine_bench.report.page import aligned, flat, write_page
 from imagine_bench.report.tables import DASH, Image, Page, Section, Table, number

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, statistics
-from imagine_bench.bench.progress import counted
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, png
 from imagine_bench.judge.plans import Plan, make_plans, require_threshold
 from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.text import percent
+from imagine_bench.running.progress import counted
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
 from imagine_bench.store.trained import Trained, best_run, load_trained, protocol_of_agents

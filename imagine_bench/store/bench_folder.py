@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.certificates.certificate import Certificate, certificate, from_json
-from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError, plain
+from imagine_bench.exact.certificate import Certificate, certificate, from_json
 from imagine_bench.protocols.control import Protocol, spec_of
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.task_types import Result, read_as, type_of
+from imagine_bench.registry.entries import file_name
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import (
     lock,

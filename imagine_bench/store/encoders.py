@@ -13,9 +13,9 @@ import numpy as np
 import platformdirs
 
 from imagine_bench import registry
-from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
+from imagine_bench.registry.entries import file_name
 from imagine_bench.rules import states_of
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.entrants import file_name
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
+from imagine_bench.registry.entries import file_name
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
 from imagine_bench.store.checkpoints import has_checkpoint

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ExpectedOutcomes, ImaginedRollout
-from imagine_bench.certificates.certificate import Certificate
 from imagine_bench.errors import ArtefactError
+from imagine_bench.exact.certificate import Certificate
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.files import first_difference
 

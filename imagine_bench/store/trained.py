@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, ModelOnlyTrainer
-from imagine_bench.entrants import entrant
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.protocols.task_types import Result
+from imagine_bench.registry.entries import entrant
 from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import is_archive

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers.jobs import Launcher
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
@@ -30,6 +28,8 @@ from imagine_bench.protocols.data import ProtocolData, require_types
 from imagine_bench.protocols.task_types import Encoders, task_type
 from imagine_bench.registry import has_task
 from imagine_bench.registry import task as registered
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.launchers.jobs import Launcher
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult, RunResult
@@ -166,7 +166,7 @@ def _dotted(variant: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
-    """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.bench.bench.bench`."""
+    """Run what is missing of every variant and compare; errors as of :func:`imagine_bench.running.bench.bench`."""
     if not has_task(task):
         task_type(task)  # knows every name
         raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")

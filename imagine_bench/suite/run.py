@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.bench.bench import carry_out, plan
-from imagine_bench.bench.launchers.jobs import Launcher, processes
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.task_types import Encoders
+from imagine_bench.running.bench import carry_out, plan
+from imagine_bench.running.launchers.jobs import Launcher, processes
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench
 from imagine_bench.store.results import BenchResult, RunResult
@@ -69,7 +69,7 @@ class SuiteResult:
 def plan_level(suite: Suite, level: Level, agent: str) -> tuple[tuple[Protocol, ...], Encoders]:
     """The benches of a level and an agent, one a seed; who cannot carry over what it learned has no earlier task.
 
-    An encoder that no one has trained yet is trained now. Raises as :func:`.bench.plan`.
+    An encoder that no one has trained yet is trained now. Raises as :func:`.running.plan`.
     """
     shared: dict[str, Any] = {
         "agents": (agent,), "seeds": suite.seeds, "budgets": (level.episodes,), "execution": suite.execution,
@@ -123,7 +123,7 @@ def run_suite(
 ) -> SuiteResult:
     """Run what is missing of a suite, planned by so many processes; runs that fail cost the others nothing.
 
-    Raises as :func:`.bench.bench`, but for runs that fail.
+    Raises as :func:`.running.bench`, but for runs that fail.
     """
     planned = plan_suite(suite, agents, planners)
     work: dict[str, tuple[ProtocolData, Encoders]] = {

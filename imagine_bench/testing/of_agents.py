@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.bench.evaluation import play
-from imagine_bench.capabilities import begin_episode
-from imagine_bench.certificates.beliefs import optimal_policy_of
+from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, ExactWorld, Observation, TaskSpec
+from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.running.evaluation import play
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.testing.common import NotOffered, make_env, require

@@ -18,7 +18,7 @@ import numpy as np
 from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.machine import describe_environment
+from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import reading, require_writable, write_json
 

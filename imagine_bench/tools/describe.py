@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.certificates.certificate import certificate, certificate_rows
+from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
 from imagine_bench.store.encoders import bundled

@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
-import imagine_bench
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.machine import commit, gl_renderer, installed, machine, versions
+from imagine_bench.registry.machine import commit, gl_renderer, installed, machine, versions
+from imagine_bench.version import PACKAGE_FOLDER
 
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
 _FRAMES = 200
 _NEEDED_DISK_GIB = 1.0
 EXTRAS_OF_A_BENCH = ("agents", "report", "rerun")
 """Extras that make an installation of environments one of benches; ``all`` is all of them."""
-_LOCK = Path(imagine_bench.__file__).parents[1] / ".ci" / "requirements.lock"
+_LOCK = PACKAGE_FOLDER.parent / ".ci" / "requirements.lock"
 _REASONS = {
     "mujoco": " MuJoCo 4.0 breaks dm-control 1.0.50: 'MjModel' has no 'flex_vertedge'.",
     "torch": " Results repeat bit for bit only on one version.",

@@ -13,7 +13,7 @@ import numpy as np
 from imagine_bench import registry, statistics
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.interfaces import SENSES, PhysicsSettings, State, TaskSpec
-from imagine_bench.machine import describe_environment
+from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import require_writable, write_json
 

@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.statistics import wilson
 from imagine_bench.store.trained import load_trained
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
-from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.seeding import TUNING_SEEDS
 
 MEDIUM = {"arrow_puzzle": 500, "arrow_puzzle_hard": 1000, "pick_place": 100}
@@ -22,7 +22,7 @@ def standard_sets(root: Path, format: str, episodes: int) -> Iterator[Path]:
     """Make the nine sets below ``root``, each of so many episodes; yields their folders, ``<task>-<random, ...>``.
 
     One that is there already is kept. The medium player is a DQN of a tuning seed, trained below ``root/runs``. Errors
-    are those of :func:`.bench` and :func:`.write_dataset`.
+    are those of :func:`.running` and :func:`.write_dataset`.
     """
     for task, name in itertools.product(MEDIUM, ("random", "medium", "optimal")):
         if not (folder := root / f"{task}-{name}").exists():

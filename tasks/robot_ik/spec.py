@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.regression.interfaces import SCORES, Dataset, Predict, RegressionSpec
+from imagine_bench.interfaces.regression import SCORES, Dataset, Predict, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from imagine_bench.agents.factored.settings import OutcomeSettings
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only as imagination_only
 
-from imagine_bench.capabilities import Label, QueryingAgent, TransferLearner
 from imagine_bench.interfaces import Observation
+from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
 
 GOALS = {(2, 1, 1): (2, 0, 1), (1, 2, 0): (0, 2, 0)}
 """Another task in the tiny world: other goals, the same bad end."""

@@ -16,12 +16,12 @@ from forger import FORGERIES
 from small_runs import Inline, context, do, small
 
 from imagine_bench.audit.verify import Replays, _verify_test, price, verdicts, verify
-from imagine_bench.bench.bench import bench
-from imagine_bench.bench.evaluation import play_test_episode, replay
-from imagine_bench.bench.run_state import environments
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.page import report_page, texts
+from imagine_bench.running.bench import bench
+from imagine_bench.running.evaluation import play_test_episode, replay
+from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.counters import EvaluationCounts

@@ -12,13 +12,13 @@ from small_runs import Inline, small
 from imagine_bench import registry
 from imagine_bench.audit import why
 from imagine_bench.audit.verify import verify
-from imagine_bench.bench.bench import bench
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report.page import report_page, texts
 from imagine_bench.report.sections.causes import causes_table, read_failures
 from imagine_bench.rules import states_of
+from imagine_bench.running.bench import bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import load_bench

@@ -14,13 +14,13 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.audit import why
-from imagine_bench.bench.bench import bench
-from imagine_bench.capabilities import FrameReader
 from imagine_bench.cli import observers
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Rules, State
+from imagine_bench.interfaces.capabilities import FrameReader
 from imagine_bench.protocols.control import protocol
 from imagine_bench.rules import states_of
+from imagine_bench.running.bench import bench
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.results import Checkpoint, RunResult

@@ -12,9 +12,9 @@ from guest_packages import install
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, RunFailedError
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.tools.new import new_package
 

@@ -13,7 +13,7 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import SetupError
-from imagine_bench.machine import versions
+from imagine_bench.registry.machine import versions
 from imagine_bench.store.bench_folder import newest_bench
 
 _MODULE = '''

@@ -14,12 +14,12 @@ from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
-from imagine_bench.machine import versions
 from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
 from imagine_bench.store.trained import load_trained
 

@@ -17,10 +17,10 @@ from imagine_bench.agents.encoders import recipes
 from small_runs import Inline
 
 from imagine_bench import registry, rules
-from imagine_bench.bench.bench import bench, plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.report.page import summary_table
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import archive_files, load_archive
 from imagine_bench.store.trained import learners, load_trained

@@ -23,9 +23,9 @@ from small_runs import FORMATS, collected, written
 
 from imagine_bench import registry
 from imagine_bench.data import lerobot
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.data.folder import read_apart, read_dataset, require_format
 from imagine_bench.errors import SetupError, UnknownNameError
+from imagine_bench.interfaces.episodes import Episodes
 
 
 def same(one: Episodes, other: Episodes) -> bool:

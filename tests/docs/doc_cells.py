@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
-from imagine_bench.certificates.certificate import Certificate, certificate
+from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.old_names import agent_label, label_today
 from imagine_bench.store import encoders
 from imagine_bench.store.bench_folder import read_protocol

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 
 N_ACTIONS = 6
 

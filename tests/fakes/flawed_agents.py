@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ExpectedOutcomes
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Rules, State, Transition
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.rules import optimal_actions, states_of, tabulate
 

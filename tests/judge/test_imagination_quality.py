@@ -11,8 +11,8 @@ import pytest
 from small_runs import context
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.interfaces import Observation, Outcome, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.imagination_quality import (
     EXAMPLES,
     SAMPLED_ROLLOUTS,

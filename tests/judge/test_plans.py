@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame, PhysicsSettings, State
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.plans import Plan, carry_out, make_env, make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
@@ -259,7 +259,7 @@ def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None
 
 
 def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
-    from imagine_bench.bench.runner import run
+    from imagine_bench.running.runner import run
     from imagine_bench.store import encoders
     from imagine_bench.store.trained import load_trained
 

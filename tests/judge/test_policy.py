@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from small_runs import Inline, small
 
 from imagine_bench import registry
-from imagine_bench.bench import bench as benches
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import State, TaskSpec
@@ -25,6 +24,7 @@ from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
 from imagine_bench.report.sections.policy import followed, policies
 from imagine_bench.rules import fewest_actions, greedy, states_of
+from imagine_bench.running import bench as benches
 from imagine_bench.store import encoders
 from imagine_bench.store.files import lock, sealed
 from imagine_bench.store.results import Beliefs, BenchResult, RunResult

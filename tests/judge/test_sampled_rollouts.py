@@ -10,8 +10,8 @@ from fake_agents import FakeImaginer
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import ImaginedRollout
 from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge import filmstrips
 from imagine_bench.judge.imagination_quality import (
     SAMPLED_ROLLOUTS,

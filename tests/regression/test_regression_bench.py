@@ -15,10 +15,10 @@ from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.audit.why import why_report
-from imagine_bench.bench.bench import plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext
 from imagine_bench.judge.calibration import log_score
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.protocols.task_types import task_types
@@ -26,12 +26,12 @@ from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression import runner
 from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.interfaces import SCORES, Dataset, Mixtures, Prediction, RegressorContext
 from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.page import flat
 from imagine_bench.report.tables import number
+from imagine_bench.running.bench import plan
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import read_json
 from imagine_bench.store.trained import load_trained

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from small_runs import do, same_but_for_time, small
 
-from imagine_bench.bench.bench import bench
-from imagine_bench.bench.launchers.jobs import launcher
 from imagine_bench.errors import ArtefactError, BusyError
+from imagine_bench.running.bench import bench
+from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
 from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import write_json
@@ -57,7 +57,7 @@ def test_a_whole_bench_says_that_nothing_was_run(
     for _ in range(2):
         folder = bench(wanted, {}, root=tmp_path, launcher=launcher("local", 1)).folder
     assert capsys.readouterr().out == f"All runs lie in {folder} already; nothing was run.\n"
-    monkeypatch.setattr("imagine_bench.machine.commit", lambda: "another")
+    monkeypatch.setattr("imagine_bench.registry.machine.commit", lambda: "another")
     bench(wanted, {}, root=tmp_path, launcher=launcher("local", 1))
     assert f"Note: {folder} was begun with another commit." in capsys.readouterr().out
 

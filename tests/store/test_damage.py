@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from small_runs import Inline, do, same_but_for_time, small
 
-from imagine_bench.bench.bench import bench
 from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.running.bench import bench
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import lock, read_json, write_bytes

@@ -13,11 +13,11 @@ import pytest
 from fake_results import bench_result
 from small_runs import Inline, small
 
-from imagine_bench.bench.bench import bench
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
+from imagine_bench.running.bench import bench
 from imagine_bench.store.archive import is_archive, load_archive
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.merge import cut, load_so_far, merge

@@ -23,10 +23,10 @@ import pytest
 from small_runs import Inline, do, final_arrays, same_but_for_time, small
 
 from imagine_bench import registry
-from imagine_bench.bench.bench import bench, plan
 from imagine_bench.cli import main
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.store.merge import load_so_far

@@ -11,8 +11,8 @@ import pytest
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.certificates.splits import split_of
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.exact.splits import split_of
 from imagine_bench.registry import AgentEntry
 from imagine_bench.report.suite import levels_csv, scores_csv, suite_table, write_suite
 from imagine_bench.suite.experiments import LADDER, Experiment, Level, Suite

@@ -12,9 +12,9 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.interfaces.model import Imagined
 from imagine_bench.judge.models.ends import Copy
 from imagine_bench.testing.contract import checks, report
-from imagine_bench.world_models import Imagined
 
 
 @pytest.mark.parametrize("model", ["copy", pytest.param("structured", marks=pytest.mark.slow)])

@@ -37,7 +37,7 @@ _FACTORED = (
     "tests/agents/factored/test_factored_formulas.py", "tests/agents/factored/test_factored.py",
     "tests/agents/test_transfer.py",
 )  # fmt: skip
-_CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/bench/test_runner.py")
+_CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/running/test_runner.py")
 ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "rules": {
         "tasks/arrows/rules.py": _RULES[:1],
@@ -59,7 +59,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "resume": {
         "imagine_bench/store/checkpoints.py": _CHECKPOINTS,
         "imagine_bench/store/counters.py": _CHECKPOINTS,
-        "imagine_bench/bench/run_state.py": ("tests/bench/test_run_state.py", *_CHECKPOINTS[::-1]),
+        "imagine_bench/running/run_state.py": ("tests/running/test_run_state.py", *_CHECKPOINTS[::-1]),
     },
     "report": {
         "imagine_bench/report/data.py": (
@@ -236,7 +236,8 @@ def reported(tried: list[dict[str, Any]], seed: int, least: float) -> int:
         table.writerows(tried)
     counts = {"seed": seed, "count": len(tried), "noticed": noticed, "reasoned": reasoned}
     by_room = {room: [sum(found), len(found)] for room, found in rooms.items()}
-    machine = importlib.import_module("imagine_bench.machine")  # not earlier, or every process had it unchanged
+    # not imported earlier, or every process had it unchanged
+    machine = importlib.import_module("imagine_bench.registry.machine")
     environment = {**machine.describe_environment(), "command": "make mutants"}
     summary = {**counts, "noticed_of": by_room, "environment": environment}
     (ROOT / "build" / "mutants.json").write_text(json.dumps(summary, indent=1) + "\n")

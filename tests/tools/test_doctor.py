@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from imagine_bench import machine as environment
 from imagine_bench.cli import main
 from imagine_bench.errors import SetupError
+from imagine_bench.registry import machine as environment
 from imagine_bench.tools import doctor
 
 
@@ -42,7 +42,7 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
 
-    monkeypatch.setattr("imagine_bench.machine.imagine_bench.__file__", str(tmp_path / "imagine_bench/__init__.py"))
+    monkeypatch.setattr("imagine_bench.registry.machine.PACKAGE_FOLDER", tmp_path / "imagine_bench")
     git("init", "-q")
     write("agents/a.py", "1")
     git("add", ".")

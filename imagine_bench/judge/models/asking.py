@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, State, TaskSpec
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.models.ends import Gallery, key_of
 from imagine_bench.judge.models.truth import Questions, lasting_actions, outcomes_by_depth, transitions
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
-from imagine_bench.world_models import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 
 STATES = 400  # macrostates asked about at most; of more, values are not computed
 AFTER_THE_END = 200  # transitions that no training contains, at most

@@ -7,12 +7,12 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.data.episodes import Episodes
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined
 from imagine_bench.judge.models.truth import Outcomes, outcomes_by_depth
 from imagine_bench.seeding import SeedTree
-from imagine_bench.world_models import Imagined
 
 
 class Gallery:
@@ -54,7 +54,7 @@ class Copy:
         del dataset, rng
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """The last frame, whatever is done; see :class:`.world_models.WorldModel`."""
+        """The last frame, whatever is done; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
         rows, depth = len(frames), actions.shape[1] - frames.shape[1] + 1
         shape = (rows, 1, depth, *frames.shape[2:])
@@ -77,7 +77,7 @@ class Exact:
         del dataset, rng
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        """Every outcome with its probability; see :class:`.world_models.WorldModel`."""
+        """Every outcome with its probability; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
         depth = actions.shape[1] - frames.shape[1] + 1
         found = [self._outcomes(history[-1], row[-depth:]) for history, row in zip(frames, actions, strict=True)]

@@ -25,9 +25,9 @@ from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
-from imagine_bench.entrants import entrant, file_name
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
+from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge.models import asking
 from imagine_bench.judge.models.asking import Answers, Reader, ask, call
 from imagine_bench.judge.models.change import Streams, counterfactual_error, noticing, streams_of
@@ -35,7 +35,8 @@ from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.scores import after_the_end, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.models.trained import TrainedModel, load_model, model_entry, runs_of
 from imagine_bench.judge.models.truth import Questions, shares
-from imagine_bench.machine import describe_environment
+from imagine_bench.registry.entries import entrant, file_name
+from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -51,7 +52,6 @@ from imagine_bench.store.files import (
     write_bytes,
     write_json,
 )
-from imagine_bench.world_models import WorldModel
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.capabilities import Imaginer, begin_episode
-from imagine_bench.data.episodes import Episodes
-from imagine_bench.entrants import WorldModelEntry
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame, State
+from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
+from imagine_bench.registry.entries import WorldModelEntry
 from imagine_bench.store.files import read_json, read_sealed
 from imagine_bench.store.run_folder import load_run
 from imagine_bench.store.trained import Trained, load_trained
-from imagine_bench.world_models import UNCERTAINTIES, Imagined
 
 _CONFIG = "config.json"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept

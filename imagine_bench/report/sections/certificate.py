@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imagine_bench.certificates.certificate import Certificate, certificate_rows
+from imagine_bench.exact.certificate import Certificate, certificate_rows
 from imagine_bench.report import figures
 from imagine_bench.report.tables import Section, Table
 from imagine_bench.report.text import percent

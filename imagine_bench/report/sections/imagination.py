@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.entrants import file_name
 from imagine_bench.judge.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
+from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData
 from imagine_bench.report.missing import known_agent

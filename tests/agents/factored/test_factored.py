@@ -19,9 +19,9 @@ from imagine_bench.agents.factored.planner import TIE, Planner
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS, DynamicsSettings, FactoredSettings, OutcomeSettings
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import Imaginer, NoveltyReader, ValueReader
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
+from imagine_bench.interfaces.capabilities import Imaginer, NoveltyReader, ValueReader
 
 
 def test_parents_are_found_and_factors_left_alone_stay() -> None:

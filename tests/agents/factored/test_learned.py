@@ -12,9 +12,9 @@ from imagine_bench.agents.factored import appearance
 from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import begin_episode
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import begin_episode
 
 
 def walk(steps: int, rng: np.random.Generator, stay: float = 0.0) -> tuple[list[Code], Frame]:

@@ -20,8 +20,8 @@ from imagine_bench.agents.factored.model import FactoredModel
 from imagine_bench.agents.factored.settings import LEARNED
 from numpy.typing import NDArray
 
-from imagine_bench.capabilities import begin_episode
 from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import begin_episode
 
 HIDDEN = 2
 """Value of the lamp where it is covered: in every frame of an episode but its first."""

@@ -16,9 +16,9 @@ from imagine_bench.agents.imagination import model_only
 from imagine_bench.agents.imagination.rollouts import Counts
 from imagine_bench.agents.replay import RealMemory
 
-from imagine_bench.capabilities import Imaginer, ValueReader
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation
+from imagine_bench.interfaces.capabilities import Imaginer, ValueReader
 from imagine_bench.seeding import SeedTree
 
 MAKERS: dict[str, Callable[..., DQN]] = {

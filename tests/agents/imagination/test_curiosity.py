@@ -15,9 +15,9 @@ from imagine_bench.agents.imagination.settings import Settings, WorldModelSettin
 from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.replay import Batch
 
-from imagine_bench.capabilities import NoveltyReader
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
+from imagine_bench.interfaces.capabilities import NoveltyReader
 from imagine_bench.seeding import SeedTree
 
 

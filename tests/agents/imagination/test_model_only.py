@@ -23,9 +23,9 @@ from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import Settings
 from imagine_bench.agents.meters import Meters
 
-from imagine_bench.capabilities import ModelOnlyTrainer
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
+from imagine_bench.interfaces.capabilities import ModelOnlyTrainer
 from imagine_bench.seeding import SeedTree
 
 GOAL = 10

@@ -13,13 +13,13 @@ from imagine_bench.agents.world_models.structured import StructuredModel
 
 from imagine_bench import registry
 from imagine_bench.data.collect import collect, policy_of
-from imagine_bench.data.episodes import Episodes
-from imagine_bench.entrants import entrant
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentContext
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
+from imagine_bench.registry.entries import entrant
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.world_models import Imagined, WorldModel, require_imagined
 
 LEARNED = [name for name, entry in registry.WORLD_MODELS.items() if not entry.privileged]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imagine_bench.capabilities import ImaginedRollout
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.store.results import BenchResult, Checkpoint, ComparedRollout, OpenLoop, RunResult
 

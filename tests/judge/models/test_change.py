@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge.models import change
 from imagine_bench.judge.models.asking import Answers, ask, counterfactuals, one_step
 from imagine_bench.judge.models.change import (
@@ -31,7 +32,6 @@ from imagine_bench.judge.models.change import (
 )
 from imagine_bench.judge.models.ends import Copy, Exact, Gallery
 from imagine_bench.judge.models.truth import Questions
-from imagine_bench.world_models import Imagined, WorldModel
 
 BOTH = pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
 

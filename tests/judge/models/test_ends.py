@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Frame, Rules, State, TaskSpec
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge.models.asking import FRAMES, Answers, after_the_end, ask, one_step, ranked, rollouts
 from imagine_bench.judge.models.ends import Copy, Exact, Gallery
 from imagine_bench.judge.models.scores import after_the_end as scores_after_the_end
 from imagine_bench.judge.models.scores import by_depth, filter_scores, one_step_scores, ranking_scores
 from imagine_bench.judge.models.truth import Questions
-from imagine_bench.world_models import Imagined, WorldModel
 
 ERRORS = (
     "total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "end_error",

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imagine_bench.data.episodes import Episodes, joined
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.world_models import Imagined, require_imagined, weights_of
+from imagine_bench.interfaces.episodes import Episodes, joined
+from imagine_bench.interfaces.model import Imagined, require_imagined, weights_of
 
 SHAPE = (3, 4, 2)
 GOOD = Imagined(

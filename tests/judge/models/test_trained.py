@@ -10,12 +10,12 @@ import pytest
 from fake_reader import BlindReader
 from small_runs import Inline, small
 
-from imagine_bench.bench import bench as benches
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.models import study
 from imagine_bench.judge.models.study import Judgement, judge, kept, shown
 from imagine_bench.judge.models.trained import load_model, model_entry
 from imagine_bench.report.judge import judgement_report
+from imagine_bench.running import bench as benches
 
 
 @pytest.fixture(scope="module")

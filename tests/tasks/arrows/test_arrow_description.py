@@ -12,9 +12,9 @@ from imagine_bench.tasks.arrows.description import COUPLINGS, FORBIDS, GOALS, Ar
 from imagine_bench.tasks.dials.dials import GESTURES
 
 from imagine_bench import registry
-from imagine_bench.entrants import file_name, parse_options
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import protocol
+from imagine_bench.registry.entries import file_name, parse_options
 
 KINDS = {name: str(kind) for name, kind in {**Arrows.__base__.__annotations__, **Arrows.__annotations__}.items()}
 KEPT = {

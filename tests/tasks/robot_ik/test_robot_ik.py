@@ -8,7 +8,7 @@ from imagine_bench.tasks.robot_ik import spec as ik
 from imagine_bench.tasks.robot_ik.planar_arm import MOVE_S
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.regression.interfaces import Prediction
+from imagine_bench.interfaces.regression import Prediction
 from imagine_bench.seeding import SeedTree
 
 

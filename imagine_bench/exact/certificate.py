@@ -1,0 +1,189 @@
+"""The certificate of a world: what any agent's result in it has to be read against, computed and not measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from imagine_bench.exact.beliefs import BeliefRules, TooManyBeliefsError
+from imagine_bench.exact.factors import FactorGraph, Scope, factor_graph
+from imagine_bench.exact.floor import Lesson, learn
+from imagine_bench.exact.machine import Machine, machine
+from imagine_bench.exact.memoryless import best_without_memory
+from imagine_bench.interfaces import Floats, Rules, TaskSpec
+from imagine_bench.rules import RuleTables, evaluate, horizon_optimum, shortest_plans, tabulate
+
+_PROVED = 1e-6  # of a success probability
+_LEARNERS, _FEWEST, _PAIRS = 10, 2, 20_000
+"""Learners behind an information floor: the most, the fewest, and (macrostate, action) pairs that they share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InformationFloor:
+    """Means over learners that know the factor graph and nothing else (:mod:`.floor`)."""
+
+    transitions: float
+    standard_error: float  #: of ``transitions``
+    episodes: float
+    learners: int  #: learner k has the generator of seed k
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certificate:
+    """Exact facts of a world within its horizon. Every field can be written as JSON."""
+
+    macrostates: int  #: those that can come up, ends included
+    starts: int
+    horizon: int  #: macro-actions
+    random: bool  #: whether some macro-action has several outcomes
+    chance_level: float  #: success probability of uniformly random macro-actions
+    seen_optimum: float  #: largest success probability if every frame showed everything at once
+    optimal_return: float  #: expected return of that policy
+    optimum: float  #: largest success probability with memory; the same where nothing is hidden or late
+    beliefs: int | None  #: how many were enumerated for it; None: too many, and ``optimum`` is only a bound
+    memoryless: float | None  #: best found of a deterministic policy without memory; None where nothing is hidden
+    memoryless_bound: float | None  #: what none of them exceeds
+    plan_lengths: tuple[tuple[int, int], ...]  #: (fewest macro-actions to a success, starts); -1 where there is none
+    dynamics: tuple[tuple[str, str, str], ...]  #: (action, coordinates that it decides, what they depend on)
+    outcomes: tuple[tuple[str, str], ...]  #: (reward and end, coordinates of the conditions that force it), in order
+    width: int  #: the most coordinates that decide one factor or condition
+    facts: int  #: local entries and conditions that there are to know
+    floor: InformationFloor | None  #: None where no start can be solved, or a learner is not done after floor.MOST
+
+
+def certificate(spec: TaskSpec) -> Certificate:
+    """Compute the certificate of a task: its rules, its horizon, and what its frames show."""
+    tables, full = tabulate(spec.rules), machine(spec.rules)
+    starts, best = tables.starts, horizon_optimum(tables, spec.horizon)
+    chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / spec.n_actions), spec.horizon)
+    lengths, graph = shortest_plans(tables)[starts], factor_graph(full)
+    seen_optimum = float(best.success[starts].mean())
+    optimum = seen_optimum
+    beliefs: int | None = 0
+    memoryless = bound = None
+    if spec.sight is not None:
+        optimum, beliefs = _with_memory(spec, tables, seen_optimum)
+        found = best_without_memory(spec.rules, spec.sight, spec.horizon, bound=optimum)
+        memoryless, bound = found.value, found.bound
+    return Certificate(
+        macrostates=len(full.coordinates),
+        starts=len(starts),
+        horizon=spec.horizon,
+        random=len(full.pair) > full.n_play * full.n_actions,
+        chance_level=float(chance.success[starts].mean()),
+        seen_optimum=seen_optimum,
+        optimal_return=float(best.returns[starts].mean()),
+        optimum=optimum,
+        beliefs=beliefs,
+        memoryless=memoryless,
+        memoryless_bound=bound,
+        plan_lengths=tuple(sorted(Counter(lengths.tolist()).items())),
+        dynamics=tuple(
+            (spec.action_names[each.action], _names(spec, each.children), _names(spec, each.parents))
+            for each in graph.factors
+        ),
+        outcomes=_outcomes(spec, full, graph),
+        width=graph.width,
+        facts=graph.facts,
+        floor=_floor(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
+    )
+
+
+def from_json(values: Mapping[str, Any]) -> Certificate:
+    """Undo ``dataclasses.asdict`` and JSON. Raises TypeError or KeyError: fields are missing or unknown."""
+    lists = {name: tuple(map(tuple, values[name])) for name in ("plan_lengths", "dynamics", "outcomes")}
+    floor = values["floor"] and InformationFloor(**values["floor"])
+    return Certificate(**{**values, **lists, "floor": floor})
+
+
+def optimum(spec: TaskSpec) -> float:
+    """The largest success probability with memory; where there are too many beliefs, a bound on it."""
+    tables = tabulate(spec.rules)
+    seen_optimum = float(horizon_optimum(tables, spec.horizon).success[tables.starts].mean())
+    return seen_optimum if spec.sight is None else _with_memory(spec, tables, seen_optimum)[0]
+
+
+def certificate_rows(found: Certificate) -> dict[str, str]:
+    """A certificate in words, by heading."""
+    plans = ", ".join(f"{length} ({count} starts)" for length, count in found.plan_lengths if length > 0)
+    unsolvable = dict(found.plan_lengths).get(-1, 0)
+    rows = {
+        "shortest plans": (plans or "none") + (f"; none from {unsolvable} starts" if unsolvable else ""),
+        "best policy": f"{_percent(found.seen_optimum)} within the horizon where everything is seen",
+    }
+    if found.memoryless is not None and found.memoryless_bound is not None:
+        how = "at most, for there are too many beliefs" if found.beliefs is None else f"over {found.beliefs:,} beliefs"
+        rows["with memory"] = f"{_percent(found.optimum)}, {how}"
+        proved = found.memoryless_bound - found.memoryless < _PROVED
+        rows["without memory"] = _percent(found.memoryless) + (
+            ", proved" if proved else f" found; only proved to be at most {_percent(found.memoryless_bound)}"
+        )
+    moves: dict[tuple[str, str], int] = Counter((children, parents) for _, children, parents in found.dynamics)
+    rows["factor graph"] = "; ".join(f"{c} from {p} ({n} actions)" for (c, p), n in moves.items())
+    rows["reward and end"] = "; ".join(f"{what} by [{scopes}]" for what, scopes in found.outcomes)
+    rows["facts"] = f"{found.facts} local entries and conditions, of at most {found.width} coordinates each"
+    if found.floor is not None:
+        floor, part = found.floor, " (of the certain part alone)" if found.random else ""
+        rows["information"] = (
+            f"{floor.transitions:.0f} ± {floor.standard_error:.0f} transitions, {floor.episodes:.0f} episodes, until a "
+            f"learner with ideal codes and this graph knows an optimal policy{part}"
+        )
+    return rows
+
+
+def _percent(share: float) -> str:
+    """Rounded down to what is not more than it is: 99.99 % is not 100."""
+    return f"{np.floor(share * 1e4 + 1e-3) / 100:.2f} %"
+
+
+def _with_memory(spec: TaskSpec, tables: RuleTables, seen_optimum: float) -> tuple[float, int | None]:
+    """The optimum with memory and the number of beliefs, or the bound that everything seen at once gives."""
+    assert spec.sight is not None
+    play = [state for state in tables.index if not spec.rules.is_terminal(state)]
+    beliefs = BeliefRules(spec.rules, spec.sight, play, spec.horizon)
+    try:
+        known = tabulate(cast(Rules, beliefs), depth=spec.horizon)
+    except TooManyBeliefsError:
+        return seen_optimum, None
+    success: Floats = horizon_optimum(known, spec.horizon).success[known.starts]
+    shares = np.array([share for share, _ in beliefs.starts.values()])
+    return min(float((success * shares).sum()), seen_optimum), len(known.index)
+
+
+def _names(spec: TaskSpec, scope: Scope) -> str:
+    return ", ".join(spec.macrostate_names[i] for i in scope) or "nothing"
+
+
+def _outcomes(spec: TaskSpec, full: Machine, graph: FactorGraph) -> tuple[tuple[str, str], ...]:
+    now, then = list(spec.macrostate_names), [f"{name} then" for name in spec.macrostate_names]
+    names = {"next": then, "choice": [*now, "action"], "both": [*now, "action", *then]}[graph.read]
+    rows = []
+    for claim in graph.claims:
+        scopes = "; ".join(", ".join(names[i] for i in scope) or "always" for scope in claim.scopes)
+        rows.append((_class(full, claim.class_), scopes))
+    return (*rows, (_class(full, graph.usual), "otherwise"))
+
+
+def _class(full: Machine, index: int) -> str:
+    reward, ended, success = full.classes[index]
+    return f"{reward:+g}{', success' if success else ', end' if ended else ''}"
+
+
+def _floor(full: Machine, graph: FactorGraph, horizon: int) -> InformationFloor | None:
+    learners = min(_LEARNERS, max(_FEWEST, _PAIRS // (full.n_play * full.n_actions)))
+    lessons = list[Lesson]()
+    for seed in range(learners):
+        lessons.append(learn(full, graph, horizon, np.random.default_rng(seed)))
+        if not lessons[-1].done:
+            return None
+    needed = np.array([lesson.transitions for lesson in lessons], dtype=np.float64)
+    return InformationFloor(
+        transitions=float(needed.mean()),
+        standard_error=float(needed.std(ddof=1) / np.sqrt(learners)),
+        episodes=float(np.mean([lesson.episodes for lesson in lessons])),
+        learners=learners,
+    )

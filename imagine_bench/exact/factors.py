@@ -1,0 +1,197 @@
+"""The factor graph of a machine: which coordinates decide which, by exact tests over everything that is reached.
+
+A coordinate's next value, given the action, depends on the smallest set of coordinates of which it is a function in
+every macrostate of play (of equal sets, the one with the coordinate itself, then the first). Coordinates that are drawn
+together are one factor. Reward and end are a list of classes, read from the top: a class holds where one of its local
+conditions does, that is where some values of a few coordinates force it among all that no class above has claimed; the
+class that needs the smallest conditions comes first, and what is left at the end is the usual case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.exact.machine import Machine
+from imagine_bench.interfaces import Floats
+
+Scope = tuple[int, ...]
+"""Coordinates, ascending."""
+_DIGITS = 9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Factor:
+    """Coordinates whose next values an action draws together, and what that depends on."""
+
+    action: int
+    children: Scope
+    parents: Scope
+    entry: NDArray[np.int64]  #: which local entry decides in each macrostate of play, from 0. Shape (P,).
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalClass:
+    """A class that some values of a few coordinates force."""
+
+    class_: int  #: index in the machine's classes
+    scopes: tuple[Scope, ...]  #: the coordinates of its conditions
+    conditions: int  #: assignments to scopes that force it
+
+
+@dataclass(frozen=True, kw_only=True)
+class FactorGraph:
+    """Which coordinates decide which. An action leaves every coordinate alone that none of its factors has."""
+
+    factors: tuple[Factor, ...]
+    #: what reward and end are a function of: ``"next"``, the macrostate reached, ``"choice"``, the macrostate and the
+    #: action, or ``"both"``
+    read: str
+    point: NDArray[np.int64]  #: the distinct point that each outcome's class is read from. Shape (N,).
+    points: NDArray[np.int64]  #: the points' values. Shape (Q, F).
+    claims: tuple[LocalClass, ...]  #: in order
+    usual: int  #: the class of everything that none claims
+
+    @property
+    def width(self) -> int:
+        """The most coordinates that decide one factor or make up one condition."""
+        scopes = [scope for claim in self.claims for scope in claim.scopes]
+        return max([len(scope) for scope in (*(factor.parents for factor in self.factors), *scopes)], default=0)
+
+    @property
+    def facts(self) -> int:
+        """Local entries of the dynamics and conditions of classes: all that there is to know."""
+        entries = sum(int(factor.entry.max()) + 1 for factor in self.factors)
+        return entries + sum(claim.conditions for claim in self.claims)
+
+
+def keys(values: NDArray[np.int64], scope: Iterable[int]) -> NDArray[np.int64]:
+    """One number for the values of some columns in each row, equal where they are. Shape (N,)."""
+    found = np.zeros(len(values), dtype=np.int64)
+    for column in scope:
+        found = found * (values[:, column].max(initial=0) + 1) + values[:, column]
+    return found
+
+
+def factor_graph(machine: Machine) -> FactorGraph:
+    """Compute it."""
+    factors = tuple(each for action in range(machine.n_actions) for each in _factors(machine, action))
+    read, point, points = _points(machine)
+    label = np.empty(len(points), dtype=np.int64)
+    label[point] = machine.class_
+    claims, usual = _claims(points, label)
+    return FactorGraph(factors=factors, read=read, point=point, points=points, claims=claims, usual=usual)
+
+
+def _factors(machine: Machine, action: int) -> Iterator[Factor]:
+    first, last = np.searchsorted(machine.pair, [action * machine.n_play, (action + 1) * machine.n_play])
+    before, after = machine.before[first:last], machine.coordinates[machine.after[first:last]]
+    now, weight = machine.coordinates[: machine.n_play], machine.probability[first:last]
+    moved = [i for i in range(now.shape[1]) if (after[:, i] != now[before, i]).any()]
+    for children in _drawn_together(moved, before, after, weight):
+        law = _laws(before, keys(after, children), weight, machine.n_play)
+        parents = _smallest(now, law, children)
+        entry = np.unique(keys(now, parents), return_inverse=True)[1].reshape(-1)
+        yield Factor(action=action, children=children, parents=parents, entry=entry)
+
+
+def _laws(before: NDArray[np.int64], value: NDArray[np.int64], weight: Floats, n: int) -> NDArray[np.int64]:
+    """A number for the distribution of a value after each macrostate, equal where they are. Shape (P,)."""
+    law = np.zeros(n, dtype=np.int64)
+    for each in np.unique(value):
+        share = np.bincount(before, weights=weight * (value == each), minlength=n).round(_DIGITS)
+        share_id = np.unique(share, return_inverse=True)[1].reshape(-1)
+        law = np.unique(law * (share_id.max() + 1) + share_id, return_inverse=True)[1].reshape(-1)
+    return law
+
+
+def _drawn_together(
+    moved: list[int], before: NDArray[np.int64], after: NDArray[np.int64], weight: Floats
+) -> list[Scope]:
+    """Partition of the coordinates that an action moves: two are together if their joint law is no product."""
+    groups = {each: {each} for each in moved}
+    if (np.bincount(before) > 1).any():
+        for one, other in combinations(moved, 2):
+            if groups[one] is not groups[other] and not _independent(before, after[:, [one, other]], weight):
+                groups[one] |= groups[other]
+                groups.update(dict.fromkeys(groups[other], groups[one]))
+    return sorted({tuple(sorted(group)) for group in groups.values()})
+
+
+def _independent(before: NDArray[np.int64], after: NDArray[np.int64], weight: Floats) -> bool:
+    shape = (int(before.max()) + 1, *(after.max(axis=0) + 1))
+    joint = np.zeros(shape)
+    np.add.at(joint, (before, after[:, 0], after[:, 1]), weight)
+    product = joint.sum(axis=2, keepdims=True) * joint.sum(axis=1, keepdims=True)
+    return bool(np.abs(joint - product).max() < 10.0**-_DIGITS)
+
+
+def _smallest(now: NDArray[np.int64], law: NDArray[np.int64], children: Scope) -> Scope:
+    columns = range(now.shape[1])
+    for size in range(now.shape[1] + 1):
+        for scope in sorted(combinations(columns, size), key=lambda each: (-len({*each} & {*children}), each)):
+            key = keys(now, scope)
+            first = np.empty(int(key.max()) + 1, dtype=np.int64)
+            first[key] = law
+            if (first[key] == law).all():
+                return scope
+    raise AssertionError("the whole macrostate decides")
+
+
+def _points(machine: Machine) -> tuple[str, NDArray[np.int64], NDArray[np.int64]]:
+    now, then = machine.coordinates[machine.before], machine.coordinates[machine.after]
+    choice = np.hstack([now, machine.action[:, None]])
+    for read, values in (("next", then), ("choice", choice), ("both", np.hstack([choice, then]))):
+        key = keys(values, range(values.shape[1]))
+        _, first, point = np.unique(key, return_index=True, return_inverse=True)
+        point = point.reshape(-1)
+        if (machine.class_[first][point] == machine.class_).all():
+            return read, point, values[first]
+    raise AssertionError("everything together decides")
+
+
+def _claims(points: NDArray[np.int64], label: NDArray[np.int64]) -> tuple[tuple[LocalClass, ...], int]:
+    claims: list[LocalClass] = []
+    while len(left := np.unique(label)) > 1:
+        claim = _next_claim(points, label, left)
+        claims.append(claim)
+        points, label = points[label != claim.class_], label[label != claim.class_]
+    return tuple(claims), int(left[0])
+
+
+def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArray[np.int64]) -> LocalClass:
+    """The class that the smallest conditions force everywhere; of those, the one with the fewest."""
+    forced: dict[int, list[tuple[Scope, NDArray[np.int64]]]] = {int(each): [] for each in left}
+    for size in range(points.shape[1] + 1):
+        scopes = list(combinations(range(points.shape[1]), size))
+        found = []
+        for class_, so_far in forced.items():
+            is_it = label == class_
+            for scope in scopes:
+                key = np.unique(keys(points, scope), return_inverse=True)[1].reshape(-1)
+                total, of_it = np.bincount(key), np.bincount(key, weights=is_it)
+                forces = (total == of_it)[key]
+                if forces.any():
+                    so_far.append((scope, np.where(forces, key, -1)))
+            if so_far and np.logical_or.reduce([key >= 0 for _, key in so_far])[is_it].all():
+                found.append(_cover(class_, so_far))
+        if found:
+            return min(found, key=lambda claim: (claim.conditions, claim.class_))
+    raise AssertionError("the whole point decides")
+
+
+def _cover(class_: int, forced: list[tuple[Scope, NDArray[np.int64]]]) -> LocalClass:
+    """A small set of scopes: again and again the one that covers the most of what is left."""
+    covered = np.zeros(len(forced[0][1]), dtype=np.bool_)
+    scopes, conditions = [], 0
+    wanted = np.logical_or.reduce([key >= 0 for _, key in forced])
+    while not (covered == wanted).all():
+        scope, key = max(forced, key=lambda each: int(((each[1] >= 0) & ~covered).sum()))
+        scopes.append(scope)
+        conditions += len(np.unique(key[key >= 0]))
+        covered |= key >= 0
+    return LocalClass(class_=class_, scopes=tuple(sorted(scopes)), conditions=conditions)

@@ -1,0 +1,126 @@
+"""The interface of a world model that is judged: frames and actions in, imagined pictures out; numpy only.
+
+Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` imagined futures of one question.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.arrays import Floats, Frame
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces.episodes import Episodes
+
+UNCERTAINTIES = ("epistemic", "aleatoric", "modal")
+_SUM_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imagined:
+    """What a model imagines. Whatever it does not offer stays None, and is judged as not offered."""
+
+    #: Pictures, gray or RGB, uint8 or floats in [0, 1]. Shape (N, S, D, H, W) or (N, S, D, H, W, 3).
+    pictures: NDArray[Any]
+    #: Probability of each picture among those of its question and depth, summing to 1 over S. Shape (N, S, D). None
+    #: makes all equally likely; a model that gives them may give any number S of pictures.
+    probabilities: NDArray[Any] | None = None
+    rewards: NDArray[Any] | None = None  #: Reward of that action, 0 once that future has ended. Shape (N, S, D).
+    p_ended: NDArray[Any] | None = None  #: Probability that the episode ended there or before. Shape (N, S, D).
+    epistemic: NDArray[Any] | None = None  #: How much it does not know for want of data, in any unit. Shape (N, D).
+    aleatoric: NDArray[Any] | None = None  #: How much is noise. Shape (N, D).
+    modal: NDArray[Any] | None = None  #: How far several possible outcomes are apart. Shape (N, D).
+    #: Whether a filter of its own would let it learn from, or act on, what it imagines there. Shape (N, D), bool.
+    accepted: NDArray[Any] | None = None
+
+
+class WorldModel(Protocol):
+    """A world model from anyone. It sees frames and actions only; an instance is fitted once."""
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Learn from real episodes; everything random is drawn from ``rng``."""
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """Imagine D macro-actions from each of N histories, in S = ``samples`` futures.
+
+        Args:
+            frames: The K latest frames of each, oldest first. Shape (N, K, 64, 64, 3), uint8.
+            actions: The K - 1 macro-actions between them, then the D to imagine. Shape (N, K - 1 + D).
+            samples: Futures wanted of each question.
+            rng: Draws whatever is random.
+        """
+
+    def parameters(self) -> int:
+        """Numbers that were fitted."""
+
+
+def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samples: int) -> Imagined:
+    """What a model handed in, if it is what it has to be.
+
+    Raises:
+        InvalidValueError: A wrong type or shape, NaN, or probabilities out of range or not summing to 1; the message
+            names the model, the method and the field.
+    """
+    said = f"World model {name}: imagine()"
+    if not isinstance(imagined, Imagined):
+        raise InvalidValueError(f"{said} gave {type(imagined).__name__}; give an Imagined.")
+    given = {field.name: getattr(imagined, field.name) for field in fields(Imagined)}
+    offered = {each: array for each, array in given.items() if array is not None}
+    _require_numbers(offered, said)
+    _require_shapes(offered, said, (rows, samples, depth))
+    _require_ranges(offered, said)
+    return imagined
+
+
+def _require_numbers(offered: dict[str, Any], said: str) -> None:
+    """Raise InvalidValueError for what is no array of finite numbers."""
+    for each, array in offered.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise InvalidValueError(f"{said} gave {each} of {type(array).__name__}; give an array of numbers.")
+        if each == "accepted" and array.dtype.kind != "b":
+            raise InvalidValueError(f"{said} gave {each} of {array.dtype}; give an array of bool.")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise InvalidValueError(f"{said} gave {each} with NaN or infinity; give finite numbers.")
+
+
+def _require_shapes(offered: dict[str, NDArray[Any]], said: str, asked: tuple[int, int, int]) -> None:
+    """Raise InvalidValueError for arrays of other shapes than those of pictures (N, S, D, ...)."""
+    rows, samples, depth = asked
+    given = offered["pictures"].shape
+    futures = given[1] if len(given) > 1 and "probabilities" in offered and given[1] else samples
+    for each, array in offered.items():
+        if each == "pictures":
+            right = len(given) in (5, 6) and given[:3] == (rows, futures, depth) and given[5:] in ((), (3,))
+            wanted = f"({rows}, {futures}, {depth}, H, W) or ({rows}, {futures}, {depth}, H, W, 3)"
+            right = right and 0 not in given
+        else:
+            shape = (rows, depth) if each in (*UNCERTAINTIES, "accepted") else (rows, futures, depth)
+            right, wanted = array.shape == shape, str(shape)
+        if not right:
+            raise InvalidValueError(f"{said} gave {each} of shape {array.shape}; give {wanted}.")
+
+
+def _require_ranges(offered: dict[str, NDArray[Any]], said: str) -> None:
+    """Raise InvalidValueError for pixels or probabilities out of range."""
+    pixels = offered["pictures"]
+    if pixels.dtype != np.uint8 and not (pixels.dtype.kind == "f" and pixels.min() >= 0.0 and pixels.max() <= 1.0):
+        raise InvalidValueError(f"{said} gave pictures of {pixels.dtype}; give uint8, or floats from 0 to 1.")
+    for each in offered.keys() & {"probabilities", "p_ended"}:
+        if offered[each].min() < 0.0 or offered[each].max() > 1.0 + _SUM_TOLERANCE:
+            raise InvalidValueError(f"{said} gave {each} outside of [0, 1]; give probabilities.")
+    if "probabilities" in offered:
+        sums = offered["probabilities"].sum(axis=1, dtype=np.float64)
+        worst = sums.flat[int(np.abs(sums - 1.0).argmax())]
+        if abs(worst - 1.0) > _SUM_TOLERANCE:
+            raise InvalidValueError(f"{said} gave probabilities that sum to {worst:.4g} over S; they must sum to 1.")
+
+
+def weights_of(imagined: Imagined) -> Floats:
+    """The probability of each picture at its depth. Shape (N, S, D)."""
+    if imagined.probabilities is not None:
+        return np.asarray(imagined.probabilities, dtype=np.float64)
+    shape = imagined.pictures.shape[:3]
+    return np.full(shape, 1.0 / shape[1])

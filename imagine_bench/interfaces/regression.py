@@ -1,0 +1,170 @@
+"""The interfaces of regression tasks and regressors: numpy and the standard library only.
+
+A regression *task* offers data whose truth is known. A *regressor* learns it and says how uncertain it is. One run
+trains several *networks*, each on data drawn for it, on every *variant* of the task. Shapes: ``E`` networks, ``N``
+rows, ``X`` inputs, ``D`` outputs, ``K`` mixture components, ``T`` weight samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.arrays import Floats
+from imagine_bench.interfaces.agent import AgentState
+from imagine_bench.interfaces.scene import Motion, Shape3D
+from imagine_bench.seeding import SeedTree
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset:
+    """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D)."""
+
+    inputs: Floats
+    targets: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mixtures:
+    """Diagonal Gaussian mixtures: weights (..., K) of sum 1, means and standard deviations above 0 (..., K, D)."""
+
+    weights: Floats
+    means: Floats
+    sigmas: Floats
+
+    def map(self, change: Callable[[Floats], Floats]) -> Mixtures:
+        """The mixtures with each array changed alike, in their leading axes."""
+        return Mixtures(weights=change(self.weights), means=change(self.means), sigmas=change(self.sigmas))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """What E networks predict, and how uncertain they are."""
+
+    prediction: Floats  #: one value sampled from the predictive mixture. Shape (E, N, D).
+    mean: Floats  #: mean over the weight samples. Shape (E, N, D).
+    epistemic: Floats  #: variance of the mean over weight samples (equation 4.25). Shape (E, N, D).
+    aleatoric: Floats  #: mean variance of the components (equation 4.26). Shape (E, N, D).
+    modal: Floats  #: mean spread of the components (equation 4.27). Shape (E, N, D).
+    stationarity: Floats  #: jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
+    #: Variance of the component that the prediction was sampled from, noise and weights together, summed over the
+    #: outputs. Shape (E, N).
+    sampled_variance: Floats
+    nll: Floats  #: negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
+    predictive: Mixtures  #: the mixture that predictions are sampled from. Leading axes (E, N).
+    #: values drawn as in equation 4.8, each from the mixture of one weight sample. Shape (E, N, S, D).
+    drawn: Floats
+
+
+SCORES: dict[str, Callable[[Prediction], Floats]] = {
+    "epistemic": lambda p: p.epistemic.sum(axis=-1),
+    "aleatoric": lambda p: p.aleatoric.sum(axis=-1),
+    "modal": lambda p: p.modal.sum(axis=-1),
+    "epistemic_plus_aleatoric": lambda p: (p.epistemic + p.aleatoric).sum(axis=-1),
+    "total": lambda p: (p.epistemic + p.aleatoric + p.modal).sum(axis=-1),
+    "stationarity": lambda p: p.stationarity,
+    "sampled_component": lambda p: p.sampled_variance,
+    "nll": lambda p: p.nll,
+}
+"""One number a row, (E, N), from a prediction: variances summed over the outputs. The higher, the less sure."""
+
+
+class Regressor(Protocol):
+    """E networks that learn to predict distributions."""
+
+    @property
+    def epoch(self) -> int:
+        """Epochs done."""
+
+    @property
+    def epochs(self) -> int:
+        """Epochs to do, those done included."""
+
+    def train(self, epochs: int) -> None:
+        """Train for so many more epochs.
+
+        Raises:
+            DivergedError: A loss is no longer finite.
+        """
+
+    def diagnostics(self) -> dict[str, float]:
+        """Means since the last call, by slashed name."""
+
+    def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
+        """Predict from each network's own inputs (E, N, X); ``rng`` samples predictions and Monte-Carlo sums."""
+
+    def pooled(self, inputs: Floats) -> Mixtures:
+        """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
+
+    def state(self) -> AgentState:
+        """A snapshot for a checkpoint."""
+
+    def restore(self, state: AgentState) -> None:
+        """Continue from ``state``, bit for bit.
+
+        Raises:
+            ArtefactError: The snapshot does not fit.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorContext:
+    """What a regressor is built from."""
+
+    datasets: tuple[Dataset, ...]  #: one a network, all of the same size. Length E.
+    seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
+    hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
+    overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
+    device: str = "cpu"
+
+
+Predict = Callable[[Floats, str], Prediction]
+"""Inputs (E, N, X) and a name, which stands for the random numbers, to what the networks predict for them."""
+
+
+class Evaluate(Protocol):
+    """A task's own measurements of trained networks."""
+
+    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+        """What the task's figures and tables are made of, by name; the first axis is the network, if there is one.
+
+        ``variant`` is what the networks were trained on; ``seeds``, one node a network, draw test inputs.
+        """
+
+
+class MovingScene(Protocol):
+    """A robot that predictions are carried out with, for recordings."""
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable shape."""
+
+    def movement(self, prediction: Floats, hz: float) -> Motion:
+        """How every body moves while one prediction (D,) is carried out, sampled ``hz`` a second."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionSpec:
+    """Everything the bench needs to know of a regression task. Building one is cheap."""
+
+    id: str
+    title: str
+    description: str
+    variants: tuple[str, ...]  #: those of the thesis, in its order
+    #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
+    require_variant: Callable[[str], None]
+    training: Callable[[str, np.random.Generator], Dataset]  #: data of a variant, drawn from a generator
+    #: The given number of rows of the same process, never trained on.
+    testing: Callable[[str, np.random.Generator, int], Dataset]
+    #: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
+    errors: Callable[[str, Floats, Floats], Floats]
+    error_name: str  #: what ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong
+    wrong_above: float
+    evaluate: Evaluate
+    sections: str  #: ``"module:attr"`` of the function that turns them into sections of the report
+    recorder: str | None = None  #: ``"module:attr"`` of the function that records them, or None
+    scene: Callable[[], MovingScene] | None = None  #: gives the robot that carries out predictions, where there is one
+    reference: str | None = None  #: name of the thesis' tables

@@ -1,0 +1,175 @@
+"""What can be registered; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
+
+An agent that comes in variants has a registered name for each, such as ``factored:given``; settings follow after a
+comma: ``factored:given,planning.depth=1``. The text is an entrant's name in protocols, tables and files; one agent,
+regressor or world model may enter with several settings.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain
+
+_BETWEEN = re.compile(r",(?=[\w.]+=)")
+_LONGEST = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskEntry:
+    """A registered task."""
+
+    spec: str  #: ``"module:attr"`` of its TaskSpec, or of a function from ``options`` to it
+    env_id: str  #: Gymnasium id, registered by ``import imagine_bench``
+    env: str  #: ``"module:attr"`` of the environment's constructor
+    horizon: int | None  #: Macro-actions before truncation; None where its environment truncates by itself
+    #: Keyword arguments of both, which say which member of a family it is.
+    options: Mapping[str, Any] = field(default_factory=dict)
+    #: ``"module:attr"`` of the frozen dataclass of all such arguments; with it, ``NAME:key=value,...`` is a task, too,
+    #: whose TaskSpec has a name and an ``env_id`` of its own.
+    world: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentEntry:
+    """A registered agent."""
+
+    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
+    learns: bool = True  #: Whether training changes it; others are only evaluated
+    needs_encoder: bool = True  #: Whether it sees what an encoder gives
+    encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
+    #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
+    #: group)``.
+    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
+    privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
+    #: Parts of :data:`.interfaces.OBSERVATIONS` that it can take, images of any size; by default 64 x 64 frames alone
+    observes: tuple[str, ...] = ()
+    #: Whether it is a :class:`.interfaces.capabilities.ExternalTrainer`, whose run cannot pause.
+    external_training_loop: bool = False
+    title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
+    description: str = "A registered agent."  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressorEntry:
+    """A registered regressor."""
+
+    make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
+    title: str  #: For headings, legends and tables
+    description: str  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderEntry:
+    """An encoder that an installed package offers, for any task."""
+
+    make: str  #: ``"module:attr"`` of a function without arguments to a :class:`.interfaces.FrameEncoder`
+    description: str = "An encoder."  #: One sentence for a reader who knows none of this
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEntry:
+    """A registered world model."""
+
+    #: ``"module:attr"`` of a function from AgentContext to :class:`.interfaces.model.WorldModel`; that of a privileged
+    #: model takes the TaskSpec and the judge's gallery of frames.
+    make: str
+    title: str  #: For headings, legends and tables
+    description: str = "A world model."  #: One sentence for a reader who knows none of this
+    encoder_kind: str | None = None  #: Which of the task's encoders it sees through, ``"latents"`` or ``"codes"``
+    privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
+    by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
+    settings: str = ""  #: As of :class:`AgentEntry`, read from ``context.overrides``; empty: there are none to give
+
+
+class Entrant(NamedTuple):
+    """An agent and the settings that it alone has in a bench."""
+
+    agent: str  #: registered name
+    settings: Mapping[str, Any]  #: by dotted name, in the order of names
+
+    def __str__(self) -> str:
+        """The one name of this entrant, however its settings were written."""
+        if not self.settings:
+            return self.agent
+        settings = ",".join(f"{name}={_text(value)}" for name, value in self.settings.items())
+        return f"{self.agent}{',' if ':' in self.agent else ':'}{settings}"
+
+    @property
+    def words(self) -> str:
+        """The settings for a reader, by the last part of their names where that is enough: ``discount 0.99``."""
+        short = [name.rpartition(".")[2] for name in self.settings]
+        names = self.settings if len(set(short)) < len(short) else short
+        return ", ".join(f"{name} {_text(value)}" for name, value in zip(names, self.settings.values(), strict=True))
+
+
+def entrant(text: str) -> Entrant:
+    """Undo ``str(entrant)``. Raises InvalidValueError: settings that are none, or one that is given twice."""
+    agent, colon, rest = text.partition(":")
+    words = _BETWEEN.split(rest) if colon else []
+    if words and words[0].isidentifier():
+        agent = f"{agent}:{words.pop(0)}"
+    return Entrant(agent, dict(parse_settings(words, f"entrant {text!r}:")))
+
+
+def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Any], ...]:
+    """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
+
+    Raises InvalidValueError: a word without ``=``, or a name given twice.
+    """
+    return tuple(sorted((name, _value(text)) for name, text in _texts(pairs, where).items()))
+
+
+def parse_options(text: str, kinds: Mapping[str, str], where: str) -> dict[str, Any]:
+    """``name=value,...`` to values by name; those whose kind has a number in it are read as JSON. Raises likewise."""
+    texts = _texts(_BETWEEN.split(text), where)
+    numbers = {name for name, kind in kinds.items() if "int" in kind or "float" in kind}
+    return {name: _value(text) if name in numbers else text for name, text in texts.items()}
+
+
+def read_mapping(file: Path) -> dict[str, Any]:
+    """A JSON file that holds one mapping. Raises ArtefactError: it does not, or cannot be read."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ArtefactError(f"{file} cannot be read ({plain(error)}); give a JSON file of one mapping.") from error
+    if not isinstance(found, dict):
+        raise ArtefactError(f"{file} holds {brief(found)}; give a JSON file of one mapping.")
+    return found
+
+
+def _texts(pairs: Sequence[str], where: str) -> dict[str, str]:
+    texts: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise InvalidValueError(f"{where} {pair!r} is not of the form name=value, such as controller.discount=0.9.")
+        if name in texts:
+            raise InvalidValueError(f"{where} names {name!r} twice; give it once.")
+        texts[name] = text
+    return texts
+
+
+def file_name(text: str) -> str:
+    """An entrant's name as a file or folder may have it on any system; of different entrants, different ones."""
+    safe = re.sub(r"[^\w.,=-]", "-", text, flags=re.ASCII)
+    if safe == text.replace(":", "-", 1) and len(safe) <= _LONGEST:
+        return safe
+    return f"{safe[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) and _value(value) == value else json.dumps(value, separators=(",", ":"))

@@ -1,0 +1,161 @@
+"""The facts of a machine and an installation that stand beside every result."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from imagine_bench import registry
+from imagine_bench.errors import SetupError
+from imagine_bench.version import PACKAGE_FOLDER, __version__
+
+PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
+OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3", "torch-world")
+"""Of adapters and of the extra ``peers``; named where they are installed."""
+GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
+_CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
+"""What decides results, in a checkout."""
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def describe_environment() -> dict[str, Any]:
+    """Command, commit, versions, machine, GL renderer (or why there is none), threads; JSON-like."""
+    return {
+        "command": command(),
+        "commit": commit(),
+        "versions": versions(),
+        "machine": machine(),
+        "gl_renderer": _gl_renderer_or_reason(),
+        "threads_a_run": 1,
+    }
+
+
+def command() -> str:
+    """The command line of this process, with the program's bare name, as a shell takes it."""
+    name = Path(sys.argv[0]).name
+    program = ["python", "-m", "imagine_bench"] if name == "__main__.py" else [name]
+    return shlex.join([*program, *sys.argv[1:]])
+
+
+def commit() -> str | None:
+    """The checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
+    top = PACKAGE_FOLDER.parent
+    if not (top / ".git").exists() or shutil.which("git") is None:
+        return None
+    head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")
+    changes = _changes(top)
+    return f"{head}+changes.{changes}" if head and changes else head
+
+
+def _changes(top: Path) -> str:
+    """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do."""
+    differing = _output("git", "-C", str(top), "diff", "--name-only", "HEAD", "--", *_CODE) or ""
+    new = _output("git", "-C", str(top), "ls-files", "--others", "--exclude-standard", "--", *_CODE) or ""
+    digest, names = hashlib.sha256(), sorted({*differing.splitlines(), *new.splitlines()})
+    for name in names:
+        digest.update(name.encode())
+        if (top / name).is_file():
+            digest.update((top / name).read_bytes())
+    return digest.hexdigest()[:8] if names else ""
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package, those that decide its numbers and those that offer agents; imports none.
+
+    One that offers agents is likely still being written: the beginning of its sources' digest follows its version.
+    """
+    found = {"python": platform.python_version(), "imagine-bench": __version__}
+    found |= {package: installed(package) for package in PACKAGES}
+    optional = {package: installed(package) for package in OPTIONAL_PACKAGES}
+    found |= {name: version for name, version in optional.items() if version != "missing"}
+    return found | {name: f"{installed(name)}+{_sources(top)}" for name, top in registry.guest_packages().items()}
+
+
+def _sources(modules: Iterable[str]) -> str:
+    """Beginning of a digest of the Python files of top modules, none of which is imported; those that lack add none."""
+    digest = hashlib.sha256()
+    for spec in filter(None, map(importlib.util.find_spec, sorted(modules))):
+        folders = spec.submodule_search_locations
+        files = [Path(spec.origin)] if spec.origin and not folders else []
+        for path in files + sorted(path for folder in folders or () for path in Path(folder).rglob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+def installed(package: str) -> str:
+    """The version of a package, read without importing it; ``"missing"`` where there is none."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "missing"
+
+
+def machine() -> dict[str, Any]:
+    """Operating system, processor, cores this process may use, memory, NVIDIA GPU."""
+    return {
+        "system": platform.platform(),
+        "cpu": cpu_model(),
+        "cores": usable_cores(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+        if hasattr(os, "sysconf")
+        else None,
+        "gpu": gpu_model(),
+        "thread_variables": {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ},
+    }
+
+
+def cpu_model() -> str:
+    """The processor's name as the system gives it."""
+    if sys.platform == "darwin":
+        return _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.machine())
+
+
+def gpu_model() -> str | None:
+    """The first NVIDIA GPU's name, or None."""
+    if shutil.which("nvidia-smi") is None:
+        return None
+    names = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
+    return names.splitlines()[0] if names else None
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def gl_renderer() -> str:
+    """Vendor and renderer of the OpenGL that draws the frames. Raises SetupError: there is none."""
+    return registry.load(GL_RENDERER)()
+
+
+def _gl_renderer_or_reason() -> str:
+    try:
+        return gl_renderer()
+    except SetupError as error:
+        return f"none: {error}"
+
+
+def _output(*words: str) -> str | None:
+    """What a command prints, stripped; None if it fails."""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,0 +1,148 @@
+"""Control tasks, which agents act in, as a type of task: how their benches are planned, run and read."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.data.folder import read_dataset, require_fits
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
+from imagine_bench.protocols.control import PRESETS, Protocol, protocol
+from imagine_bench.protocols.data import digest
+from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.protocols.task_types import Encoders, TaskType
+from imagine_bench.registry.entries import entrant
+from imagine_bench.rules import states_of
+from imagine_bench.running import runner
+from imagine_bench.running.queries import require_able
+from imagine_bench.running.run_state import make_env
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.results import BenchResult, RunResult
+
+_CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
+
+
+def plan_control(
+    task: str, preset: str, *, encoder: str | None = None, dataset: Path | str | None = None, **changes: Any
+) -> tuple[Protocol, Encoders]:
+    """The protocol of a control bench and the encoders it uses; errors as of :func:`imagine_bench.running.bench.plan`.
+
+    ``encoder`` is a bundled name or a path, instead of the task's own. One that gives codes is for every agent, one
+    that gives latents for those that read latents. ``dataset`` is a folder; without budgets, its episodes are all that
+    learners have.
+    """
+    found = None if dataset is None else read_dataset(Path(dataset))
+    if found is not None:
+        changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
+    wanted = protocol(task, preset, **changes)
+    if found is not None:
+        require_fits(found, registry.task(task), wanted.appearance)
+    if not registry.is_own(task):
+        _require_sound(wanted)
+    filled = {"settings_digest": digest(resolved_settings(wanted))}
+    if wanted.device != "cpu":
+        registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
+    paths = _encoders(wanted, encoder)
+    names = {"encoder": "latents", "codes": "codes"}
+    filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
+    whole = protocol(task, preset, **{**changes, **filled})
+    rests_on_others = any(map(_rests_on_others, whole.agents))
+    if found is not None:
+        paths = {**paths, "dataset": found.folder.resolve()}
+    if encoder or whole.dataset or whole.after or whole.demonstrations or whole.queries or rests_on_others:
+        _check_abilities(whole, paths)
+    return whole, paths
+
+
+def _require_sound(wanted: Protocol) -> None:
+    """Raise InvalidValueError for a package's task whose rules, frames or environment would end every run or report."""
+    spec = registry.task(wanted.task)
+    try:
+        spec.facts()
+        frame = spec.render_macrostates(
+            np.array(states_of(spec.rules)[:1]), wanted.appearance, np.random.default_rng(0)
+        )
+        seen = [("render_macrostates", frame[0])]
+        with closing(make_env(wanted, wanted.task)) as env:
+            first = env.reset(seed=0)[0]
+        if wanted.shows_frames_alone:
+            seen.append(("its environment", first))
+        elif set(first) != set(wanted.observation.split(",")):
+            raise InvalidValueError(f"its environment shows {brief(first)}, not {wanted.observation}")
+        for what, each in seen:
+            if (each.shape, each.dtype) != ((64, 64, 3), np.uint8):
+                raise InvalidValueError(f"{what} gives frames of {each.dtype} and shape {each.shape}")
+    except Exception as error:  # whatever a guest does wrong is one sentence
+        why = " ".join(plain(error).split()).rstrip(".")
+        more = f"'imagine-bench check --task {wanted.task}' says more"
+        raise InvalidValueError(f"Task {wanted.task} cannot be run: {why}. {more}.") from error
+
+
+def _rests_on_others(agent: str) -> bool:
+    """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
+    return registry.agent_entry(agent).external_training_loop or entrant(agent).agent not in registry.AGENTS
+
+
+def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
+    """Build every learner once, to see whether it can use its encoder and do what only some can."""
+    for agent in wanted.agents:
+        entry = registry.agent_entry(agent)
+        if entry.learns:
+            encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
+            spec = RunSpec(protocol=wanted, agent=agent, seed=wanted.seeds[0], encoder=encoder)
+            require_able(registry.make_agent(agent, spec.context()), agent, wanted)
+
+
+def resolved_settings(wanted: Protocol) -> dict[str, Any]:
+    """All settings of every learner by its name, each override checked by the agents that have such a setting.
+
+    Raises:
+        UnknownNameError: No agent of the protocol has it.
+        InvalidValueError: A value of the wrong type or out of its range.
+    """
+    overrides = dict(wanted.overrides)
+    known = {name for agent in wanted.agents for name in registry.setting_names(agent)} if overrides else set()
+    for name in overrides:
+        if name not in known:
+            raise UnknownNameError("setting", name, sorted(known))
+    name, group = wanted.hyperparameters, wanted.config_group
+    found = {agent: registry.settings(agent, name, overrides, group) for agent in wanted.agents}
+    return {agent: dataclasses.asdict(found[agent]) for agent in wanted.agents if registry.agent_entry(agent).learns}
+
+
+def _encoders(wanted: Protocol, given: str | None) -> Encoders:
+    """The artefact of each kind that an agent needs; a given one is there whether or not any does."""
+    entries = [registry.agent_entry(agent) for agent in wanted.agents]
+    needed = {entry.encoder_kind for entry in entries if entry.needs_encoder}
+    spec = registry.task(wanted.task)
+    if given is None:
+        return {kind: encoders.own(spec, wanted.appearance, kind) for kind in sorted(needed)}
+    path = encoders.resolve(spec, wanted.appearance, given)
+    kind = encoders.kind(path)
+    if needed and kind == "latents" and kind not in needed:
+        raise InvalidValueError(
+            f"No agent of this bench reads the latents that encoder {path.stem!r} gives; give one made with "
+            "'imagine-bench encoder --recipe codes', or leave --encoder out."
+        )
+    replaced = needed | {kind} if kind == "codes" else {kind}
+    own = {other: encoders.own(spec, wanted.appearance, other) for other in sorted(needed - replaced)}
+    return {**own, **dict.fromkeys(sorted(replaced), path)}
+
+
+def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
+    """Do a run, looked at by every registered observer; see :func:`.runner.run`."""
+    *askers, recorder = registry.OBSERVERS
+    names = [*askers, recorder] if spec.protocol.shows_frames_alone else [recorder]  # the others ask with frames
+    return runner.run(spec, folder, on_progress, [registry.load(name)() for name in names])
+
+
+CONTROL = TaskType(
+    tasks=registry.tasks, learners=registry.agents, draws=True, protocol=Protocol, presets=PRESETS, plan=plan_control,
+    run=run_observed, load_run=run_folder.load_run, load_so_far=load_so_far, result=BenchResult,
+)  # fmt: skip

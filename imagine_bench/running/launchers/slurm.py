@@ -1,0 +1,120 @@
+"""The same runs as jobs of a Slurm cluster, by submitit; where there is no Slurm, as plain processes of this machine.
+
+The folder of the bench must be on a file system that all nodes share. Jobs ask for one core each; account, partition
+and time limit are what sbatch's own variables say, such as ``SBATCH_PARTITION``. A job that is preempted or reaches its
+limit is queued again and goes on from its run's last checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import lacking
+from imagine_bench.protocols.runs import OnProgress, Progress
+from imagine_bench.running.launchers.jobs import ONE_THREAD, Failure, Job, absolute, carry_out, require_workers
+from imagine_bench.store.files import make_folder, write_bytes
+
+_POLL_S = 1.0
+_LIMIT_MIN = 24 * 60
+"""Where ``SBATCH_TIMELIMIT`` says nothing."""
+_LOST = 1000
+"""Times that a job may reach its limit before its run counts as failed."""
+
+
+class SlurmCluster:
+    """``workers`` jobs in Slurm's queue at a time, at least 1.
+
+    Raises:
+        InvalidValueError: Fewer than one worker.
+        SetupError: submitit is not installed.
+    """
+
+    def __init__(self, workers: int) -> None:
+        require_workers(workers)
+        try:
+            import submitit  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise lacking("submitit") from error
+        self._workers, self._submitit = workers, submitit
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job, in order; those in the queue are cancelled when this is interrupted."""
+        waiting, failures = [absolute(job) for job in jobs][::-1], []
+        queued: dict[Any, Job] = {}
+        try:
+            while waiting or queued:
+                while waiting and len(queued) < self._workers:
+                    job = waiting.pop()
+                    queued[self._submit(job)] = job
+                time.sleep(_POLL_S)
+                for ticket, job in list(queued.items()):
+                    news = _latest(job)
+                    if news is not None:
+                        on_progress(news)
+                    if ticket.done():
+                        del queued[ticket]
+                        failure = Failure(job=job, reason=_reason(ticket))
+                        if failure.reason:
+                            failures.append(failure)
+                            on_progress(failure.progress)
+        finally:
+            for ticket in queued:
+                ticket.cancel()
+        return tuple(failures)
+
+    def _submit(self, job: Job) -> Any:
+        news = _news(job)
+        news.unlink(missing_ok=True)
+        executor = self._submitit.AutoExecutor(folder=make_folder(news.parent), slurm_max_num_timeout=_LOST)
+        executor.update_parameters(
+            name=f"{job.spec.agent}-{job.spec.seed}", cpus_per_task=1, timeout_min=_LIMIT_MIN,
+            gpus_per_node=int(job.spec.protocol.device == "cuda"),
+            slurm_setup=[f"export {name}={value}" for name, value in ONE_THREAD.items()],
+        )  # fmt: skip
+        return executor.submit(_Work(), job)
+
+
+class _Work:
+    """What a node does with a job; submitit asks it what to queue when the job must stop."""
+
+    def __call__(self, job: Job) -> str:
+        os.environ.update(ONE_THREAD)
+        return carry_out(job, lambda progress: _tell(job, progress))
+
+    def checkpoint(self, job: Job) -> Any:
+        import submitit  # noqa: PLC0415 - as above
+
+        return submitit.helpers.DelayedSubmission(self, job)
+
+
+def _news(job: Job) -> Path:
+    """Where a node leaves how far it is."""
+    return job.folder.parent / "slurm" / f"{job.folder.name}.json"
+
+
+def _tell(job: Job, progress: Progress) -> None:
+    write_bytes(_news(job), json.dumps(dataclasses.asdict(progress)).encode())
+
+
+def _latest(job: Job) -> Progress | None:
+    with suppress(OSError):  # not begun
+        return Progress(**json.loads(_news(job).read_bytes()))
+    return None
+
+
+def _reason(ticket: Any) -> str:
+    """Why an ended job's run failed, or an empty string."""
+    try:
+        reason: str = ticket.result()
+    except Exception as error:  # whatever submitit raises for a job that was killed or could not begin
+        return (
+            f"Slurm job {ticket.job_id} ended early ({str(error).strip().splitlines()[-1]}); see {ticket.paths.stderr}"
+        )
+    return reason

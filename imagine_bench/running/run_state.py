@@ -1,0 +1,175 @@
+"""A run that goes on: its agent, environment and counters, how they are saved, and how far it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from imagine_bench import registry
+from imagine_bench.data.folder import read_dataset
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import OBSERVATIONS, Agent
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
+from imagine_bench.running.evaluation import ByName, Env, StartsFrom
+from imagine_bench.running.queries import Teacher, demonstrator, require_able
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.checkpoints import load_newest, save_snapshot, sweep_partial
+from imagine_bench.store.counters import Counters
+from imagine_bench.store.files import reading, sweep, writing
+
+_RECENT = 100
+"""Training episodes whose success is shown while running."""
+_REPORT_EVERY_S = 0.25
+
+
+def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
+    """The environment of a task as a protocol has it, for training or for tests; ``options`` replace what it has."""
+    env = gymnasium.make(
+        registry.task_entry(task).env_id,
+        **{**protocol.world, **options},
+        appearance=protocol.appearance_in_tests if testing else protocol.appearance,
+        disable_env_checker=True,  # the tests run it; here it would only cost time
+    )
+    if protocol.observation in OBSERVATIONS[1:]:
+        env = ByName(env, protocol.observation)
+    if protocol.split is None or task != protocol.task:
+        return env
+    return StartsFrom(env, protocol.spec(testing=testing).rules.start_states)
+
+
+@contextmanager
+def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]]:
+    """The environments of training and of tests; one and the same unless tests have looks or starts of their own."""
+    with closing(make_env(protocol, protocol.task, **options)) as env:
+        if protocol.appearance_in_tests == protocol.appearance and protocol.split is None:
+            yield env, env
+            return
+        with closing(make_env(protocol, protocol.task, testing=True, **options)) as test_env:
+            yield env, test_env
+
+
+class Run:
+    """A run as far as it has come: a new one, or what the newest checkpoint in its folder holds.
+
+    Raises:
+        ArtefactError: The folder was begun with something else, or the encoder is not the protocol's.
+        InvalidValueError: The agent cannot do what the protocol asks of it.
+    """
+
+    def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:
+        self.spec, self.protocol, self.folder = spec, spec.protocol, folder
+        self.env, self.test_env = env, test_env
+        self.task, self.entry = registry.task(spec.protocol.task), registry.agent_entry(spec.agent)
+        self._require_its_encoder()
+        self.dataset = self._its_dataset() if self.entry.learns else None
+        self.agent: Agent = registry.make_agent(spec.agent, spec.context())
+        if self.entry.learns:
+            require_able(self.agent, spec.agent, spec.protocol)
+        wanted = self.protocol
+        self.teacher = Teacher(self.task.rules, wanted.feedback, wanted.feedback_error) if wanted.feedback else None
+        self.counters = Counters()
+        self._on_progress = on_progress
+        with writing(folder):
+            sweep(folder)
+            sweep_partial(folder / "checkpoints")
+        run_folder.check_config(folder, self._config())
+        if self.entry.external_training_loop:
+            run_folder.forget(folder)  # an earlier attempt cannot be gone on with
+        snapshot = load_newest(folder / "checkpoints")
+        if snapshot is not None:
+            with reading(folder / "checkpoints", f"a checkpoint of {spec.agent!r}"):
+                self.agent.restore(snapshot.agent)
+                self.counters = Counters.of(snapshot)
+            if self.counters.rows:  # a kill between a test's checkpoint and its table would leave the table behind
+                run_folder.write_metrics(folder, self.counters.rows)
+        self._saved_s = self._reported_s = time.monotonic()
+
+    def _require_its_encoder(self) -> None:
+        """Refuse another file than the protocol's, such as an older one on another node, or one changed since."""
+        wanted = self.protocol.encoder_of(self.entry.encoder_kind) if self.entry.needs_encoder else None
+        if wanted is not None and self.spec.encoder is not None:
+            found = encoders.identity(self.spec.encoder)
+            if found != wanted:
+                raise ArtefactError(f"{self.spec.encoder} is encoder {found}, and this bench is of {wanted}.")
+
+    def _its_dataset(self) -> Episodes | None:
+        """The protocol's dataset, if it has one; ArtefactError for another, such as one that changed since."""
+        if self.protocol.dataset is None or self.spec.dataset is None:
+            return None
+        found = read_dataset(self.spec.dataset)
+        if found.identity != self.protocol.dataset:
+            raise ArtefactError(
+                f"{self.spec.dataset} is dataset {found.identity}, and this bench is of {self.protocol.dataset}."
+            )
+        return found.episodes
+
+    def _config(self) -> Mapping[str, Any]:
+        settings = getattr(self.agent, "settings", None)
+        return {
+            "protocol": self.protocol.as_dict(),
+            "protocol_hash": self.protocol.hash,
+            "agent": self.protocol.written_name(self.spec.agent),
+            "seed": self.spec.seed,
+            "settings": {} if settings is None else dataclasses.asdict(settings),
+        }
+
+    @cached_property
+    def demonstrator(self) -> Agent:
+        """See :func:`.queries.demonstrator`; it holds nothing from one episode to the next."""
+        return demonstrator(self.spec)
+
+    @property
+    def budgets_left(self) -> tuple[int, ...]:
+        """Budgets to come before the run pauses or ends."""
+        until = self.spec.until
+        budgets = [budget for budget in self.protocol.budgets if until is None or budget <= until]
+        return tuple(budgets[len(self.counters.rows) :])
+
+    @contextmanager
+    def training_time(self) -> Iterator[None]:
+        """Count the CPU seconds of the block as training."""
+        start_s = time.process_time()
+        yield
+        self.counters.train_cpu_s += time.process_time() - start_s
+
+    def made_progress(self, phase: Phase) -> None:
+        """Tell how far the run is and save it, each if the last time is long enough ago."""
+        self.tell(phase)
+        if time.monotonic() - self._saved_s >= self.spec.checkpoint_every_s:
+            self.save()
+
+    def save(self, folder: str = "checkpoints") -> Path:
+        """Save everything that is needed to go on; returns where it lies."""
+        where = save_snapshot(self.folder / folder, self.counters.snapshot(self.agent.state()))
+        self._saved_s = time.monotonic()
+        return where
+
+    def tell(self, phase: Phase, *, at_once: bool = False) -> None:
+        """Tell how far the run is, unless it was told a moment ago."""
+        now_s = time.monotonic()
+        if not at_once and now_s - self._reported_s < _REPORT_EVERY_S:
+            return
+        self._reported_s = now_s
+        counters, test = self.counters, self.counters.test
+        tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
+        played = counters.before + counters.episode + tested * self.protocol.evaluation_episodes
+        recent = counters.success[-_RECENT:]
+        if test is not None and test.episodes:
+            success: float | None = test.successes / test.episodes
+        else:
+            success = sum(recent) / len(recent) if recent else None
+        spec, done, episode = self.spec, played + (test.episodes if test else 0), counters.episode
+        where = Progress(
+            agent=spec.agent, seed=spec.seed, bench=self.protocol.hash, phase=phase, done=done, work=spec.work,
+            episode=episode, success=success,
+        )  # fmt: skip
+        self._on_progress(where)

@@ -1,0 +1,7 @@
+"""The version of this package, and where it is installed."""
+
+from pathlib import Path
+
+__version__ = "0.1.0"
+PACKAGE_FOLDER = Path(__file__).parent
+"""The folder ``imagine_bench``; in a checkout its parent is the top folder."""

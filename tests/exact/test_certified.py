@@ -1,0 +1,74 @@
+"""A bench keeps the certificate of its world, and starts where its split says."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import time
+
+import numpy as np
+import pytest
+from small_runs import Inline, small
+
+from imagine_bench import registry
+from imagine_bench.errors import ArtefactError
+from imagine_bench.exact.certificate import certificate
+from imagine_bench.exact.splits import split_of
+from imagine_bench.report import write_report
+from imagine_bench.report.data import collect
+from imagine_bench.running.bench import bench
+from imagine_bench.store.archive import archive_files, load_archive
+from imagine_bench.store.bench_folder import load_bench
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    wanted = small(agents=("table",), split="plan_length=2")
+    return bench(wanted, {}, root=tmp_path_factory.mktemp("runs"), launcher=Inline())
+
+
+def test_training_and_tests_start_where_the_split_says(result):
+    split = split_of(registry.task("arrow_puzzle").rules, "plan_length=2")
+    (run,) = result.runs
+    trained = {tuple(start) for start in run.training_starts.tolist()}
+    tested = {tuple(start) for row in run.checkpoints for start in row.kept.starts.tolist()}
+    assert trained and trained <= set(split.train)
+    assert tested and tested <= set(split.test)
+    assert result.protocol.split == split.identity
+
+
+def test_the_certificate_is_that_of_the_tests_starts(result):
+    spec = result.protocol.spec(testing=True)
+    assert result.certificate == certificate(spec) != certificate(registry.task("arrow_puzzle"))
+    assert min(length for length, _ in result.certificate.plan_lengths) == 3
+    facts = collect(result).facts
+    assert facts.mean_plan_length == np.average([3, 4, 5], weights=[12, 12, 6])
+    assert (facts.chance_level, facts.optimum) == (result.certificate.chance_level, 1.0)
+    assert facts.chance_level < registry.task("arrow_puzzle").facts().chance_level
+
+
+def test_it_is_read_back_and_drawn(result, tmp_path, monkeypatch):
+    monkeypatch.delattr("imagine_bench.store.bench_folder.certificate")  # nothing is computed again
+    assert load_bench(result.folder).certificate == result.certificate
+    page = write_report(dataclasses.replace(result, folder=tmp_path)).read_text()
+    assert "The world" in page and 'id="certificate"' in page and "12 of them starts" not in page
+    for name, text in archive_files(result).items():
+        (tmp_path / name).write_text(text)
+    assert load_archive(tmp_path).certificate == result.certificate
+
+
+def test_a_damaged_certificate_is_named(result, tmp_path):
+    folder = shutil.copytree(result.folder, tmp_path / result.folder.name)
+    path = folder / "certificate.json"
+    path.write_text(path.read_text().replace('"optimum": 1.0', '"optimum": 0.5'))
+    with pytest.raises(ArtefactError, match=r"certificate\.json is damaged"):
+        load_bench(folder)
+
+
+def test_a_learner_that_has_seen_all_that_is_unsure_plans_again():
+    """Of the clockwise puzzle some conditions are never told apart: all points that they decide are seen instead."""
+    started_s = time.process_time()
+    found = certificate(registry.task("arrow_puzzle_clockwise"))
+    assert found.floor is not None and found.optimum == 1.0
+    assert 56 < found.floor.transitions < found.macrostates * 6  # facts; all that a table could need
+    assert time.process_time() - started_s < 30.0

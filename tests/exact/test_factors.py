@@ -1,0 +1,105 @@
+"""The factor graph against the structure that machines were built with, and the floor against what can be counted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from machines import Wheels, spec_of
+
+from imagine_bench import registry
+from imagine_bench.exact.certificate import certificate, certificate_rows
+from imagine_bench.exact.factors import factor_graph
+from imagine_bench.exact.floor import learn
+from imagine_bench.exact.machine import machine
+
+
+def test_the_thesis_puzzle_has_39_facts():
+    """24 of what a turn does, 12 forbidden pairs, 3 goals: counted by hand."""
+    found = certificate(registry.task("arrow_puzzle"))
+    assert (found.facts, found.width, found.macrostates, found.starts) == (39, 2, 165, 54)
+    assert found.plan_lengths == ((1, 12), (2, 12), (3, 12), (4, 12), (5, 6))
+    assert {children == parents for _, children, parents in found.dynamics} == {True}
+    assert [what for what, _ in found.outcomes] == ["-5, end", "+50, success", "-1"]
+    assert 39 / 3 < found.floor.transitions < 234  # less than the pairs that a table needs
+    json.dumps(dataclasses.asdict(found))
+
+
+@pytest.mark.parametrize(
+    ("dials", "facts"),
+    [
+        ({}, 3 * 2 * 4 + 2 * 4 + 3),
+        ({"forbid": False}, 3 * 2 * 4 + 3),
+        ({"slip": 0.1}, 3 * 2 * 4 + 2 * 4 + 3),
+        ({"slip": 0.1, "fickle": 0.2}, 3 * 2 * 4 + 6 * 3 + 2 * 4 + 3),
+        ({"n": 6}, 6 * 2 * 4 + 5 * 4 + 6),
+    ],
+    ids=str,
+)
+def test_facts_are_those_that_the_machine_was_built_of(dials, facts):
+    graph = factor_graph(machine(Wheels(**dials)))
+    assert (graph.facts, graph.width, graph.read) == (facts, 2, "next")
+    assert all(factor.children == factor.parents for factor in graph.factors)
+
+
+class _Coupled(Wheels):
+    """A turn takes the next wheel along, or neither moves: they are drawn together."""
+
+    def outcomes(self, state, action):
+        found = []
+        for outcome in super().outcomes(state, action):
+            wheel = action // 2
+            if outcome.macrostate[:-1] == state[:-1]:
+                found.append(outcome)
+            else:
+                after, next_ = list(outcome.macrostate), (wheel + 1) % self.n
+                after[next_] = (after[next_] + 1) % 4
+                found.append(self.judge(state, action, tuple(after), outcome.probability))
+        return tuple(found)
+
+
+def test_what_is_drawn_together_is_one_factor():
+    graph = factor_graph(machine(_Coupled(slip=0.3, forbid=False)))
+    assert {(f.action, f.children, f.parents) for f in graph.factors if f.action < 2} == {
+        (0, (0, 1), (0, 1)),
+        (1, (0, 1), (0, 1)),
+    }
+    sure = factor_graph(machine(_Coupled(forbid=False)))
+    assert [f.children for f in sure.factors if f.action == 0] == [(0,), (1,)]
+
+
+@pytest.mark.parametrize("dials", [{}, {"slip": 0.3}, {"fickle": 0.3}], ids=str)
+def test_a_learner_that_is_done_has_seen_what_it_needs(dials):
+    """A transition shows at most one entry of the dynamics a wheel, so that there is a bound from below."""
+    rules = Wheels(**dials)
+    full = machine(rules)
+    graph = factor_graph(full)
+    lessons = [learn(full, graph, 12, np.random.default_rng(seed)) for seed in range(3)]
+    assert all(lesson.done and lesson.facts <= graph.facts for lesson in lessons)
+    assert all(lesson.episodes <= lesson.transitions for lesson in lessons)
+    assert min(lesson.transitions for lesson in lessons) >= 24 * 0.7
+    again = learn(full, graph, 12, np.random.default_rng(0))
+    assert again == lessons[0]
+
+
+def test_a_world_without_a_plan_says_so():
+    class Hopeless(Wheels):
+        def judge(self, state, action, reached, share=1.0):
+            return dataclasses.replace(super().judge(state, action, reached, share), success=False)
+
+    found = certificate(spec_of(Hopeless(n=2), 5))
+    assert found.floor is None and found.optimum == 0.0
+    assert certificate_rows(found)["shortest plans"] == "none; none from 18 starts"
+
+
+@pytest.mark.slow
+def test_a_certificate_of_24_576_macrostates_takes_seconds():
+    """30 CPU s and 1 GB are allowed."""
+    import time
+
+    start_s = time.process_time()
+    found = certificate(spec_of(Wheels(n=6, forbid=False), 20))
+    assert time.process_time() - start_s < 30.0
+    assert (found.macrostates, found.width, found.optimum) == (24_576, 2, 1.0)

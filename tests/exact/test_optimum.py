@@ -1,0 +1,218 @@
+"""Optima with and without memory against brute force over histories and policies, and against simulated episodes."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from episodes import EPISODES, arrays_of_rules, simulated, solved, solved_as_a_flow
+from machines import Glimpse, Wheels, spec_of
+
+from imagine_bench import registry
+from imagine_bench.exact.beliefs import OptimalPolicy
+from imagine_bench.exact.certificate import certificate
+from imagine_bench.exact.memoryless import best_without_memory
+from imagine_bench.interfaces import Outcome
+from imagine_bench.rules import evaluate, greedy, optimal_policy, states_of, tabulate
+
+WORLDS = {
+    "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
+    "first": (Wheels(n=2, fickle=0.3), Glimpse(finger="first"), 3),
+    "first, sure": (Wheels(n=2), Glimpse(finger="first"), 3),
+    "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 3),
+    "lag 1": (Wheels(n=2, slip=0.3), Glimpse(lag=1), 4),
+    "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 4),
+    "lag 1, half": (Wheels(n=2, fickle=0.2), Glimpse(finger=0.5, lag=1), 3),
+}
+ALL = pytest.mark.parametrize(("rules", "sight", "horizon"), WORLDS.values(), ids=list(WORLDS))
+
+
+def _best_over_histories(rules, sight, horizon):
+    """Expectimax over what was shown: whole trajectories of macrostates are kept, nothing is merged."""
+
+    def best(trajectories, step):
+        if step == horizon:
+            return 0.0
+        values = []
+        for action in range(rules.n_actions):
+            won, groups = 0.0, defaultdict(list)
+            for states, weight in trajectories:
+                for o in rules.outcomes(states[-1], action):
+                    if o.terminated:
+                        won += weight * o.probability * o.success
+                        continue
+                    longer = (*states, o.macrostate)
+                    frame = max(0, step + 1 - sight.lag)
+                    # the frame of the start was seen before; after that each frame is one draw
+                    shown = ((1.0, None),) if step + 1 - sight.lag < 1 else sight.seen(longer[frame], frame)
+                    for share, what in shown:
+                        groups[what].append((longer, weight * o.probability * share))
+            values.append(won + sum(best(group, step + 1) for group in groups.values()))
+        return max(values)
+
+    groups = defaultdict(list)
+    for start in rules.start_states:
+        for share, what in sight.seen(start, 0):
+            groups[what].append(((start,), share / len(rules.start_states)))
+    return sum(best(group, 0) for group in groups.values())
+
+
+@ALL
+def test_the_optimum_with_memory_is_that_of_all_histories(rules, sight, horizon):
+    found = certificate(spec_of(rules, horizon, sight))
+    assert found.optimum == pytest.approx(_best_over_histories(rules, sight, horizon), abs=1e-9)
+    assert found.chance_level <= found.memoryless <= found.memoryless_bound <= found.optimum + 1e-9
+    assert found.optimum <= found.seen_optimum + 1e-9
+
+
+def _play(rules, sight, horizon, act, rng):
+    """One simulated episode; whether it succeeds. ``act`` is given what is shown, and how many actions were done."""
+    state = rules.start_states[rng.integers(len(rules.start_states))]
+    frames = []
+    for step in range(horizon):
+        shares, shown = zip(*sight.seen(state, step), strict=True)
+        frames.append(shown[rng.choice(len(shown), p=shares)])
+        outcomes = rules.outcomes(state, act(frames[max(0, step - sight.lag)], step))
+        outcome = outcomes[rng.choice(len(outcomes), p=[o.probability for o in outcomes])]
+        if outcome.terminated:
+            return outcome.success
+        state = outcome.macrostate
+    return False
+
+
+@ALL
+def test_the_oracle_reaches_the_optimum_from_what_it_sees(rules, sight, horizon):
+    found, oracle = certificate(spec_of(rules, horizon, sight)), OptimalPolicy(rules, sight, horizon)
+    rng, n = np.random.default_rng(0), 2_000
+    share = np.mean([_play(rules, sight, horizon, oracle, rng) for _ in range(n)])
+    p = found.optimum
+    assert abs(share - p) < 4 * np.sqrt(max(p * (1 - p), 1e-3) / n)
+
+
+SOLVED = [
+    "arrow_puzzle",
+    "arrow_puzzle_hard",
+    "arrows:cubes=2,coupling=neighbour,slip=0.3",
+    "pick_place",
+    "pick_place:slip=0.2,fickle=0.4",
+]
+
+
+@pytest.mark.parametrize("name", SOLVED)
+def test_chance_and_optimum_agree_with_100_000_episodes(name):
+    """And with another solver; worlds of arrows also by other rules, in their own tests."""
+    spec = registry.task(name)
+    found, world = spec.facts(), arrays_of_rules(spec.rules)
+    optimum, chance, policy = solved(world, spec.horizon)
+    assert (found.optimum, found.chance_level) == pytest.approx((optimum, chance), abs=1e-9)
+    for expected, how in ((found.chance_level, None), (found.optimum, policy)):
+        limit = 4 * np.sqrt(expected * (1 - expected) / EPISODES) + 1e-5
+        assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
+
+
+@pytest.mark.parametrize("name", ["arrow_puzzle:fickle=0.3,horizon=4", "arrows:cubes=2,fickle=0.5,slip=0.1,horizon=3"])
+def test_the_optimum_is_that_of_a_linear_programme(name):
+    """Where haste pays, so that a policy must count actions: what is best for return is not best within the horizon."""
+    spec = registry.task(name)
+    flow = solved_as_a_flow(arrays_of_rules(spec.rules), spec.horizon)
+    assert spec.facts().optimum == pytest.approx(flow, abs=1e-7) == certificate(spec).optimum
+    tables = tabulate(spec.rules)
+    stationary = evaluate(tables, greedy(optimal_policy(tables), spec.n_actions), spec.horizon)
+    assert stationary.success[tables.starts].mean() < flow - 1e-3
+
+
+@dataclass(frozen=True)
+class _Corridor:
+    """Five rooms in a row; the way out is behind the left one, a trap behind the right one, and one starts between."""
+
+    slip: float = 0.0  #: one goes the other way
+
+    n_actions, states, start_states = 2, None, ((1,), (2,), (3,))
+
+    def outcomes(self, state, action):
+        found = []
+        for share, way in ((1 - self.slip, action), (self.slip, 1 - action)):
+            to = state[0] + (1 if way else -1)
+            done, lost = to < 0, to > 4
+            if share:
+                found.append(Outcome(share, (max(0, min(to, 4)),), float(done), terminated=done or lost, success=done))
+        return tuple(found)
+
+    def is_terminal(self, state):
+        return False
+
+
+class _Wall:
+    """Only the end rooms can be told."""
+
+    lag = 0
+
+    def seen(self, macrostate, step):
+        return ((1.0, (macrostate[0] if macrostate[0] in (0, 4) else -1,)),)
+
+
+class _Lit:
+    """Every room is seen, but late."""
+
+    lag = 1
+
+    def seen(self, macrostate, step):
+        return ((1.0, macrostate),)
+
+
+TINY = {
+    "walls": (_Corridor(), _Wall(), 5),
+    "late": (_Corridor(), _Lit(), 4),
+    "slipping": (_Corridor(slip=0.2), _Wall(), 6),
+    "wheel": (Wheels(n=1, slip=0.3), Glimpse(finger=0.5, lag=1), 3),
+}
+
+
+@pytest.mark.parametrize(("rules", "sight", "horizon"), TINY.values(), ids=list(TINY))
+def test_without_memory_no_policy_of_all_is_better(rules, sight, horizon):
+    found = best_without_memory(rules, sight, horizon, bound=1.0)
+    things = sorted({what for s in states_of(rules) for step in (0, 9) for _, what in sight.seen(s, step)})
+    policies = itertools.product(range(rules.n_actions), repeat=len(things))
+    best = max(_value(rules, sight, horizon, dict(zip(things, policy, strict=True))) for policy in policies)
+    assert found.value == pytest.approx(best, abs=1e-9)
+    assert found.bound == pytest.approx(best, abs=1e-6)
+
+
+def _value(rules, sight, horizon, policy):
+    """Success of a policy without memory, by recursion over all that may happen."""
+
+    def from_here(states, shown, step):
+        if step == horizon:
+            return 0.0
+        value = 0.0
+        for o in rules.outcomes(states[-1], policy[shown]):
+            longer, frame = (*states, o.macrostate), step + 1 - sight.lag
+            if o.terminated:
+                value += o.probability * o.success
+            elif frame < 1:
+                value += o.probability * from_here(longer, shown, step + 1)
+            else:
+                frames = sight.seen(longer[frame], frame)
+                value += o.probability * sum(share * from_here(longer, what, step + 1) for share, what in frames)
+        return value
+
+    starts = rules.start_states
+    return sum(q * from_here((s,), what, 0) for s in starts for q, what in sight.seen(s, 0)) / len(starts)
+
+
+def test_what_needs_no_memory_is_said_of_the_thesis_puzzle():
+    """A walk round the legal arrangements passes a goal within ten turns, whoever was pointed at."""
+    spec = registry.task("arrow_puzzle")
+    found = best_without_memory(spec.rules, Glimpse(finger="first"), spec.horizon, bound=1.0)
+    assert found.value == pytest.approx(1.0)
+    short = best_without_memory(spec.rules, Glimpse(finger="first"), 5, bound=1.0)
+    assert short.value < 0.95
+
+
+def test_too_many_beliefs_leave_a_bound_and_say_so(monkeypatch):
+    monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 5)
+    found = certificate(spec_of(Wheels(n=2, fickle=0.3), 3, Glimpse(finger="first")))
+    assert found.beliefs is None and found.optimum == found.seen_optimum

@@ -1,0 +1,80 @@
+"""The registered oracle in real environments against the optimum that the world's certificate states."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import gymnasium
+import numpy as np
+import pytest
+
+import imagine_bench  # noqa: F401  (registers the environments)
+from imagine_bench import registry
+from imagine_bench.exact.beliefs import BeliefRules, OptimalPolicy, optimal_policy_of
+from imagine_bench.exact.certificate import optimum
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.running.evaluation import play
+from imagine_bench.seeding import SeedTree
+
+EPISODES = 120
+WORLDS = (
+    "arrows:forbid=none,lag=1",
+    "arrows:slip=0.4,horizon=4",
+    "arrows:fickle=0.5,horizon=4",
+    "pick_place:gesture=0.5",
+    "pick_place:slip=0.2",
+)
+
+
+def _oracle(spec):
+    context = AgentContext(
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=None, seeds=SeedTree(0),
+        optimal_policy=optimal_policy_of(spec),
+    )  # fmt: skip
+    return registry.make_agent("oracle", context)
+
+
+def _successes(spec, agent, episodes):
+    entry = registry.task_entry(spec.id)
+    with closing(gymnasium.make(entry.env_id, execution="kinematic", disable_env_checker=True)) as env:
+        for index in range(episodes):
+            *_, (_, info) = play(env, agent, seed=1000 + index, explore=False, privileged=True)
+            yield bool(info["is_success"])
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_oracle_reaches_what_the_certificate_says(name):
+    spec = registry.task(name)
+    p = optimum(spec)
+    share = np.mean(list(_successes(spec, _oracle(spec), EPISODES)))
+    assert abs(share - p) <= 3.3 * np.sqrt(max(p * (1 - p), 1e-3) / EPISODES)
+
+
+@pytest.mark.parametrize("name", ["arrows:lag=2", "pick_place:gesture=0.5,lag=1"])
+def test_what_is_shown_is_possible_by_the_sight(name):
+    """Every episode's frames, late or hiding, are among those that the belief machine expects."""
+    spec, rng = registry.task(name), np.random.default_rng(3)
+    beliefs = BeliefRules(spec.rules, spec.sight, spec.rules.start_states, spec.horizon)
+    hidden = late = 0
+    with closing(gymnasium.make(spec.env_id, execution="kinematic", disable_env_checker=True)) as env:
+        for seed in range(20):
+            _, info = env.reset(seed=seed)
+            belief, over = beliefs.starts[tuple(info["shown"].tolist())][1], False
+            while not over:
+                action = int(rng.integers(spec.n_actions))
+                _, _, terminated, truncated, info = env.step(action)
+                over = terminated or truncated
+                shown = tuple(info["shown"].tolist())
+                hidden, late = hidden + (-1 in shown), late + (shown[:-1] != tuple(info["macrostate"].tolist())[:-1])
+                if not terminated:
+                    belief = beliefs.follow(belief, action, shown)
+                    assert belief is not None
+                    assert tuple(info["macrostate"].tolist()) in {windows[-1] for windows, _ in belief[1]}
+    assert late and (hidden or "gesture" not in name)
+
+
+def test_with_too_many_beliefs_it_votes(monkeypatch):
+    monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 3)
+    spec = registry.task("arrows:forbid=none,lag=1")
+    assert OptimalPolicy(spec.rules, spec.sight, spec.horizon)._rows == {}
+    assert all(_successes(spec, _oracle(spec), 20))  # it knows where it is, as nothing here is random

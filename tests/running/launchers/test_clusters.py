@@ -1,0 +1,188 @@
+"""Runs on a real Ray cluster and by submitit: the same bits as at home, also when they are cut off in the middle."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.running.launchers.jobs import LAUNCHERS, Job, absolute, launcher
+from imagine_bench.running.launchers.local import LocalPool
+from imagine_bench.running.launchers.ray import RayCluster
+from imagine_bench.running.launchers.slurm import SlurmCluster
+from imagine_bench.store import encoders
+from imagine_bench.store.run_folder import load_run
+
+needs_ray = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="Ray is an optional extra: pip install 'imagine-bench[ray]'"
+)
+
+
+def jobs(root: Path, seeds: tuple[int, ...], episodes: int) -> list[Job]:
+    """Small real learners that take a few seconds each and checkpoint often."""
+    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    wanted = protocol(
+        "arrow_puzzle", "smoke", agents=("dqn",), seeds=seeds, budgets=(episodes // 2, episodes),
+        evaluation_episodes=5, execution="kinematic", open_loop_starts=0, recorded_episodes=0,
+        overrides=(("controller.hidden", (32, 32)),), encoder=encoders.identity(encoder),
+    )  # fmt: skip
+    return [
+        Job(
+            spec=RunSpec(protocol=wanted, agent="dqn", seed=seed, encoder=encoder, checkpoint_every_s=0.2),
+            folder=root / f"seed_{seed}",
+        )
+        for seed in seeds
+    ]
+
+
+def results(root: Path, seeds: tuple[int, ...]) -> list[Any]:
+    """What the runs found, but for CPU times."""
+    found: list[Any] = []
+    for seed in seeds:
+        run = load_run(root / f"seed_{seed}")
+        rows = [dataclasses.replace(row, train_cpu_s=0.0, eval_cpu_s=0.0, diagnostics={}) for row in run.checkpoints]
+        losses = [row.diagnostics["loss/bellman"] for row in run.checkpoints]
+        found.append((rows, losses, run.training_success.tolist(), run.training_length.tolist()))
+    return found
+
+
+def test_launchers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(launcher("local", 1), LocalPool)
+    with pytest.raises(UnknownNameError, match=r"No launcher 'rey'. Did you mean 'ray'\? Known: local, ray, slurm"):
+        launcher("rey", 1)
+    with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
+        launcher("ray", 0)
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    for name, module in (("ray", "ray"), ("slurm", "submitit")):
+        with pytest.raises(SetupError, match=rf"needs {module}, .*: pip install 'imagine-bench\[{name}\]'"):
+            launcher(name, 1)
+    assert set(LAUNCHERS) == {"local", "ray", "slurm"}
+
+
+@pytest.mark.slow
+def test_submitted_jobs_give_the_same_bits_also_when_preempted(tmp_path: Path) -> None:
+    """submitit's executor for one machine, with the signal that Slurm sends before it takes a node away."""
+    told: list[Progress] = []
+    preempted: list[int] = []
+
+    def preempt(progress: Progress) -> None:
+        told.append(progress)
+        if progress.episode >= 20 and not preempted:
+            for child in psutil.Process().children(recursive=True):
+                if "submitit.core._submit" in " ".join(child.cmdline()):
+                    child.send_signal(signal.SIGUSR2)
+                    preempted.append(progress.episode)
+
+    assert SlurmCluster(1).launch(jobs(tmp_path / "slurm", (0,), 600), preempt) == ()
+    assert preempted and (tmp_path / "slurm" / "seed_0" / "log.txt").read_text().count("begins or goes on") == 2
+    assert LocalPool(1).launch(jobs(tmp_path / "home", (0,), 600), lambda _: None) == ()
+    assert results(tmp_path / "slurm", (0,)) == results(tmp_path / "home", (0,))
+    assert told[-1].phase == "done"
+
+
+def test_a_submitted_job_that_fails_says_why(tmp_path: Path) -> None:
+    (job,) = jobs(tmp_path, (0,), 60)
+    lost = dataclasses.replace(job, spec=dataclasses.replace(job.spec, encoder=tmp_path / "no.safetensors"))
+    (failure,) = SlurmCluster(1).launch([lost], lambda _: None)
+    assert "no.safetensors" in failure.reason and failure.job.spec.seed == 0
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_cluster_started_here_gives_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    assert LocalPool(1).launch(jobs(tmp_path / "home", (0,), 60), lambda _: None) == ()
+    told: list[Progress] = []
+    assert RayCluster(1).launch(jobs(tmp_path / "ray", (0,), 60), told.append) == ()
+    assert results(tmp_path / "ray", (0,)) == results(tmp_path / "home", (0,))
+    assert told and told[-1].phase == "done"
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two raylets; the second, with the runs on it, is killed outright, and a worker of the first by signal 9."""
+    from ray.cluster_utils import Cluster
+
+    seeds, episodes = (0, 1, 2), 240
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    doomed = cluster.add_node(num_cpus=2)
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    killed: dict[str, list[int]] = {"node": [], "worker": []}
+    begun: set[int] = set()
+
+    def kill(progress: Progress) -> None:
+        if progress.episode >= 20:
+            begun.add(progress.seed)
+        if len(begun) == len(seeds) and not killed["node"]:
+            killed["node"] = [progress.episode]
+            cluster.remove_node(doomed, allow_graceful=False)
+        elif killed["node"] and not killed["worker"] and progress.episode > killed["node"][0] + 40:
+            holder = (tmp_path / "ray" / f"seed_{progress.seed}" / ".lock").read_text()  # "process N on HOST"
+            os.kill(int(holder.split()[1]), signal.SIGKILL)
+            killed["worker"] = [progress.episode]
+
+    try:
+        assert RayCluster(1).launch(jobs(tmp_path / "ray", seeds, episodes), kill) == ()
+    finally:
+        cluster.shutdown()
+    assert killed["node"] and killed["worker"], "both must really have been killed in the middle"
+    begins = sum(
+        (tmp_path / "ray" / f"seed_{seed}" / "log.txt").read_text().count("begins or goes on") for seed in seeds
+    )
+    assert begins >= len(seeds) + 2, "the lost runs must have been started again"
+    assert LocalPool(2).launch(jobs(tmp_path / "home", seeds, episodes), lambda _: None) == ()
+    assert results(tmp_path / "ray", seeds) == results(tmp_path / "home", seeds)
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_cluster_without_a_gpu_does_not_wait_for_one_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "num_gpus": 0, "include_dashboard": False})
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    (here,) = jobs(tmp_path, (0,), 10)
+    spec = dataclasses.replace(here.spec, protocol=dataclasses.replace(here.spec.protocol, device="cuda"))
+    try:
+        with pytest.raises(SetupError, match="No node of the Ray cluster has a GPU for device 'cuda'"):
+            RayCluster(1).launch([dataclasses.replace(here, spec=spec)], lambda _: None)
+    finally:
+        cluster.shutdown()
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", f"{scheme}127.0.0.1:1")
+    with pytest.raises(SetupError, match=rf"No Ray cluster answers at RAY_ADDRESS={scheme}127\.0\.0\.1:1 "):
+        RayCluster(1).launch(jobs(tmp_path, (0,), 10), lambda _: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_paths_of_a_job_mean_the_same_on_every_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    wanted = protocol("arrow_puzzle", "smoke", agents=("dqn",))
+    spec = RunSpec(protocol=wanted, agent="dqn", seed=0, encoder=Path("e.safetensors"), dataset=Path("datasets/mixed"))
+    job = absolute(Job(spec=spec, folder=Path("runs/dqn/seed_0")))
+    assert (job.spec.encoder, job.spec.dataset) == (tmp_path / "e.safetensors", tmp_path / "datasets/mixed")
+    assert job.folder == tmp_path / "runs/dqn/seed_0"
+    assert absolute(dataclasses.replace(job, spec=dataclasses.replace(spec, dataset=None))).spec.dataset is None

@@ -1,0 +1,117 @@
+"""The local pool: every job is carried out or accounted for, and nothing outlives the parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from bench_fakes import FakeRunSpec
+from small_runs import small
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.protocols.runs import Progress
+from imagine_bench.running.launchers.jobs import Job
+from imagine_bench.running.launchers.local import LocalPool
+from imagine_bench.store import run_folder
+
+_HERE = Path(__file__).parents[2] / "fakes"
+
+
+def job(root: Path, agent: str, seed: int, **changes: object) -> Job:
+    spec = FakeRunSpec(protocol=small(agents=(agent,), seeds=(0, 1), **changes), agent=agent, seed=seed)
+    return Job(spec=spec, folder=root / agent / f"seed_{seed}")
+
+
+def test_a_failed_run_is_named_and_stops_no_other(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, "failing", 1), job(tmp_path, "failing", 0)]
+    told: list[Progress] = []
+    (failure,) = LocalPool(1).launch(jobs, told.append)
+    assert failure.job is jobs[0]
+    assert failure.reason == "RuntimeError: this agent breaks on purpose"
+    log = failure.job.log.read_text()
+    assert "failing seed 1 begins or goes on" in log and "Traceback" in log and "breaks on purpose" in log
+    assert not run_folder.is_done(jobs[0].folder) and run_folder.is_done(jobs[1].folder)
+    assert [progress.seed for progress in told if progress.phase == "done"] == [0]
+    assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
+        (1, failure.reason)
+    ]
+
+
+def test_a_process_that_is_killed_is_a_failure(tmp_path: Path) -> None:
+    victim = job(tmp_path, "table", 0, budgets=(100_000,))
+
+    told: list[Progress] = []
+
+    def kill(progress: Progress) -> None:
+        told.append(progress)
+        for child in psutil.Process().children():
+            if "spawn_main" in " ".join(child.cmdline()):
+                child.send_signal(signal.SIGKILL)
+
+    (failure,) = LocalPool(1).launch([victim], kill)
+    assert failure.reason == "its process was killed by SIGKILL (out of memory?)"
+    assert (told[-1].phase, told[-1].detail) == ("failed", failure.reason)
+
+
+def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) -> None:
+    def closed_screen(progress: Progress) -> None:
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        LocalPool(1).launch([job(tmp_path, "failing", 0)], closed_screen)
+
+
+def test_no_workers_are_refused() -> None:
+    with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
+        LocalPool(0)
+
+
+@pytest.fixture
+def busy_bench(tmp_path: Path) -> subprocess.Popen[str]:
+    """The command line with a run that would take minutes, once its worker has begun to train."""
+    words = "bench --task arrow_puzzle --preset smoke --agents table --budgets 100000 --execution kinematic --workers 1"
+    command = [sys.executable, str(_HERE / "bench_fakes.py"), *words.split(), "--out", str(tmp_path)]
+    heed = signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background may ignore Ctrl-C
+    bench = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    signal.signal(signal.SIGINT, heed)
+    deadline_s = time.monotonic() + 60
+    while not list(tmp_path.glob("*/*/table/seed_0/config.json")):
+        assert time.monotonic() < deadline_s and bench.poll() is None
+        time.sleep(0.05)
+    return bench
+
+
+def family(bench: subprocess.Popen[str]) -> list[psutil.Process]:
+    found = psutil.Process(bench.pid).children(recursive=True)
+    assert any("spawn_main" in " ".join(child.cmdline()) for child in found)
+    return found
+
+
+@pytest.mark.parametrize("to_all", [True, False])
+def test_ctrl_c_ends_everything_and_says_how_to_go_on(busy_bench: subprocess.Popen[str], to_all: bool) -> None:
+    """A terminal sends Ctrl-C to the whole process group; ``kill -INT`` to the parent alone."""
+    children = family(busy_bench)
+    if to_all:
+        os.killpg(busy_bench.pid, signal.SIGINT)
+    else:
+        busy_bench.send_signal(signal.SIGINT)
+    _, errors = busy_bench.communicate(timeout=60)
+    assert busy_bench.returncode == 130
+    assert "Traceback" not in errors
+    assert errors.splitlines()[-1] == (
+        "imagine-bench: interrupted; the same command goes on from the last checkpoints."
+    )
+    assert psutil.wait_procs(children, timeout=30)[1] == []
+
+
+def test_kill_9_of_the_parent_leaves_no_orphan(busy_bench: subprocess.Popen[str]) -> None:
+    children = family(busy_bench)
+    busy_bench.kill()
+    busy_bench.communicate(timeout=60)
+    assert psutil.wait_procs(children, timeout=30)[1] == []

@@ -1,0 +1,122 @@
+"""One agent with several settings in one bench, and worlds that a protocol changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+from small_runs import Inline, small
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.protocols.data import digest
+from imagine_bench.registry.entries import entrant, file_name
+from imagine_bench.report.figures import color
+from imagine_bench.report.page import summary_table
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.control import resolved_settings
+from imagine_bench.store.archive import archive_files, load_archive
+from imagine_bench.store.bench_folder import read_protocol
+from imagine_bench.store.merge import merge
+from imagine_bench.store.trained import load_trained
+
+SLOW = "dqn:controller.discount=0.99"
+_FEW = {"budgets": (2,), "evaluation_episodes": 3, "execution": "kinematic", "recorded_episodes": 0}
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "words"),
+    [
+        ("dqn", "dqn", ""),
+        ("dqn:b.y=1,a.x=[256, 256]", "dqn:a.x=[256,256],b.y=1", "x [256,256], y 1"),
+        ("dqn:a.x=0.990,b.x=current", "dqn:a.x=0.99,b.x=current", "a.x 0.99, b.x current"),
+        ('dqn:a.x="0.5",a.y=null', 'dqn:a.x="0.5",a.y=null', 'x "0.5", y null'),
+    ],
+)
+def test_an_entrant_has_one_name(text: str, name: str, words: str) -> None:
+    one = entrant(text)
+    assert (str(one), one.words) == (name, words) and entrant(name) == one
+
+
+@pytest.mark.parametrize("text", ["dqn:", "dqn:controller.discount", "dqn:a=1,a=2"])
+def test_settings_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(InvalidValueError, match=r"is not of the form name=value|twice"):
+        protocol("arrow_puzzle", agents=(text,))
+
+
+def test_folders_are_safe_and_differ() -> None:
+    names = ["dqn", SLOW, "a:x=[1,2]", "a:x=[1;2]", "a:x=" + "9" * 300, "a:x=" + "9" * 301, "a:x=../..", "a:x=a/b"]
+    folders = [file_name(name) for name in names]
+    assert folders[:2] == ["dqn", "dqn-controller.discount=0.99"] and len(set(folders)) == len(names)
+    assert all(len(each) < 120 and not set(each) & set('/\\:*?"<>|[] ') for each in folders)
+
+
+def test_an_entrants_settings_are_its_own_and_checked() -> None:
+    wanted = protocol("arrow_puzzle", agents=("dqn", SLOW), overrides=(("controller.discount", 0.5),))
+    found = resolved_settings(wanted)
+    assert found["dqn"]["controller"]["discount"] == 0.5 and found[SLOW]["controller"]["discount"] == 0.99
+    assert registry.agent_entry(SLOW).title == "DQN (discount 0.99)" and color(SLOW) != color("dqn")
+    with pytest.raises(UnknownNameError, match=r"'controller\.discont'"):
+        plan("arrow_puzzle", "smoke", agents=("dqn:controller.discont=0.99",))
+    with pytest.raises(InvalidValueError, match="discount"):
+        plan("arrow_puzzle", "smoke", agents=("dqn:controller.discount=7",))
+    with pytest.raises(InvalidValueError, match="none of them twice"):
+        protocol("arrow_puzzle", agents=(SLOW, "dqn:controller.discount=0.990"))
+    assert protocol("arrow_puzzle", agents=("dqn",)).hash != protocol("arrow_puzzle", agents=(SLOW,)).hash
+
+
+def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
+    both = bench(*plan("arrow_puzzle", "smoke", agents=("dqn", SLOW), **_FEW), root=tmp_path, launcher=Inline())
+    trained = load_trained(both.folder / "dqn-controller.discount=0.99" / "seed_0")
+    assert trained.agent.settings.controller.discount == 0.99
+    assert [both.of(agent)[0].settings["controller"]["discount"] for agent in ("dqn", SLOW)] == [0.95, 0.99]
+    assert re.search(r"chance +DQN +DQN \(discount 0.99\) +optimum", summary_table(both))
+    for name, content in archive_files(both).items():
+        (tmp_path / name).write_text(content)
+    assert load_archive(tmp_path).of(SLOW)[0].checkpoints[0].successes == both.of(SLOW)[0].checkpoints[0].successes
+    parts = [
+        dataclasses.replace(both, protocol=dataclasses.replace(both.protocol, agents=(agent,)), runs=both.of(agent))
+        for agent in both.protocol.agents
+    ]
+    assert merge(parts, tmp_path).protocol.agents == ("dqn", SLOW)
+
+
+def test_what_is_not_said_changes_no_hash(tmp_path: Path) -> None:
+    wanted = small()
+    assert not {"test_appearance", "physics"} & wanted.as_dict().keys()
+    assert dataclasses.replace(wanted, physics=()).hash == wanted.hash
+    other = small(test_appearance="strong")
+    assert Protocol.from_dict(other.as_dict()) == other and other.hash != wanted.hash
+    store = bench(other, {}, root=tmp_path, launcher=Inline()).folder
+    assert read_protocol(store) == other
+
+
+def test_kept_hashes_are_as_they_were() -> None:
+    kept = [json.loads(path.read_text()) for path in sorted(Path("docs/results").glob("*/bench.json"))]
+    control = [each for each in kept if "evaluation_episodes" in each["protocol"]]
+    same = [each for each in control if digest(each["protocol"]) == each["protocol_hash"]]
+    assert len(same) > 3
+    for each in same:
+        assert Protocol.from_dict(each["protocol"]).hash == each["protocol_hash"]
+
+
+def test_training_and_tests_may_look_different() -> None:
+    wanted = protocol("arrow_puzzle", appearance="clean", test_appearance="photo")
+    assert (wanted.appearance_in_tests, wanted.looks) == ("photo_held_out", "clean, tested at photo")
+    assert protocol("arrow_puzzle", appearance="photo").appearance_in_tests == "photo_held_out"
+    with pytest.raises(UnknownNameError, match="appearance"):
+        protocol("arrow_puzzle", test_appearance="bright")
+
+
+def test_physics_is_said_in_one_way_and_felt() -> None:
+    wanted = protocol("arrow_puzzle", physics=(("pad_friction", 0.5), ("object_mass", 1.0)))
+    assert wanted.physics == (("pad_friction", 0.5),)
+    assert wanted.world == {"execution": "physics", "physics": {"pad_friction": 0.5}}
+    with pytest.raises(InvalidValueError, match="change nothing in kinematic execution"):
+        protocol("arrow_puzzle", execution="kinematic", physics=(("pad_friction", 0.5),))
+    with pytest.raises(UnknownNameError, match="physics setting"):
+        protocol("arrow_puzzle", physics=(("friction", 0.5),))

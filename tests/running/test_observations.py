@@ -1,0 +1,173 @@
+"""What agents see is a choice of the protocol: shown as named, refused where an agent cannot take it, reported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from fake_agents import FakeAgent
+from recordings import contents
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.interfaces import Agent, AgentContext, Observation, Transition
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.evaluation import play
+from imagine_bench.running.run_state import environments
+from imagine_bench.store.trained import load_trained
+
+_FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": "kinematic", "recorded_episodes": 1}
+
+
+class Witness(FakeAgent):
+    """Notes what it is shown."""
+
+    seen: list[Observation]
+    contexts: list[AgentContext]
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        self.seen.append(observation)
+        return super().act(observation, explore=explore)
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        self.seen += [transition.observation, transition.next_observation]
+
+
+@pytest.fixture
+def witness(monkeypatch: pytest.MonkeyPatch) -> Witness:
+    """Registered as an agent that takes all but the human's view."""
+    agent, usual = Witness(), registry.make_agent
+    agent.seen, agent.contexts = [], []
+
+    def make(name: str, context: AgentContext) -> Agent:
+        if name != "witness":
+            return usual(name, context)
+        agent.contexts.append(context)
+        return agent
+
+    entry = registry.AgentEntry(make="none:none", needs_encoder=False, observes=("frame", "state", "proprio"))
+    monkeypatch.setitem(registry.AGENTS, "witness", entry)
+    monkeypatch.setattr(registry, "make_agent", make)
+    return agent
+
+
+@pytest.mark.parametrize(
+    ("choice", "size"), [("frame", 64), ("frame", 96), ("state", 64), ("proprio,frame", 64), ("state,proprio", 64)]
+)
+def test_agents_are_shown_what_is_chosen(tmp_path: Path, witness: Witness, choice: str, size: int) -> None:
+    shown = {"observation": choice, "observation_size": size}
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("witness", "random", "oracle"), **_FEW, **shown)
+    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    shapes = {"frame": (size, size, 3), "state": (15,), "proprio": (16,)}
+    parts = choice.split(",")
+    assert witness.contexts[-1].observation == {part: shapes[part] for part in parts} and len(witness.seen) > 10
+    for each in witness.seen:
+        assert each.frame.shape == (shapes["frame"] if "frame" in parts else (0, 0, 3))
+        assert {name: part.shape for name, part in each.more.items()} == {
+            part: shapes[part] for part in parts if part != "frame"
+        }
+        assert each.macrostate is None and ("state" not in parts or each.more["state"].sum() == 4.0)
+    assert "/real/frame" in contents(result.folder / "witness/seed_0/recording.rrd")
+    said = (result.folder / "report" / "index.html") if main(["report", str(result.folder)]) == 0 else None
+    assert said is not None and ("agents see" in said.read_text()) == (not wanted.shows_frames_alone)
+
+
+def test_choices_in_any_order_are_one_bench() -> None:
+    one, other = (
+        Protocol(task="arrow_puzzle", preset="quick", observation=each) for each in ("state,frame", "frame,state")
+    )
+    assert one == other and one.world["observation"] == "frame,state" and "privileged" in one.looks
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"observation": "stat"}, UnknownNameError, "No observation 'stat'. Did you mean 'state'?"),
+        ({"observation": "state,state"}, InvalidValueError, "none of them twice"),
+        ({"observation_size": 16}, InvalidValueError, "observation_size is 16; give 32 to 256 pixels"),
+        (
+            {"observation": "human", "agents": ("witness",)},
+            InvalidValueError,
+            "takes frame, state, proprio, but not human",
+        ),
+        (
+            {"observation": "state", "agents": ("dqn",)},
+            InvalidValueError,
+            "Agent 'dqn' takes 64 x 64 frames alone; leave",
+        ),
+        ({"observation_size": 96, "agents": ("factored:given",)}, InvalidValueError, "takes 64 x 64 frames alone"),
+    ],
+)
+@pytest.mark.usefixtures("witness")
+def test_what_cannot_be_shown_is_one_sentence(changes: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error) as caught:
+        plan("arrow_puzzle", "smoke", **{"agents": ("witness",), **changes})
+    assert words in str(caught.value)
+
+
+@pytest.mark.usefixtures("witness")
+def test_a_run_that_saw_something_else_is_not_asked_with_frames(tmp_path: Path) -> None:
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("witness",), observation="state", **_FEW)
+    folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder / "witness/seed_0"
+    with pytest.raises(InvalidValueError, match="is of an agent that sees state at 64 pixels, and it would be asked"):
+        load_trained(folder)
+
+
+def test_a_part_alone_comes_by_its_name() -> None:
+    wanted = Protocol(task="pick_place", preset="quick", observation="proprio", execution="kinematic")
+    with environments(wanted) as (env, _):
+        seen, _ = env.reset(seed=1)
+        assert set(seen) == {"proprio"} and env.observation_space.contains(seen)
+
+
+class _Broken(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Its third observation has a part that no agent should be shown."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], part: Any) -> None:
+        super().__init__(env)
+        self.part, self.steps = part, 0
+
+    def step(self, action: Any) -> Any:
+        seen, *rest = super().step(action)
+        self.steps += 1
+        return (seen if self.steps < 2 else {**seen, "proprio": self.part}, *rest)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (np.full(16, np.nan, dtype=np.float32), "gave a proprio with NaN or infinity"),
+        (np.zeros(7, dtype=np.float32), "gave a proprio of float32 and shape (7,); it declares float32 of shape (16,)"),
+        (np.zeros(16), "gave a proprio of float64"),
+        (None, "gave a proprio of <class 'NoneType'> and shape None"),
+    ],
+)
+def test_a_part_that_goes_wrong_ends_the_run(part: Any, words: str) -> None:
+    wanted = Protocol(task="arrow_puzzle", preset="quick", observation="state,proprio", execution="kinematic")
+    with environments(wanted) as (env, _), pytest.raises(InvalidValueError) as caught:
+        for seed in range(9):
+            list(play(_Broken(env, part), FakeAgent(), seed=seed, explore=True, privileged=False))
+    assert words in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+@pytest.mark.parametrize(("choice", "policy"), [("state", "MultiInputPolicy"), ("frame", "CnnPolicy")])
+def test_a_librarys_agent_takes_them_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choice: str, policy: str
+) -> None:
+    library = pytest.importorskip("stable_baselines3")
+    named, make_dqn = list[str](), library.DQN
+    monkeypatch.setattr(
+        library, "DQN", lambda name, *given, **more: named.append(name) or make_dqn(name, *given, **more)
+    )
+    few = (("sb3.batch_size", 8), ("sb3.buffer_size", 500), ("sb3.learning_starts", 10))
+    shown = {"observation": choice, "observation_size": 64 if choice == "state" else 48, "overrides": few}
+    wanted, paths = plan("arrow_puzzle_easy", "smoke", agents=("sb3_dqn",), **{**_FEW, "budgets": (20,)}, **shown)
+    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    assert named == [policy] and np.isfinite(result.runs[0].checkpoints[-1].mean_return)

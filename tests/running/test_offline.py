@@ -1,0 +1,196 @@
+"""Learning from a dataset first: its transitions are experience as any, whatever format they come in."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bench_fakes import Pupil
+from small_runs import FORMATS, Inline, collected, final_arrays, measured, written
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import Transition
+from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.report import summary_table, write_report
+from imagine_bench.rules import states_of
+from imagine_bench.running import run_state
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.control import plan_control, run_observed
+from imagine_bench.seeding import episode_seed
+from imagine_bench.store.results import RunResult
+
+_FEW: dict[str, Any] = {
+    "seeds": (0,), "evaluation_episodes": 2, "execution": "kinematic", "open_loop_starts": 0,
+    "recorded_episodes": 0, "appearance": "mild",
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def pupils() -> list[Pupil]:
+    Pupil.made.clear()
+    return Pupil.made
+
+
+def spec_of(dataset: Path | None, agent: str = "pupil", **changes: Any) -> RunSpec[Any]:
+    wanted, paths = plan_control("arrow_puzzle", "smoke", dataset=dataset, **{"agents": (agent,), **_FEW, **changes})
+    encoder = next((path for kind, path in paths.items() if kind != "dataset"), None)
+    return RunSpec(protocol=wanted, agent=agent, seed=0, encoder=encoder, dataset=paths.get("dataset"))
+
+
+def run(folder: Path, spec: RunSpec[Any], on_progress: OnProgress = lambda progress: None) -> RunResult:
+    result = run_observed(spec, folder, on_progress)
+    assert result is not None
+    return result
+
+
+def facts(transition: Transition) -> tuple[Any, ...]:
+    frames = (transition.observation.frame.tobytes(), transition.next_observation.frame.tobytes())
+    return (*frames, transition.action, transition.reward, transition.terminated, transition.truncated)
+
+
+def test_the_learner_sees_the_transitions_and_no_state(tmp_path: Path) -> None:
+    episodes = collected()[0]
+    result = run(tmp_path / "run", spec_of(written(tmp_path / "set").folder))
+    pupil = Pupil.made[-1]
+    before, _ = episodes.rows
+    wanted = [
+        (
+            episodes.frames[row].tobytes(), episodes.frames[row + 1].tobytes(), episodes.actions[step],
+            episodes.rewards[step], episodes.terminated[step], episodes.truncated[step],
+        )
+        for step, row in enumerate(before)
+    ]  # fmt: skip
+    assert [facts(transition) for _, transition in pupil.shown] == wanted
+    assert [episode for episode, _ in pupil.shown] == np.repeat(np.arange(6), episodes.lengths).tolist()
+    for _, transition in pupil.shown:
+        assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
+    tested = sum(row.mean_length * row.test_episodes for row in result.checkpoints)
+    rules = registry.task("arrow_puzzle").rules
+    asked = sum(not rules.is_terminal(state) for state in states_of(rules))
+    assert len(pupil.seen) == tested + asked, "it acts in tests, and for each macrostate, to find causes of failures"
+    assert all(seen.macrostate is None for seen in pupil.seen)
+
+
+def test_a_dataset_is_experience_and_budgets_count_it(tmp_path: Path) -> None:
+    episodes, folder = collected()[0], written(tmp_path / "set").folder
+    offline = run(tmp_path / "offline", spec_of(folder))
+    assert [row.episodes for row in offline.checkpoints] == [6], "without budgets, the dataset is all"
+    assert offline.checkpoints[0].env_steps == len(episodes.actions)
+    assert offline.training_success.tolist() == episodes.success.tolist()
+    assert offline.training_length.tolist() == episodes.lengths.tolist()
+    further = run(tmp_path / "further", spec_of(folder, budgets=(3, 8)))
+    first, second = further.checkpoints
+    assert first.env_steps == episodes.lengths[:3].sum() and second.env_steps > len(episodes.actions)
+    assert further.training_success[:6].tolist() == episodes.success.tolist()
+
+
+def test_own_episodes_start_where_they_would_without(tmp_path: Path) -> None:
+    run(tmp_path / "alone", spec_of(None, budgets=(8,)))
+    alone = Pupil.made[-1]
+    run(tmp_path / "after", spec_of(written(tmp_path / "set").folder, budgets=(8,)))
+    after = Pupil.made[-1]
+    for episode in (6, 7):
+        starts = [next(t.observation.frame for k, t in each.shown if k == episode) for each in (alone, after)]
+        assert np.array_equal(*starts)
+    assert episode_seed("training", 0, 6) not in collected()[1]["privileged"]["seeds"].tolist()
+
+
+def test_three_formats_train_to_the_same_bits(tmp_path: Path) -> None:
+    agent, results, specs = "dqn", {}, {}
+    for format in FORMATS:
+        specs[format] = spec_of(written(tmp_path / format, format).folder, agent)
+        results[format] = run(tmp_path / f"run-{format}", specs[format])
+    one = results["npz"]
+    for format in FORMATS[1:]:
+        assert specs[format].protocol == specs["npz"].protocol, "one bench"
+        assert measured(results[format]) == measured(one)
+        mine, theirs = final_arrays(tmp_path / f"run-{format}"), final_arrays(tmp_path / "run-npz")
+        assert mine.keys() == theirs.keys() and all(mine[name].tobytes() == theirs[name].tobytes() for name in mine)
+    assert specs["npz"].protocol.hash != spec_of(None, agent, budgets=(6,)).protocol.hash
+
+
+def test_a_kill_within_a_dataset_changes_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_state, "_REPORT_EVERY_S", 0.0)
+    told = 0
+
+    def killing(progress: Any) -> None:
+        nonlocal told
+        told += progress.phase == "training"
+        if told == 3:
+            told += 1
+            raise KeyboardInterrupt
+
+    spec = spec_of(written(tmp_path / "set").folder, "table", budgets=(4, 8))
+    whole = run(tmp_path / "whole", spec)
+    often = dataclasses.replace(spec, checkpoint_every_s=0.0)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "killed", often, killing)
+    assert measured(run(tmp_path / "killed", often)) == measured(whole)
+    assert final_arrays(tmp_path / "killed")["table"].tobytes() == final_arrays(tmp_path / "whole")["table"].tobytes()
+
+
+def test_a_dataset_that_changed_since_is_refused(tmp_path: Path) -> None:
+    spec = spec_of(written(tmp_path / "set").folder, "table")
+    shutil.rmtree(tmp_path / "set")
+    other = written(tmp_path / "set", episodes=3)
+    with pytest.raises(ArtefactError, match=f"is dataset {other.identity}, and this bench is of mixed-6@"):
+        run(tmp_path / "run", spec)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        pytest.param(
+            {"agents": ("sb3_dqn",)},
+            "Agent 'sb3_dqn' trains in a loop of its own and cannot learn from a dataset",
+            marks=pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="the extra peers"),
+        ),
+        ({"agents": ("q_learning_macrostate",)}, "is shown true macrostates and cannot learn from a dataset"),
+        ({"demonstrations": 2}, "Both a dataset and demonstrations would come first; give one of them"),
+    ],
+)
+def test_what_cannot_learn_from_a_dataset_is_refused(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None:
+    folder = written(tmp_path / "set").folder
+    with pytest.raises(InvalidValueError, match=sentence):
+        plan("arrow_puzzle", "smoke", dataset=folder, **{**_FEW, **changes})
+
+
+def test_a_dataset_of_another_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = written(tmp_path / "set").folder
+    for task in ("pick_place", "arrow_puzzle_hard"):
+        assert main(["bench", "--task", task, "--dataset", str(folder)]) == 2
+        assert f"is of arrow_puzzle with 6 macro-actions; give one of {task}, which has" in capsys.readouterr().err
+    (folder / "card.json").unlink()
+    assert main(["bench", "--task", "pick_place", "--dataset", str(folder)]) == 2
+    assert "is of a task with 6 macro-actions; give one of pick_place, which has" in capsys.readouterr().err
+    assert main(["bench", "--task", "toy_regression", "--dataset", str(folder)]) == 2
+    assert "toy_regression takes no --dataset" in capsys.readouterr().err
+
+
+def test_frames_that_look_otherwise_are_refused(tmp_path: Path) -> None:
+    """An encoder for clean frames would make nothing of them; tests may look otherwise."""
+    folder = written(tmp_path / "set").folder
+    with pytest.raises(InvalidValueError, match="frames of appearance mild, not clean; give --appearance mild, and"):
+        plan("arrow_puzzle", "smoke", dataset=folder, **{**_FEW, "appearance": "clean"})
+    wanted, _ = plan("arrow_puzzle", "smoke", dataset=folder, **_FEW, test_appearance="clean")
+    assert (wanted.appearance, wanted.test_appearance) == ("mild", "clean")  # type: ignore[attr-defined]
+
+
+def test_a_bench_of_a_dataset_stands_beside_the_fixed_agents(tmp_path: Path) -> None:
+    folder = written(tmp_path / "set").folder
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("random", "oracle", "table"), dataset=folder, **_FEW)
+    result = bench(wanted, paths, root=tmp_path / "runs", launcher=Inline())
+    assert {run.agent: run.checkpoints[-1].env_steps for run in result.runs} == {
+        "random": 0, "oracle": 0, "table": len(collected()[0].actions),
+    }  # fmt: skip
+    page = write_report(result).read_text()
+    assert f"trained first on dataset {wanted.dataset}" in page
+    assert f"trained first on dataset {wanted.dataset}" in summary_table(result)
+    assert wanted.dataset == f"mixed-6@{collected()[0].hash[:12]}"

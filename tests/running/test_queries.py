@@ -1,0 +1,297 @@
+"""What learners are taught and not shown: demonstrations, answers, and earlier tasks of the same world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bench_fakes import Pupil
+from imagine_bench.tasks.arrows.rules import ArrowRules
+from small_runs import final_arrays, measured, small
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.rules import fewest_actions
+from imagine_bench.running import phases, run_state
+from imagine_bench.running.control import run_observed
+from imagine_bench.running.queries import LabelOracle, Teacher
+from imagine_bench.store import encoders
+from imagine_bench.store.codec import read_arrays
+from imagine_bench.store.results import RunResult
+
+
+@pytest.fixture(autouse=True)
+def pupils() -> list[Pupil]:
+    Pupil.made.clear()
+    return Pupil.made
+
+
+def do(folder: Path, agent: str = "pupil", task: str = "arrow_puzzle", **changes: Any) -> RunResult:
+    wanted = {**small().as_dict(), "agents": (agent,), "budgets": (6,), "evaluation_episodes": 1, **changes}
+    wanted = {name: value for name, value in wanted.items() if name not in ("task", "preset")}
+    spec = RunSpec(protocol=protocol(task, "smoke", **wanted), agent=agent, seed=0)
+    return run_observed(spec, folder, lambda progress: None)
+
+
+# --- demonstrations ----------------------------------------------------------------------------------------------
+
+
+def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
+    plain, shown = do(tmp_path / "plain"), do(tmp_path / "shown", demonstrations=4)
+    alone, taught = Pupil.made
+    assert shown.training_success[:4].all() and not plain.training_success.all()
+
+    def starts(pupil: Pupil) -> list[bytes]:
+        first = {episode: transition for episode, transition in reversed(pupil.shown)}
+        return [first[episode].observation.frame.tobytes() for episode in sorted(first)]
+
+    assert starts(alone) == starts(taught), "the same six starts, whoever acts"
+    for episode, transition in taught.shown:
+        assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
+        assert episode >= 4 or transition.reward == (50.0 if transition.terminated else -1.0)
+    assert sum(episode < 4 for episode, _ in taught.shown) == shown.training_length[:4].sum()
+
+
+def test_demonstrations_are_shortest_plans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rules, lengths, states = registry.task("arrow_puzzle_clockwise").rules, [], []
+    real = phases.play
+
+    def watching(env: Any, agent: Any, **options: Any) -> Any:
+        for transition, info in real(env, agent, **options):
+            if transition.observation.macrostate is not None:
+                states.append((tuple(transition.observation.macrostate.tolist()), transition.action))
+            yield transition, info
+
+    monkeypatch.setattr(phases, "play", watching)
+    result = do(tmp_path / "run", task="arrow_puzzle_clockwise", demonstrations=6)
+    assert all(rules.optimal_action(state) == action for state, action in states)
+    lengths = result.training_length.tolist()
+    assert len(states) == sum(lengths)
+    assert max(lengths) <= 6 and result.training_success.all()
+
+
+# --- queries -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", registry.TASKS)
+def test_answers_are_the_rules_and_chance_has_none(task: str) -> None:
+    rules = registry.task(task).rules
+    oracle, answered, refused = LabelOracle(rules), 0, 0
+    for state in rules.states:
+        for first in range(rules.n_actions):
+            single = {(each.reward, each.terminated) for each in rules.outcomes(state, first)}
+            answer = oracle.label(state, np.array([first]))
+            assert (answer is None) == (len(single) > 1)
+            for second in range(rules.n_actions):
+                possible = {
+                    Label(after.reward, after.terminated)
+                    for each in rules.outcomes(state, first)
+                    for after in rules.outcomes(each.macrostate, second)
+                }
+                answer = oracle.label(state, np.array([first, second]))
+                assert answer == (next(iter(possible)) if len(possible) == 1 else None)
+                answered, refused = answered + (answer is not None), refused + (answer is None)
+    by_chance = any(len(rules.outcomes(state, a)) > 1 for state in rules.states for a in range(rules.n_actions))
+    assert answered > 0 and (refused > 0) == by_chance
+
+
+def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
+    oracle = LabelOracle(ArrowRules())
+    assert oracle.label((3, 1, 2, 0), np.array([0])) == Label(50.0, True)
+    assert oracle.label((3, 1, 2, 0), np.array([0, 1])) == Label(-1.0, False), "there and back through a goal"
+    for actions in ([], [6], [0, -1]):
+        with pytest.raises(InvalidValueError, match="give at least one, each from 0 to 5"):
+            oracle.label((3, 1, 2, 0), np.array(actions))
+
+
+def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
+    do(tmp_path / "run", queries=3, demonstrations=2)
+    (pupil,) = Pupil.made
+    asked = read_arrays(tmp_path / "run" / "training.npz")["queries"].tolist()
+    assert asked == [0, 0, 3, 3, 3, 3], "who watches does not ask"
+    assert len(pupil.answers) == 12
+    assert all(answer is not None for _, answer in pupil.answers), "this puzzle leaves nothing to chance"
+    assert len({answer for _, answer in pupil.answers}) > 1
+    assert all(observation.macrostate is None for observation in pupil.seen)
+
+
+def test_queries_change_no_start_and_no_test(tmp_path: Path) -> None:
+    asking, without = do(tmp_path / "with", queries=2), do(tmp_path / "without")
+    assert np.array_equal(asking.training_length, without.training_length), "this pupil learns nothing by asking"
+    assert final_arrays(tmp_path / "with")["table"].tobytes() == final_arrays(tmp_path / "without")["table"].tobytes()
+
+
+# --- feedback ----------------------------------------------------------------------------------------------------
+
+
+def test_feedback_is_reward_for_optimal_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By counting plans: an action is optimal where it leads to a goal by as few actions as any."""
+    lived, real = [], phases.play
+
+    def watching(env: Any, agent: Any, **options: Any) -> Any:
+        state = None
+
+        def before_acting(observation: Any, info: Any) -> None:
+            nonlocal state
+            state = tuple(info["macrostate"].tolist())
+            options["before_acting"](observation, info)
+
+        for transition, info in real(env, agent, **{**options, "before_acting": before_acting}):
+            lived.append((state, transition.reward, transition.terminated, info))
+            yield transition, info
+
+    monkeypatch.setattr(phases, "play", watching)
+    do(tmp_path / "run", feedback=3.0, budgets=(30,))
+    (pupil,) = Pupil.made
+    rules, right = registry.task("arrow_puzzle").rules, []
+    for (state, reward, terminated, info), (_, seen) in zip(lived, pupil.shown, strict=True):
+        success, after = bool(info["is_success"]), tuple(info["macrostate"].tolist())
+        steps = 1 if success else 999 if terminated else 1 + fewest_actions(rules, after)
+        right.append(steps == fewest_actions(rules, state))
+        assert seen.reward == reward + (3.0 if right[-1] else -3.0) and seen.observation.macrostate is None
+    assert 5 < sum(right) < len(right) - 5
+
+
+def test_a_noisy_teacher_errs_as_often_as_said(tmp_path: Path) -> None:
+    teacher, rules = Teacher(registry.task("arrow_puzzle").rules, 1.0, 0.2), registry.task("arrow_puzzle").rules
+    info = {"macrostate": np.array((3, 1, 2, 0))}
+    frame = np.zeros((64, 64, 3), np.uint8)
+    optimal = rules.optimal_action((3, 1, 2, 0))
+    seen = Observation(frame=frame)
+    lived = Transition(
+        observation=seen, action=optimal, reward=-1.0, next_observation=seen, terminated=False, truncated=False
+    )
+    rewards = []
+    for episode in range(2):
+        teacher.begin(episode)
+        teacher(seen, info)
+        rewards.append([teacher.told(lived).reward for _ in range(4_000)])
+    assert set(rewards[0]) == {0.0, -2.0} and rewards[0] != rewards[1]
+    wrong = np.mean(np.array(rewards) == -2.0)
+    assert abs(wrong - 0.2) < 4 * np.sqrt(0.2 * 0.8 / 8_000)
+    teacher.begin(0)
+    teacher(seen, info)
+    assert [teacher.told(lived).reward for _ in range(4_000)] == rewards[0]
+
+
+# --- earlier tasks -----------------------------------------------------------------------------------------------
+
+
+def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, real = [], phases.play
+
+    def watching(env: Any, agent: Any, *, seed: int, **options: Any) -> Any:
+        seeds.append((env.spec.id.partition("/")[2], seed))
+        return real(env, agent, seed=seed, **options)
+
+    monkeypatch.setattr(phases, "play", watching)
+    earlier = ("arrow_puzzle_hard", "arrow_puzzle_toward")
+    result = do(tmp_path / "run", after=earlier, after_episodes=3)
+    (pupil,) = Pupil.made
+    assert pupil.carried == [3, 3], "once after each earlier task, on its own episodes"
+    assert {episode for episode, _ in pupil.shown} == set(range(6)), "episodes are counted from 0 on each task"
+    names = ["ArrowPuzzleHard-v0"] * 3 + ["ArrowPuzzleToward-v0"] * 3 + ["ArrowPuzzle-v0"] * 6
+    assert [name for name, _ in seeds] == names
+    assert len({seed for _, seed in seeds}) == 12
+    alone = do(tmp_path / "alone")
+    assert [seed for _, seed in seeds[6:12]] == [seed for _, seed in seeds[12:18]], "pairs: the same starts"
+    assert result.checkpoints[0].env_steps == result.training_length.sum()
+    assert len(result.training_length) == len(alone.training_length) == 6
+
+
+def test_who_can_carry_over_or_ask_is_known() -> None:
+    for agent, carries, asks in (("factored:given", True, True), ("imagination", True, False), ("dqn", False, False)):
+        kind = registry.agent_entry(agent).encoder_kind
+        encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
+        spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=encoder)
+        made = registry.make_agent(agent, spec.context())
+        assert (isinstance(made, TransferLearner), isinstance(made, QueryingAgent)) == (carries, asks)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["--after", "arrow_puzzle_hard"],
+            "Agent 'dqn' has no model of the world to carry over from arrow_puzzle_hard;",
+        ),
+        (["--queries", "2"], "Agent 'dqn' cannot query an oracle; leave --queries out"),
+        (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: what is known of one world is of no"),
+        (["--after", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'?"),
+        (["--after-episodes", "50"], "after_episodes is 50, but no task comes before; give it in after."),
+        (["--demonstrations", "-1"], "demonstrations is -1; give at least 0."),
+        (["--queries", "-1"], "queries is -1; give at least 0"),
+        (["--feedback-error", "0.1"], "feedback is 0.0 and feedback_error 0.1; give a reward of at least 0"),
+        (["--feedback", "1", "--feedback-error", "0.6"], "feedback is 1.0 and feedback_error 0.6; give a reward of"),
+    ],
+)
+def test_wrong_words_get_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    given = ["bench", "--task", "arrow_puzzle", "--preset", "smoke", "--agents", "dqn", "--out", str(tmp_path / "runs")]
+    assert main([*given, *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"imagine-bench: {sentence}")
+    assert not (tmp_path / "runs").exists()
+
+
+# --- all of it, killed and resumed -------------------------------------------------------------------------------
+
+
+class _KilledError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes"),
+    [
+        ("factored:given", {"after": ("arrow_puzzle_hard",), "after_episodes": 4, "demonstrations": 2, "queries": 2}),
+        (
+            "imagination",
+            {
+                "after": ("arrow_puzzle_hard",),
+                "after_episodes": 4,
+                "demonstrations": 2,
+                "feedback": 1.0,
+                "feedback_error": 0.3,
+            },
+        ),
+    ],
+)
+def test_a_killed_and_taught_learner_ends_in_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str, changes: dict[str, Any]
+) -> None:
+    kind = registry.agent_entry(agent).encoder_kind
+    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
+    overrides = (("imagination.start_episode", 3),) if agent == "imagination" else ()
+    wanted = small(agents=(agent,), budgets=(4, 7), evaluation_episodes=2, overrides=overrides, **changes)
+
+    def go(folder: Path, every_s: float) -> RunResult:
+        spec = RunSpec(protocol=wanted, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
+        return run_observed(spec, folder, lambda progress: None)
+
+    whole = go(tmp_path / "whole", 1e9)
+    real, saves = run_state.save_snapshot, []
+
+    def killing(folder: Path, snapshot: Any) -> Path:
+        saves.append(real(folder, snapshot))
+        if len(saves) in (2, 4, 5, 8):  # on the earlier task, right after it, while watching, while asking
+            raise _KilledError
+        return saves[-1]
+
+    monkeypatch.setattr(run_state, "save_snapshot", killing)
+    for _ in range(4):
+        with pytest.raises(_KilledError):
+            go(tmp_path / "run", 0.0)
+    resumed = go(tmp_path / "run", 0.0)
+    assert measured(whole) == measured(resumed)
+    before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
+    assert set(before) == set(after)
+    assert [name for name in before if before[name].tobytes() != after[name].tobytes()] == []

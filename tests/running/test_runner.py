@@ -1,0 +1,290 @@
+"""One run: what agents are shown, what is counted, and that a killed and resumed run ends in the same bits."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import bench_fakes
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.macro_env import MacroEnv
+from small_runs import context, do, final_arrays, same_but_for_time, small
+
+import imagine_bench  # noqa: F401 - registers the environments
+from imagine_bench import registry
+from imagine_bench.cli import observers
+from imagine_bench.errors import ArtefactError, DivergedError
+from imagine_bench.interfaces import Transition
+from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.running import run_state
+from imagine_bench.running.control import run_observed
+from imagine_bench.running.evaluation import play_test_episode
+from imagine_bench.seeding import TUNING_SEEDS, episode_seed
+from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.counters import EvaluationCounts
+
+
+@pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
+def test_a_tuning_run_is_shown_tuning_starts_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
+) -> None:
+    asked = []
+    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
+        real = getattr(observers, name)
+        monkeypatch.setattr(
+            observers, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
+        )
+    do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
+    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("open_loop_starts", purpose)}
+
+
+def test_tests_have_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reset, seen, shown = MacroEnv.reset, set(), set()
+
+    def noted(env: MacroEnv, *, seed: int, options: Any = None) -> Any:
+        seen.add((seed >> 56, env.world._level.name))
+        return reset(env, seed=seed, options=options)
+
+    monkeypatch.setattr(MacroEnv, "reset", noted)
+    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
+        real = getattr(observers, name)
+        monkeypatch.setattr(observers, name, lambda *a, real=real, **k: shown.add(k["appearance"]) or real(*a, **k))
+    do(tmp_path / "run", "imaginer", 0, agents=("imaginer",), open_loop_starts=2, appearance="photo")
+    training, evaluation = (episode_seed(purpose, 0, 0) >> 56 for purpose in ("training", "evaluation"))
+    assert seen == {(training, "photo"), (evaluation, "photo_held_out")}
+    assert shown == {"photo_held_out"}
+
+
+def test_a_run_counts_what_happens(tmp_path: Path) -> None:
+    told: list[Progress] = []
+    spec = RunSpec(protocol=small(), agent="table", seed=3)
+    result = run_observed(spec, tmp_path / "run", told.append)
+    assert [row.episodes for row in result.checkpoints] == [4, 9]
+    assert result.training_length.shape == result.training_success.shape == (9,)
+    assert [row.env_steps for row in result.checkpoints] == [
+        result.training_length[:4].sum(),
+        result.training_length.sum(),
+    ]
+    assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [
+        row.env_steps for row in result.checkpoints
+    ]
+    assert all(row.test_episodes == 5 and 1 <= row.mean_length <= 10 for row in result.checkpoints)
+    assert result.settings == {"rate": 0.5}
+    assert (result.agent, result.seed, result.recording) == ("table", 3, None)
+    assert told[-1].phase == "done" and told[-1].done == told[-1].work == 9 + 2 * 5
+
+
+def test_the_runner_itself_learns_from_every_transition_once(tmp_path: Path) -> None:
+    """The runner's episodes, replayed by hand through the environment, are the agent's very transitions."""
+    do(tmp_path / "run", budgets=(6,))
+    agent = bench_fakes.TableAgent(context())
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="clean")
+    for episode in range(6):
+        frame, _ = env.reset(seed=episode_seed("training", 0, episode))
+        over = False
+        while not over:
+            before = bench_fakes.Observation(frame=frame)
+            action = agent.act(before, explore=True)
+            frame, reward, terminated, truncated, _ = env.step(action)
+            after = bench_fakes.Observation(frame=frame)
+            agent.observe(
+                Transition(
+                    observation=before,
+                    action=action,
+                    reward=float(reward),
+                    next_observation=after,
+                    terminated=terminated,
+                    truncated=truncated,
+                ),
+                episode=episode,
+            )
+            over = terminated or truncated
+    env.close()
+    assert np.abs(agent.table).sum() > 0
+    assert np.array_equal(final_arrays(tmp_path / "run")["table"], agent.table)
+
+
+def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
+    seen = bench_fakes.NosyAgent.seen
+    seen.clear()
+    do(tmp_path / "plain", "nosy", agents=("nosy",))
+    assert len(seen) > 20 and all(value is None for value in seen)
+    seen.clear()
+    do(tmp_path / "privileged", "nosy_privileged", agents=("nosy_privileged",))
+    optimal_policy, *macrostates = seen
+    assert callable(optimal_policy)
+    assert all(macrostate.shape == (4,) for macrostate in macrostates)
+
+
+def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
+    first, second = do(tmp_path / "run", "oracle", agents=("oracle",)).checkpoints
+    assert dataclasses.replace(first, episodes=9) == second
+    assert (first.env_steps, first.success_rate, first.mean_length > 1) == (0, 1.0, True)
+
+
+def test_every_agent_and_seed_meets_the_same_test_starts() -> None:
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="clean")
+    starts = []
+    real_reset = env.reset
+
+    def reset(**options: Any) -> Any:
+        frame, info = real_reset(**options)
+        starts.append((tuple(info["macrostate"]), frame.tobytes()))
+        return frame, info
+
+    env.reset = reset  # type: ignore[method-assign]
+    for seed in (0, 1):
+        tally = EvaluationCounts()
+        for _ in range(4):
+            play_test_episode(tally, env, bench_fakes.TableAgent(context(seed)), privileged=False, purpose="evaluation")
+    env.close()
+    assert starts[:4] == starts[4:]
+    assert len(set(starts)) > 1
+
+
+def test_a_finished_run_is_read_and_not_repeated(tmp_path: Path) -> None:
+    before = do(tmp_path / "run")
+    times = {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*") if not path.name.startswith(".lock")
+    }
+    assert same_but_for_time(before, do(tmp_path / "run"))
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+
+
+def test_other_settings_do_not_go_on_in_a_run_that_was_begun(tmp_path: Path) -> None:
+    do(tmp_path / "run")
+    (tmp_path / "run" / "DONE").unlink()
+    with pytest.raises(ArtefactError, match=r"was begun with protocol\.budgets \[4, 9\], and .* use \[4, 10\]"):
+        do(tmp_path / "run", budgets=(4, 10))
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "training.npz", "config.json", "imagined.npz"])
+def test_a_changed_result_is_noticed(tmp_path: Path, name: str) -> None:
+    do(tmp_path / "run")
+    path = tmp_path / "run" / name
+    path.write_bytes(path.read_bytes() + b"0")
+    with pytest.raises(ArtefactError, match=rf"{name} is not as the run left it.*left untouched"):
+        do(tmp_path / "run")
+
+
+def test_divergence_leaves_its_state_for_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def diverge(agent: bench_fakes.TableAgent, transition: Transition, *, episode: int) -> None:
+        if episode == 2:
+            raise DivergedError("The loss is NaN.")
+
+    monkeypatch.setattr(bench_fakes.TableAgent, "observe", diverge)
+    with pytest.raises(DivergedError, match=r"The loss is NaN\. The agent's state lies in .*diverged"):
+        do(tmp_path / "run")
+    saved = load_newest(tmp_path / "run" / "diverged")
+    assert saved is not None and saved.episode == 2
+
+
+class _KilledError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 7, 12, 16, 19])
+def test_stopping_anywhere_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> None:
+    """After any episode, of training or of a test, half way through counting: the result is the same."""
+    whole = do(tmp_path / "whole")
+    real, calls = run_state.save_snapshot, []
+
+    def killing(folder: Path, snapshot: Any) -> Path:
+        where = real(folder, snapshot)
+        calls.append(where)
+        if len(calls) == stop_after:
+            raise _KilledError
+        return where
+
+    monkeypatch.setattr(run_state, "save_snapshot", killing)
+    with pytest.raises(_KilledError):
+        do(tmp_path / "run", every_s=0.0)
+    monkeypatch.setattr(run_state, "save_snapshot", real)
+    assert same_but_for_time(whole, do(tmp_path / "run"))
+    weights, again = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
+    assert weights["table"].tobytes() == again["table"].tobytes()
+
+
+_CHILD = """
+import json, signal, sys
+from pathlib import Path
+import bench_fakes
+from imagine_bench.running import run_state, runner
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import RunSpec
+
+save, saves = run_state.save_snapshot, iter(range(int(sys.argv[3])))
+def saying(folder, snapshot):
+    if next(saves, None) is None:
+        signal.pause()  # whoever is to kill this is late
+    print("saving", flush=True)
+    return save(folder, snapshot)
+
+run_state.save_snapshot = saying
+spec = RunSpec(protocol=Protocol.from_dict(json.loads(sys.argv[2])), agent="table", seed=0, checkpoint_every_s=0.0)
+runner.run(spec, Path(sys.argv[1]), lambda progress: None)
+"""
+
+
+def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"budgets": (40, 80), "evaluation_episodes": 10}
+    whole = do(tmp_path / "whole", **changes)
+    folder, settings = tmp_path / "run", json.dumps(small(**changes).as_dict())
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1] / "fakes")}
+    for saves, delay_s in ((13, 0.0), (31, 0.002), (26, 0.009)):  # in training, in a test, and in the midst of writing
+        command = [sys.executable, "-c", _CHILD, str(folder), settings, str(saves)]
+        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
+            assert child.stdout is not None
+            lines = [child.stdout.readline() for _ in range(saves)]
+            time.sleep(delay_s)
+            child.kill()
+        assert lines == [b"saving\n"] * saves and child.returncode == -signal.SIGKILL
+        snapshot = load_newest(folder / "checkpoints")
+        assert snapshot is not None and not (folder / "DONE").exists()
+    assert 40 < snapshot.episode < 80  # non-vacuous: the last kill came half way
+    assert same_but_for_time(whole, do(folder, **changes))
+    assert final_arrays(tmp_path / "whole")["table"].tobytes() == final_arrays(folder)["table"].tobytes()
+
+
+def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> None:
+    """The checkpoint of a test is written before its row of the table."""
+    folder, spec = tmp_path / "run", RunSpec(protocol=small(budgets=(2, 4, 9)), agent="table", seed=0, until=4)
+    assert run_observed(spec, folder, lambda progress: None) is None, "it pauses"
+    table = (folder / "metrics.csv").read_text()
+    assert [line.split(",")[0] for line in table.splitlines()[1:]] == ["2", "4"]
+    (folder / "metrics.csv").unlink()
+    run_observed(spec, folder, lambda progress: None)
+    assert (folder / "metrics.csv").read_text() == table
+
+
+def test_every_registered_agent_has_a_target() -> None:
+    for entry in registry.AGENTS.values():
+        assert callable(registry.load(entry.make))
+
+
+def test_test_episodes_are_greedy_and_training_explores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    act = bench_fakes.TableAgent.act
+
+    def telling(agent: Any, observation: Any, *, explore: bool) -> int:
+        asked.append(explore)
+        return act(agent, observation, explore=explore)
+
+    monkeypatch.setattr(bench_fakes.TableAgent, "act", telling)
+    counts, env = EvaluationCounts(), gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    for _ in range(3):
+        play_test_episode(counts, env, bench_fakes.TableAgent(context()), privileged=False, purpose="evaluation")
+    env.close()
+    assert len(asked) == len(counts.actions) > 0 and not any(asked)
+    asked.clear()
+    result = do(tmp_path / "run", open_loop_starts=0)
+    assert sum(asked) == result.training_length.sum(), "each training step explores, and no step of a test"
