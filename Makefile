@@ -3,7 +3,7 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
-PYTEST ?= -n auto --dist loadfile
+PYTEST ?= -n auto --dist worksteal
 
 # The variables that each target takes.
 takes_bench := TASK PRESET AGENTS SEEDS BUDGETS APPEARANCE EXECUTION ENCODER VARIANTS LAUNCHER WORKERS DEVICE ARGS

@@ -31,3 +31,17 @@ def times(path: Path, entity: str, timeline: str) -> set[int]:
         if chunk.entity_path == entity and timeline in chunk.timeline_names
         for time in chunk.to_record_batch().column(timeline).to_pylist()
     }
+
+
+def view_names(path: Path) -> set[str]:
+    """The names of the views in the recording's blueprint."""
+    reader = RrdReader(path)
+    return {
+        name
+        for store in reader.blueprints()
+        for chunk in reader.stream(store=store)
+        for column in chunk.to_record_batch().schema.names
+        if column.endswith("Blueprint:display_name")
+        for names in chunk.to_record_batch().column(column).to_pylist()
+        for name in names or ()
+    }

@@ -1,0 +1,89 @@
+"""A fast test uses at most about 3 seconds of CPU time: one that uses more is named, one that uses twice as much fails.
+
+The limit grows where the machine is slower than the one it was set on: a calibration loop is timed at the session's
+start, and again before a test fails. Child processes count; fixtures that tests share do not.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Generator
+
+import numpy as np
+import pytest
+
+LIMIT_CPU_S = 3.0
+"""CPU seconds that a fast test may use on the machine whose calibration loop takes the seconds below."""
+CALIBRATION_CPU_S = 0.08
+_USED = "cpu_s"
+
+
+def calibration_cpu_s() -> float:
+    """CPU seconds of a fixed piece of work: the least of three rounds, in Python and in numpy."""
+
+    def once() -> float:
+        before = time.process_time()
+        matrix = np.full((128, 128), 0.5)
+        for _ in range(60):
+            matrix = np.tanh(matrix @ matrix / 64.0)
+        sum(number * number % 7 for number in range(400_000))
+        return time.process_time() - before
+
+    return min(once() for _ in range(3))
+
+
+def slowness() -> float:
+    """How many times slower than the reference this machine is now, at least 1."""
+    return max(1.0, calibration_cpu_s() / CALIBRATION_CPU_S)
+
+
+def cpu_s() -> float:
+    """CPU seconds of this process and of the children it has waited for."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+class CpuLimit:
+    """The pytest plugin that holds fast tests to the limit."""
+
+    def __init__(self) -> None:
+        self.slowness = slowness()
+        self.slow: list[tuple[float, str]] = []
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, object, object]:
+        """Time the test itself; a test that passed fails if it used twice the limit."""
+        before = cpu_s()
+        result = yield
+        used = cpu_s() - before
+        if item.get_closest_marker("slow") is None:
+            item.user_properties.append((_USED, used / self.slowness))
+            if used > 2.0 * LIMIT_CPU_S * self.slowness:
+                self.slowness = max(self.slowness, slowness())
+            limit = LIMIT_CPU_S * self.slowness
+            if used > 2.0 * limit:
+                pytest.fail(
+                    f"The test used {used:.1f} CPU s, more than twice the limit of {limit:.1f} CPU s. "
+                    "Make it cheaper, share what it trains in a module's fixture, or mark it slow.",
+                    pytrace=False,
+                )
+        return result
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Remember the tests over the limit."""
+        used = dict(report.user_properties).get(_USED)
+        if report.when == "call" and isinstance(used, float) and used > LIMIT_CPU_S:
+            self.slow.append((used, report.nodeid))
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Name the tests over the limit, the slowest first."""
+        if self.slow:
+            terminalreporter.section(f"fast tests over {LIMIT_CPU_S:.0f} CPU s, in seconds of the reference machine")
+        for used, name in sorted(self.slow, reverse=True):
+            terminalreporter.line(f"{used:6.1f}  {name}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hold every test of the session to the limit, plug-ins' tests too."""
+    config.pluginmanager.register(CpuLimit(), "cpu-limit")

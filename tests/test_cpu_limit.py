@@ -1,0 +1,51 @@
+"""The rule of conftest.py about the CPU time of fast tests, on a small session of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+_TESTS = """
+import time
+import pytest
+
+def burn(seconds):
+    until = time.process_time() + seconds
+    while time.process_time() < until:
+        pass
+
+@pytest.fixture(scope="module")
+def trained():
+    burn(0.5)
+
+def test_cheap(trained): pass
+def test_over(): burn(0.15)
+def test_far_over(): burn(0.6)
+@pytest.mark.slow
+def test_marked_slow(): burn(0.6)
+"""
+_CHANGES = "LIMIT_CPU_S = 0.1\nCALIBRATION_CPU_S = 1000.0\n"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("session")
+    (folder / "conftest.py").write_text((Path(__file__).parent / "conftest.py").read_text() + "\n" + _CHANGES)
+    (folder / "test_it.py").write_text(_TESTS)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(folder), str(folder), "-q"]
+    environment = {**os.environ, "PYTEST_ADDOPTS": ""}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
+
+
+def test_a_test_of_twice_the_limit_fails(report: str) -> None:
+    assert "1 failed, 3 passed" in report
+    assert "test_far_over" in report and "more than twice the limit of 0.1 CPU s" in report
+
+
+def test_a_test_over_the_limit_is_named(report: str) -> None:
+    _, _, named = report.partition("fast tests over")
+    assert "test_over" in named and "test_cheap" not in named and "test_marked_slow" not in named
