@@ -50,7 +50,8 @@ class ModelOnlyTraining:
         self._generator = torch.Generator(device).manual_seed(seeds.child("episodes").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
         self.controller = Controller(size, self._n_actions, self.settings.controller, weights)
-        self._memory = ImaginedMemory(self.settings.memory.imagined, size, device)
+        weighted = self.settings.imagination.confidence_scale is not None
+        self._memory = ImaginedMemory(self.settings.memory.imagined, size, device, weighted=weighted)
 
     def episode(self, starts: StartMemory, real: RealMemory, meters: Meters) -> None:
         """Imagine one episode from a replayed start, learning at every step of it.
@@ -62,15 +63,18 @@ class ModelOnlyTraining:
         weights = imagination.draw_weights(generator)
         imagination.filter.move_threshold(imagination.model, real, weights.dynamics, generator)
         z, predicted, kept = starts.sample(1, generator), 0, 0
+        gathered = torch.zeros(1, device=z.device)
         while kept < settings.depth:
             chance = max(epsilon(self.steps, self.settings.controller), settings.exploration)
             action = imagination.act(self.controller, z, chance, generator)
             step = imagination.step(z, action, weights, generator)
             predicted += 1
-            if not bool(imagination.keeps(step)):
+            if not bool(imagination.keeps(step, gathered)):
                 break
             terminated = step.p_terminated > TERMINAL
-            self._memory.add(Batch(z, action, step.reward, step.next_z, terminated.float()))
+            weight = imagination.confidence(step, gathered)
+            self._memory.add(Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight))
+            gathered = imagination.gathered_with(step, gathered)
             for _ in range(self.settings.controller.updates_per_step):
                 batch = self._memory.sample(self.settings.controller.batch_size, generator)
                 meters.add("loss/bellman_imagined", self.controller.update(batch))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.errors import DivergedError
+from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -165,6 +165,24 @@ class Imagination:
             return bounded
         return bounded & self.filter.passes(gathered + self.uncertainty(step), step.p_terminated, step.reward_std)
 
+    def confidence(self, step: Imagined, gathered: Tensor) -> Tensor | None:
+        """What each of N transitions counts in updates, in (0, 1]; None where all count alike. Shape (N,)."""
+        scale = self.settings.confidence_scale
+        if scale is None:
+            return None
+        return 1.0 / (1.0 + (gathered + self.uncertainty(step)) / scale)
+
+    def gathered_with(self, step: Imagined, gathered: Tensor) -> Tensor:
+        """The uncertainty of each rollout up to and with this step, where steps accumulate; else as before: (N,)."""
+        return gathered + self.uncertainty(step) if self.settings.accumulates else gathered
+
+    def require_no_confidence(self, reader: str) -> None:
+        """Raise InvalidValueError if transitions are to be weighed by confidence, which ``reader`` cannot do."""
+        if self.settings.confidence_scale is not None:
+            raise InvalidValueError(
+                f"{reader} cannot weigh transitions by their confidence; leave imagination.confidence_scale out."
+            )
+
     def admits(self, z: Tensor, action: Tensor, step: Imagined, gathered: Tensor | float) -> Tensor:
         """Which of N transitions a rollout keeps and goes on from: those of :meth:`keeps`. Shape (N,), bool."""
         del z, action
@@ -194,11 +212,10 @@ class Imagination:
             keep = self.admits(z, action, step, gathered)
             predicted, accepted = predicted + len(z), accepted + int(keep.sum())
             if keep.any():
-                weight = None if scale is None else 1.0 / (1.0 + (gathered + self.uncertainty(step)) / scale)
+                weight = self.confidence(step, gathered)
                 imagined = Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight)
                 self.memory.add(imagined.where(keep))
-            if settings.accumulates:
-                gathered = gathered + self.uncertainty(step)
+            gathered = self.gathered_with(step, gathered)
             going_on = keep & ~terminated
             z, gathered = step.next_z[going_on], gathered[going_on]
             if len(z) == 0:

@@ -46,7 +46,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         horizon: Most steps of an episode.
 
     Raises:
-        InvalidValueError: No such number of episodes or steps, or a pool that is empty or of another size of latents.
+        InvalidValueError: No such number of episodes or steps, a pool that is empty or of another size of latents, or
+            transitions that are to be weighed by confidence, for which an environment has no place.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
@@ -54,6 +55,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
     def __init__(self, imagination: Imagination, starts: Latents, *, num_envs: int = 1, horizon: int = 10) -> None:
         if num_envs < 1 or horizon < 1:
             raise InvalidValueError(f"num_envs is {num_envs} and horizon {horizon}; each must be at least 1.")
+        imagination.require_no_confidence("An imagined environment")
         model = imagination.model
         if starts.ndim != 2 or len(starts) == 0 or starts.shape[1] != model.latent_size:
             raise InvalidValueError(
@@ -67,6 +69,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         self._z, self._steps = np.empty((0, model.latent_size), np.float32), np.zeros(num_envs, np.int64)
+        self._gathered = torch.zeros(num_envs, device=self._generator.device)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -74,6 +77,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
         super().reset(seed=seed)
         self._z, self._steps[:] = self._draw_starts(self.num_envs), 0
+        self._gathered.zero_()
         return self._z.copy(), {}
 
     def step(self, actions: NDArray[np.int64]) -> tuple[Latents, Floats, Switches, Switches, dict[str, Any]]:
@@ -93,7 +97,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
             torch.tensor(values, device=generator.device) for values in (self._z, np.asarray(actions, np.int64))
         )
         step = imagination.step(z, action, imagination.draw_weights(generator), generator)
-        accepted = imagination.keeps(step).cpu().numpy()
+        accepted = imagination.keeps(step, self._gathered).cpu().numpy()
+        self._gathered = imagination.gathered_with(step, self._gathered)
         reached = np.where(accepted[:, None], step.next_z.cpu().numpy(), self._z)  # [N, Z]
         reward = np.where(accepted, step.reward.cpu().numpy(), 0.0).astype(np.float64)
         self._steps += 1
@@ -102,6 +107,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         ended = terminated | truncated
         info = self._info(step, accepted, reached, ended)
         reached[ended], self._steps[ended] = self._draw_starts(int(ended.sum())), 0
+        self._gathered[torch.from_numpy(ended)] = 0.0
         self._z = reached
         return self._z.copy(), reward, terminated, truncated, info
 

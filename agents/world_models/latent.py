@@ -42,6 +42,7 @@ class LatentModel:
         self.compares = settings.model.members * weight_samples(settings) > 1
         """Whether there are several networks, whose disagreement is an epistemic uncertainty."""
         self.imagination = self.new_imagination(context)
+        self.imagination.require_no_confidence("A world model that is judged")
 
     def new_imagination(self, context: AgentContext) -> Imagination:
         """What imagines, of which nothing is learned yet."""
@@ -84,6 +85,7 @@ class LatentModel:
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
+        gathered = torch.zeros(len(z))
         steps: dict[str, list[Any]] = {
             name: [] for name in ("pictures", "rewards", "p_ended", "accepted", *UNCERTAINTIES)
         }
@@ -96,7 +98,8 @@ class LatentModel:
             steps["rewards"].append((alive * step.reward).numpy())
             alive = alive * (1.0 - step.p_terminated)
             steps["p_ended"].append((1.0 - alive).numpy())
-            kept = kept & self.imagination.keeps(step)  # what follows a discarded step is discarded
+            kept = kept & self.imagination.keeps(step, gathered)  # what follows a discarded step is discarded
+            gathered = self.imagination.gathered_with(step, gathered)
             steps["accepted"].append(kept.view(rows, samples).float().mean(dim=1).numpy() >= _MOST)
             for name in UNCERTAINTIES:
                 reduced = self.imagination.filter.score(getattr(spread, name))

@@ -248,8 +248,21 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     wanted = Protocol(task=spec.id, preset=preset, **values)
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         _require_takes(agent, wanted)
+    _require_learner(wanted)
     require_same_world(wanted.task, wanted.after)
     return wanted
+
+
+def _require_learner(wanted: Protocol) -> None:
+    """Raise InvalidValueError for an option of training where no agent of the bench learns."""
+    if any(agent_entry(agent).learns for agent in wanted.agents):
+        return
+    for option in ("dataset", "demonstrations", "queries", "feedback", "after"):
+        if getattr(wanted, option):
+            raise InvalidValueError(
+                f"No agent of this bench learns ({', '.join(wanted.agents)}), so --{option} changes nothing; leave it "
+                "out, or give an agent that learns."
+            )
 
 
 def _require_takes(agent: str, wanted: Protocol) -> None:

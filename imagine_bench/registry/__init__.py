@@ -271,7 +271,9 @@ def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
 
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
-    return load(agent_entry(agent).settings).names()
+    where = agent_entry(agent).settings
+    names: frozenset[str] = load(where).names() if where else frozenset()
+    return names
 
 
 def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -289,7 +291,7 @@ def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
-    """An agent's settings, a dataclass, with those of the overrides that it has.
+    """An agent's settings, a dataclass, with those of the overrides that it has; None of an agent without settings.
 
     Raises:
         UnknownNameError: No such hyper-parameter set or config group.
@@ -297,7 +299,8 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], gro
     """
     entry, own = agent_entry(agent), entrant(agent).agent in AGENTS
     with _guests_faults(f"Agent {agent} (settings {entry.settings})", own=own):
-        return load(entry.settings).resolve(hyperparameters, own_settings(agent, overrides), group)
+        given = own_settings(agent, overrides)
+        return load(entry.settings).resolve(hyperparameters, given, group) if entry.settings else None
 
 
 @contextmanager

@@ -33,6 +33,7 @@ TASKS: dict[str, TaskEntry] = {
 }  # fmt: skip
 
 _TRUE_STATE = "the true macrostate (privileged: other learners see frames)"
+_IMAGINATION_SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
 _COUNT_TABLE_SETTINGS = "imagine_bench.agents.tabular.settings:HYPERPARAMETERS"
 _LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
 
@@ -51,10 +52,12 @@ AGENTS: dict[str, AgentEntry] = {
         description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
     ),
     "imagination": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.imagination.agent:make",
         description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.imagination.agent:make_uncertainty", title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
@@ -99,11 +102,13 @@ AGENTS: dict[str, AgentEntry] = {
         description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
     ),
     "imagination_only": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.imagination.model_only:make",
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
         "world is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.imagination.model_only:make_uncertainty", title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
@@ -163,10 +168,12 @@ AGENTS: dict[str, AgentEntry] = {
         description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
     ),
     "imagination_exact": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.controls.exact:make", privileged=True, title="imagination, exact model",
         description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
     ),
     "imagination_exact_filter": AgentEntry(
+        settings=_IMAGINATION_SETTINGS,
         make="imagine_bench.agents.controls.exact:make_filter", privileged=True, title="imagination, exact filter",
         description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
         "right by the rules.",

@@ -45,8 +45,8 @@ class AgentEntry:
     needs_encoder: bool = True  #: Whether it sees what an encoder gives
     encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
     #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
-    #: group)``.
-    settings: str = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
+    #: group)``; by default it has none.
+    settings: str = ""
     privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
     #: Parts of :data:`.interfaces.OBSERVATIONS` that it can take, images of any size; by default 64 x 64 frames alone
     observes: tuple[str, ...] = ()

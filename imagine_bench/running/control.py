@@ -113,7 +113,8 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
             raise UnknownNameError("setting", name, sorted(known))
     name, group = wanted.hyperparameters, wanted.config_group
     found = {agent: registry.settings(agent, name, overrides, group) for agent in wanted.agents}
-    return {agent: dataclasses.asdict(found[agent]) for agent in wanted.agents if registry.agent_entry(agent).learns}
+    learners = [agent for agent in wanted.agents if registry.agent_entry(agent).learns]
+    return {agent: {} if found[agent] is None else dataclasses.asdict(found[agent]) for agent in learners}
 
 
 def _encoders(wanted: Protocol, given: str | None) -> Encoders:

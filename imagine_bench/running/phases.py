@@ -7,7 +7,13 @@ from collections.abc import Callable
 from contextlib import closing
 
 from imagine_bench.interfaces import Observation
-from imagine_bench.interfaces.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
+from imagine_bench.interfaces.capabilities import (
+    ExternalTrainer,
+    ModelOnlyTrainer,
+    QueryingAgent,
+    TransferLearner,
+    begin_episode,
+)
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.running.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
 from imagine_bench.running.lanes import episodes_in_lanes, lanes_pay
@@ -56,6 +62,7 @@ def train(run: Run, budget: int) -> None:
 
 def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
     counters, episode = run.counters, run.counters.episode
+    begin_episode(run.agent)
     for transition in dataset.transitions(episode):
         run.agent.observe(transition, episode=episode)
     counters.add_episode(bool(dataset.success[episode]), int(dataset.lengths[episode]))
@@ -64,6 +71,8 @@ def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
 def _training_episode(run: Run, *, demonstrated: bool) -> None:
     counters, length, success = run.counters, 0, False
     seed = episode_seed("training", run.spec.seed, counters.episode)
+    if demonstrated:
+        begin_episode(run.agent)  # an agent that acts is told by play()
     queries = None if demonstrated else _queries(run)
     teacher = None if demonstrated else _teacher(run)
     watching = [each for each in (queries, teacher) if each is not None]

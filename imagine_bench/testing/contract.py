@@ -10,6 +10,7 @@ from imagine_bench.errors import InvalidValueError, plain
 from imagine_bench.testing.common import NotOffered
 from imagine_bench.testing.of_agents import AGENT_CHECKS, checked_agent
 from imagine_bench.testing.of_models import MODEL_CHECKS, CheckedModel
+from imagine_bench.testing.of_options import OPTION_ROWS, CheckedOptions, watching_teaches_as_living
 from imagine_bench.testing.of_tasks import TASK_CHECKS
 
 Checks = Mapping[str, Callable[[], None]]
@@ -28,8 +29,12 @@ def checks(task: str | None = None, agent: str | None = None, model: str | None 
         raise InvalidValueError("An agent and a world model are checked one at a time; give --agent or --model.")
     where = task or _USUAL
     if agent is not None:
-        one = checked_agent(agent, where)
-        return {what: functools.partial(check, one) for what, check in AGENT_CHECKS.items()}
+        one, options = checked_agent(agent, where), CheckedOptions(agent, where)
+        found = {what: functools.partial(check, one) for what, check in AGENT_CHECKS.items()}
+        found["watched episodes teach it what its own do"] = functools.partial(watching_teaches_as_living, one)
+        for option in OPTION_ROWS:
+            found[f"the option {option} has an effect or is refused"] = functools.partial(options.check, option)
+        return found
     if model is not None:
         if registry.world_model_entry(model).privileged:
             raise InvalidValueError(f"World model {model} is given the rules and learns nothing; name one that learns.")

@@ -14,7 +14,6 @@ import hashlib
 import shutil
 import tempfile
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,18 +25,21 @@ from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
-from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.evaluation import play
-from imagine_bench.running.run_state import Run, environments
+from imagine_bench.running.evaluation import Env, play
+from imagine_bench.running.run_state import Run, make_env
+from imagine_bench.store import encoders
 from imagine_bench.store.counters import Counters
-from imagine_bench.testing.common import NotOffered, make_env, require
+from imagine_bench.testing.common import NotOffered, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
 
 _EPISODES = 2
+_TESTS = 8
+"""Test episodes of an agent whose training is a library's or none: some end with their first macro-action."""
 Changes = Mapping[str, Any]
 
 
@@ -49,16 +51,20 @@ class OptionRow:
     changes: Changes  #: What the bench with the option has
     without: Changes = field(default_factory=dict)  #: What the bench that it is compared with has
     world: str = ""  #: An option of the task's world, ``key=value``, in place of a field
+    episodes: int = 2  #: Training episodes of either run
 
 
 _TASK = "the task that is checked"
 OPTION_ROWS: Mapping[str, OptionRow] = {
     "dataset": OptionRow(fields=("dataset",), changes={"dataset": "a folder of two episodes"}),
     "demonstrations": OptionRow(fields=("demonstrations",), changes={"demonstrations": _EPISODES}),
-    "queries": OptionRow(fields=("queries",), changes={"queries": 1}),
+    "queries": OptionRow(fields=("queries",), changes={"queries": 1}, episodes=8),
     "feedback": OptionRow(fields=("feedback",), changes={"feedback": 1.0}),
     "feedback error": OptionRow(
-        fields=("feedback_error",), without={"feedback": 1.0}, changes={"feedback": 1.0, "feedback_error": 0.5}
+        fields=("feedback_error",),
+        without={"feedback": 1.0},
+        changes={"feedback": 1.0, "feedback_error": 0.5},
+        episodes=6,
     ),
     "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
     "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}),
@@ -117,9 +123,9 @@ class CheckedOptions:
     def check(self, option: str) -> None:
         """Raise InvalidValueError if the option changes nothing; NotOffered, with the sentence, if it is refused."""
         row = OPTION_ROWS[option]
-        base = self.run(self.task, tuple(row.without.items()))
         try:
-            changed = self.run(self._task_of(row), tuple(self._given(row).items()))
+            base = self.run(self.task, tuple(row.without.items()), row.episodes)
+            changed = self.run(self._task_of(row), tuple(self._given(row).items()), row.episodes)
         except ImagineBenchError as refusal:
             raise NotOffered(f"it is refused: {refusal}") from refusal
         require(base != changed, f"{option} changes nothing that {self.agent} does, earns or learns")
@@ -129,6 +135,9 @@ class CheckedOptions:
             return {"dataset": _dataset(self.task)}
         if "after" in row.changes:
             return {**row.changes, "after": (self.task,)}
+        if row.world and self.entry.needs_encoder:  # that of the task: one of its own would have to be trained
+            encoder = encoders.own(registry.task(self.task), "clean", self.entry.encoder_kind)
+            return {**row.changes, "encoder": str(encoder)}
         return row.changes
 
     def _task_of(self, row: OptionRow) -> str:
@@ -141,11 +150,11 @@ class CheckedOptions:
             raise NotOffered(f"{base} has no such option")
         return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
 
-    def _run(self, task: str, changes: tuple[tuple[str, Any], ...]) -> str:
-        """What two episodes of training, and of tests for one that learns nothing, left: a digest."""
+    def _run(self, task: str, changes: tuple[tuple[str, Any], ...], episodes: int) -> str:
+        """What some episodes of training, or of tests for one that learns nothing, left: a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(
-            task, "smoke", agents=(self.agent,), seeds=(0,), budgets=(_EPISODES,), evaluation_episodes=_EPISODES,
+            task, "smoke", agents=(self.agent,), seeds=(0,), budgets=(episodes,), evaluation_episodes=_TESTS,
             open_loop_starts=0, recorded_episodes=0, **given,
         )  # fmt: skip
         encoder = paths[self.entry.encoder_kind] if self.entry.needs_encoder else None
@@ -153,8 +162,26 @@ class CheckedOptions:
             protocol=wanted, agent=self.agent, seed=0, encoder=encoder, dataset=paths.get("dataset"),
             checkpoint_every_s=1e9,
         )  # fmt: skip
-        with tempfile.TemporaryDirectory() as folder, environments(wanted) as (env, test_env):
+        env, test_env = (_environment(_world(wanted), testing=testing) for testing in (False, True))
+        with tempfile.TemporaryDirectory() as folder:
             return _carried_out(Run(spec, Path(folder), _silent, env, test_env))
+
+
+def _world(wanted: Protocol) -> Protocol:
+    """The part of a protocol that its environments are made from; the rest is as in any."""
+    return Protocol(
+        task=wanted.task, preset="check", agents=("random",), execution=wanted.execution, split=wanted.split,
+        appearance=wanted.appearance, physics=wanted.physics, observation=wanted.observation,
+        observation_size=wanted.observation_size,
+    )  # fmt: skip
+
+
+@functools.cache
+def _environment(world: Protocol, *, testing: bool) -> Env:
+    """The environment of a world, made once: episodes carry nothing over to the next."""
+    env = make_env(world, world.task, testing=testing)
+    atexit.register(env.close)
+    return env
 
 
 def _silent(progress: Progress) -> None:
@@ -162,15 +189,19 @@ def _silent(progress: Progress) -> None:
 
 
 def _carried_out(run: Run) -> str:
-    """Train, or test one that learns nothing; a digest of what it did and earned, and of what it is then."""
-    watched = _WatchedAgent(run.agent, sees=not run.entry.learns)
-    if run.entry.external_training_loop:
-        phases.train_externally(run, run.agent, lambda budget: None)  # type: ignore[arg-type]
+    """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
+    external = run.entry.external_training_loop
+    watched = _WatchedAgent(run.agent, sees=external or not run.entry.learns)
+    if isinstance(run.agent, ExternalTrainer):
+        phases.train_externally(run, run.agent, lambda budget: None)
+    if external:  # a library may learn nothing from so little: what counts is what it is shown
+        run.agent = watched
+        phases.test(run)
     elif run.entry.learns:
         run.agent = watched
         phases.transfer(run)
-        phases.train(run, _EPISODES)
-        episodes = run.protocol.episodes_before + _EPISODES
+        phases.train(run, run.protocol.budgets[-1])
+        episodes = run.protocol.episodes_before + run.protocol.budgets[-1]
         require(watched.begun >= episodes, f"told of {watched.begun} beginnings of {episodes} training episodes")
     else:
         run.agent = watched
@@ -253,12 +284,13 @@ def watching_teaches_as_living(one: CheckedAgent) -> None:
         raise NotOffered("it does not learn from episodes that are shown to it")
     actor, watcher = one.make(), one.make()
     starts: list[Observation] = []
-    with closing(make_env(one.spec)) as env:
-        for episode in range(_EPISODES):
-            begin_episode(watcher)
-            for transition, _ in play(env, actor, seed=episode, explore=True, privileged=one.entry.privileged):
-                starts.append(transition.observation)
-                actor.observe(transition, episode=episode)
-                watcher.observe(transition, episode=episode)
+    world = Protocol(task=one.spec.id, preset="check", agents=("random",), execution=one.spec.executions[-1])
+    env = _environment(world, testing=False)
+    for episode in range(_EPISODES):
+        begin_episode(watcher)
+        for transition, _ in play(env, actor, seed=episode, explore=True, privileged=one.entry.privileged):
+            starts.append(transition.observation)
+            actor.observe(transition, episode=episode)
+            watcher.observe(transition, episode=episode)
     require(same_arrays(actor.state(), watcher.state()), "it learned otherwise from episodes that it was only shown")
     require(greedy(actor, starts) == greedy(watcher, starts), "it then acts otherwise")

@@ -14,9 +14,12 @@ from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.agent import make as make_agent
 from imagine_bench.agents.imagination.agent import make_uncertainty
 from imagine_bench.agents.imagination.mixture import Mixture
+from imagine_bench.agents.imagination.model_only import ModelOnlyTraining
 from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
-from imagine_bench.agents.replay import Batch, RealMemory
+from imagine_bench.agents.imagination.vector_env import ImaginedVectorEnv
+from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.replay import Batch, RealMemory, StartMemory
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.seeding import SeedTree
@@ -27,6 +30,8 @@ UNCERTAINTY = 0.1
 
 class Unsure(CountingModel):
     """As uncertain of every step as of any other."""
+
+    n_actions = 2
 
     def predict(self, z: torch.Tensor, action: torch.Tensor, weights: None) -> Mixture:
         sound = super().predict(z, action, weights)
@@ -62,6 +67,42 @@ def test_filter_and_weights_go_together() -> None:
     imagination, controller = make(filtered=True, model=Unsure(), threshold=0.35, accumulates=True, confidence_scale=1)
     assert sorted(set(depths(imagination, controller))) == [1.0, 2.0, 3.0]
     assert len(imagination.memory.arrays()["weight"]) == 9
+
+
+def practised(**changes: object) -> ModelOnlyTraining:
+    """One imagined episode of a controller that is trained in the model alone."""
+    imagination, _ = make(filtered=True, model=Unsure(), threshold=0.35, **changes)
+    settings = Settings(imagination=imagination.settings, controller=ControllerSettings(hidden=(8,), batch_size=4))
+    training = ModelOnlyTraining(imagination, 2, settings, SeedTree(0), CPU)
+    starts = StartMemory(1, 2, CPU)
+    starts.add((torch.zeros(2), torch.zeros(2)))
+    training.episode(starts, NOTHING_REAL, Meters())
+    return training
+
+
+@pytest.mark.parametrize(("accumulates", "depth"), [(False, 10), (True, 3)])
+def test_model_only_training_gathers_and_weighs_uncertainty(accumulates: bool, depth: int) -> None:
+    training = practised(accumulates=accumulates, confidence_scale=0.2)
+    assert training.steps == depth
+    gathered = UNCERTAINTY * (np.arange(1, depth + 1) if accumulates else np.ones(depth))
+    np.testing.assert_allclose(training.arrays()["memory/weight"], 1.0 / (1.0 + gathered / 0.2), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("accumulates", "depth"), [(False, 10), (True, 3)])
+def test_an_imagined_environment_gathers_uncertainty(accumulates: bool, depth: int) -> None:
+    imagination, _ = make(filtered=True, model=Unsure(), threshold=0.35, accumulates=accumulates)
+    env = ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32), num_envs=2, horizon=10)
+    for seed in range(2):  # a new episode has gathered nothing
+        env.reset(seed=seed)
+        accepted = [env.step(np.zeros(2, np.int64))[4]["accepted"].tolist() for _ in range(10)]
+        assert [all(each) for each in accepted[:depth]] == [True] * depth
+        assert depth == 10 or accepted[depth] == [False, False]
+
+
+def test_who_cannot_weigh_by_confidence_refuses_it() -> None:
+    imagination, _ = make(filtered=True, model=Unsure(), threshold=0.35, confidence_scale=0.2)
+    with pytest.raises(InvalidValueError, match=r"cannot weigh .* leave imagination\.confidence_scale out"):
+        ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32))
 
 
 def test_the_controller_learns_by_weight() -> None:

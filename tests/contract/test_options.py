@@ -1,0 +1,53 @@
+"""Every agent with every option of a protocol: the option has an effect or is refused; watching teaches as living."""
+
+from __future__ import annotations
+
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.running.control import plan_control
+from imagine_bench.testing.common import NotOffered
+from imagine_bench.testing.of_agents import checked_agent
+from imagine_bench.testing.of_options import (
+    OPTION_ROWS,
+    CheckedOptions,
+    require_every_field,
+    watching_teaches_as_living,
+)
+
+TASK = "arrow_puzzle:horizon=3"
+
+
+def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:
+    require_every_field()
+
+
+@pytest.mark.parametrize("agent", sorted(registry.agents()))
+def test_every_option_has_an_effect_or_is_refused(agent: str) -> None:
+    options, refused = CheckedOptions(agent, TASK), set()
+    for option in OPTION_ROWS:
+        try:
+            options.check(option)
+        except NotOffered:
+            refused.add(option)
+    assert not refused & {"split", "physics", "appearance", "gesture", "lag"}, "what the world is like is for all"
+
+
+@pytest.mark.parametrize("agent", sorted(registry.agents()))
+def test_watching_episodes_teaches_as_living_them(agent: str) -> None:
+    try:
+        watching_teaches_as_living(checked_agent(agent, TASK))
+    except NotOffered:
+        pytest.skip("it learns from no episodes that are shown to it")
+
+
+@pytest.mark.parametrize("option", [{"demonstrations": 2}, {"queries": 1}, {"feedback": 1.0}, {"after": (TASK,)}])
+def test_options_of_training_are_refused_where_no_agent_learns(option: dict[str, object]) -> None:
+    with pytest.raises(InvalidValueError, match="No agent of this bench learns"):
+        plan_control(TASK, "smoke", agents=("random", "oracle"), **option)
+
+
+@pytest.mark.parametrize("agent", ["random", "oracle"])
+def test_agents_without_settings_take_none(agent: str) -> None:
+    assert not registry.setting_names(agent)
