@@ -29,7 +29,8 @@ from .encoders.recipes import Recipe
 from .encoders.training import classes_of, draw_frames
 
 _CERTAIN = -20.0  # log variance of a latent that is known
-_FRAMES, _PROBE_STEPS = 4000, 2000
+_FRAMES = 4000
+_PROBE_STEPS = 2000
 _GRAY = 0.5  # of a picture that nobody can draw
 
 
@@ -48,7 +49,8 @@ class OfferedNetwork(EncoderNetwork):
         super().__init__()
         module, _, attribute = offer.partition(":")
         self.offered: FrameEncoder = getattr(importlib.import_module(module), attribute)()
-        self.offer, self.latent_size = offer, latent_size
+        self.offer = offer
+        self.latent_size = latent_size
         self.register_buffer("centre", torch.zeros(latent_size))
         self.register_buffer("scale", torch.ones(latent_size))
 
@@ -107,7 +109,8 @@ def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path:
     size: dict[str, Any] = {"frames": _FRAMES, "held_out_frames": _FRAMES // 4, "probe_steps": _PROBE_STEPS}
     recipe = Recipe(name=name, architecture="offered", **size)
     seeds = SeedTree(0).child("encoder_training", spec.id, appearance)
-    rng, generator = seeds.generator(), torch.Generator().manual_seed(seeds.child("torch").integer())
+    rng = seeds.generator()
+    generator = torch.Generator().manual_seed(seeds.child("torch").integer())
     frames, macrostates = draw_frames(spec, appearance, recipe.frames, rng)
     unseen, theirs = draw_frames(spec, appearance_of_tests(appearance), recipe.held_out_frames, rng)
     offered = OfferedNetwork(offer, 0).offered
@@ -116,12 +119,24 @@ def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path:
     cardinalities = classes_of(spec)
     probe = empty_probe(network.latent_size, cardinalities, PROBE_HIDDEN).to_empty(device="cpu")
     card = EncoderCard(
-        task=spec.id, appearance=appearance, recipe=recipe, preprocessing=spec.preprocessing,
-        latent_size=network.latent_size, macrostate_names=spec.macrostate_names, cardinalities=cardinalities, seed=0,
+        task=spec.id,
+        appearance=appearance,
+        recipe=recipe,
+        preprocessing=spec.preprocessing,
+        latent_size=network.latent_size,
+        macrostate_names=spec.macrostate_names,
+        cardinalities=cardinalities,
+        seed=0,
         command=f"imagine-bench bench --task {spec.id} --appearance {appearance} --encoder {name}",
-        data=f"{recipe.frames} frames for scale and probe; what {offer} was trained on is its own", versions={},
-        cpu_s={}, kl_nats=math.nan, reconstruction=math.nan, probe={}, code_sizes=sizes, offer=offer,
-    )  # fmt: skip
+        data=f"{recipe.frames} frames for scale and probe; what {offer} was trained on is its own",
+        versions={},
+        cpu_s={},
+        kl_nats=math.nan,
+        reconstruction=math.nan,
+        probe={},
+        code_sizes=sizes,
+        offer=offer,
+    )
     encoder = OfferedEncoder(network, probe, card)
     if not sizes:
         mu = encoder.encode(frames)[0]

@@ -85,7 +85,9 @@ class Encoder:
     """Frames to latents and back, with no gradient and no randomness, and an evaluation-only reader (``probe``)."""
 
     def __init__(self, network: EncoderNetwork, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
-        self.card, self.latent_size, self.device = card, card.latent_size, torch.device(device)
+        self.card = card
+        self.latent_size = card.latent_size
+        self.device = torch.device(device)
         self.network = network.to(self.device).requires_grad_(False).eval()
         self.probe = probe.to(self.device).requires_grad_(False).eval()
         self._preprocess = preprocess(card.preprocessing)

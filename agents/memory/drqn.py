@@ -40,7 +40,9 @@ class DRQN(RememberingAgent):
 
     def new_controller(self, generator: torch.Generator) -> Controller:
         """Values with a memory of their own."""
-        size, units, settings = self.perception.latent_size, self.settings.recurrence.units, self.settings.controller
+        size = self.perception.latent_size
+        units = self.settings.recurrence.units
+        settings = self.settings.controller
         network = RecurrentValues(size - units, self.n_actions, units, settings, generator)
         return Controller(size, self.n_actions, settings, generator, network)
 
@@ -52,7 +54,8 @@ class DRQN(RememberingAgent):
     def draw_batch(self, memory: Transitions) -> Batch:
         """Replayed sequences as transitions between states, through which the loss reaches what remembers."""
         del memory
-        count, length = self.settings.controller.batch_size, self.settings.recurrence.sequence
+        count = self.settings.controller.batch_size
+        length = self.settings.recurrence.sequence
         sequences = self.real.draw(count, length, self._replay)
         with torch.no_grad():
             then = sequences.states(self.controller.target.recurrence)  # type: ignore[arg-type]

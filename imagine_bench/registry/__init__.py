@@ -142,7 +142,8 @@ def offers(group: str) -> Mapping[str, Any]:
     """
     found: dict[str, Any] = {}
     for point in entry_points(group=group):
-        what, kind = _GROUPS[group].what, load(_GROUPS[group].kind)
+        what = _GROUPS[group].what
+        kind = load(_GROUPS[group].kind)
         package = point.dist.name if point.dist else point.module
         offer = f"The package {package} offers {point.value} as {what} {point.name}"
         if point.name in found or point.name in _GROUPS[group].own():
@@ -238,9 +239,11 @@ def register_env(entry: TaskEntry) -> None:
     gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
     if entry.env.startswith("imagine_bench."):
         gymnasium.register(
-            vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
-            max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
-        )  # fmt: skip
+            vector_id(entry.env_id),
+            vector_entry_point="imagine_bench.tasks.vector_env:make",
+            max_episode_steps=entry.horizon,
+            kwargs={"env": entry.env, **entry.options},
+        )
 
 
 def vector_id(env_id: str) -> str:
@@ -295,7 +298,8 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], gro
         UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    entry, own = agent_entry(agent), entrant(agent).agent in AGENTS
+    entry = agent_entry(agent)
+    own = entrant(agent).agent in AGENTS
     with _guests_faults(f"Agent {agent} (settings {entry.settings})", own=own):
         return load(entry.settings).resolve(hyperparameters, own_settings(agent, overrides), group)
 
@@ -328,7 +332,8 @@ def task(name: str) -> TaskSpec:
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
             raise TypeError(f"it is {brief(spec)} and no TaskSpec")
-    listed, values = getattr(spec.rules, "states", None), tuple(map(len, spec.macrostate_values))
+    listed = getattr(spec.rules, "states", None)
+    values = tuple(map(len, spec.macrostate_values))
     counts = tuple(1 + max(column) for column in zip(*listed, strict=True)) if listed else values
     for what, ours, theirs in (
         ("id", name if name in known else spec.id, spec.id),
@@ -348,7 +353,8 @@ def task(name: str) -> TaskSpec:
 
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    entry, own = agent_entry(name), entrant(name).agent in AGENTS
+    entry = agent_entry(name)
+    own = entrant(name).agent in AGENTS
     with _guests_faults(f"Agent {name} ({entry.make})", own=own):
         agent: Agent = load(entry.make)(context)
     return agent
@@ -392,7 +398,8 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
-    entry, own = regressor_entry(name), entrant(name).agent in REGRESSORS
+    entry = regressor_entry(name)
+    own = entrant(name).agent in REGRESSORS
     with _guests_faults(f"Regressor {name} ({entry.make})", own=own):
         regressor: Regressor = load(entry.make)(context)
     return regressor

@@ -145,14 +145,25 @@ class CheckedOptions:
         """What two episodes of training, and of tests for one that learns nothing, left: a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(
-            task, "smoke", agents=(self.agent,), seeds=(0,), budgets=(_EPISODES,), evaluation_episodes=_EPISODES,
-            open_loop_starts=0, recorded_episodes=0, **given,
-        )  # fmt: skip
+            task,
+            "smoke",
+            agents=(self.agent,),
+            seeds=(0,),
+            budgets=(_EPISODES,),
+            evaluation_episodes=_EPISODES,
+            open_loop_starts=0,
+            recorded_episodes=0,
+            **given,
+        )
         encoder = paths[self.entry.encoder_kind] if self.entry.needs_encoder else None
         spec = RunSpec(
-            protocol=wanted, agent=self.agent, seed=0, encoder=encoder, dataset=paths.get("dataset"),
+            protocol=wanted,
+            agent=self.agent,
+            seed=0,
+            encoder=encoder,
+            dataset=paths.get("dataset"),
             checkpoint_every_s=1e9,
-        )  # fmt: skip
+        )
         with tempfile.TemporaryDirectory() as folder, environments(wanted) as (env, test_env):
             return _carried_out(Run(spec, Path(folder), _silent, env, test_env))
 
@@ -251,7 +262,8 @@ def watching_teaches_as_living(one: CheckedAgent) -> None:
     """Raise InvalidValueError if an agent learns otherwise from episodes that it was only shown than from its own."""
     if one.entry.external_training_loop or not one.entry.learns:
         raise NotOffered("it does not learn from episodes that are shown to it")
-    actor, watcher = one.make(), one.make()
+    actor = one.make()
+    watcher = one.make()
     starts: list[Observation] = []
     with closing(make_env(one.spec)) as env:
         for episode in range(_EPISODES):
