@@ -22,9 +22,9 @@ from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
+from imagine_bench.running.trained import Trained
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
-from imagine_bench.store.trained import Trained
 
 _LOOK_S = 2.0  # how long the scene stands still while the plan is shown, before and after the arm moves
 

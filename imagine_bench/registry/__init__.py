@@ -68,18 +68,6 @@ _GROUPS = {
     ),
     WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
 }
-TASK_TYPES = {
-    "control": "imagine_bench.running.control:CONTROL",
-    "regression": "imagine_bench.regression.task_type:REGRESSION",
-}
-"""The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
-
-OBSERVERS = tuple(
-    f"imagine_bench.cli.observers:{name}"
-    for name in ("OpenLoopObserver", "BeliefsObserver", "ExamplesObserver", "RecordingObserver")
-)
-"""What looks at every control run, in this order, each the ``"module:attr"`` of a
-:class:`.running.runner.RunObserver` without arguments."""
 
 
 def load(target: str) -> Any:

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import Episodes, content_hash
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
 from imagine_bench.judge.models.asking import call
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.study import make
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.testing.common import require
 

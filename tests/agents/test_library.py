@@ -12,13 +12,13 @@ from small_runs import measured, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.bench import plan
-from imagine_bench.running.control import run_observed
 from imagine_bench.running.evaluation import TrainingStarts
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder

@@ -20,8 +20,8 @@ from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.trained import load_trained
 from imagine_bench.store import encoders
-from imagine_bench.store.trained import load_trained
 
 _PYPROJECT = """
 [project]

@@ -10,9 +10,9 @@ import pytest
 from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.running import run_state
-from imagine_bench.running.control import run_observed
 from imagine_bench.store import encoders
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult

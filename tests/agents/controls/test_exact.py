@@ -18,10 +18,10 @@ from imagine_bench.agents.imagination.rollouts import Imagined
 from small_runs import small
 
 from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import ExactWorld, Outcome, Transition
 from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.running.control import run_observed
 from imagine_bench.store import encoders
 
 STATES, GOAL = 6, 5

@@ -15,10 +15,10 @@ from imagine_bench.agents.tabular.settings import HYPERPARAMETERS
 from small_runs import small
 
 from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.running.control import run_observed
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 

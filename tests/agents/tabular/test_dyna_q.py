@@ -17,10 +17,10 @@ from imagine_bench.agents.tabular.settings import DYNA_Q, Q_LEARNING
 from small_runs import small
 
 from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.running.control import run_observed
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 

@@ -24,8 +24,8 @@ from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
+from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
-from imagine_bench.store.trained import load_trained
 
 POLICIES = {
     "random": "every macro-action by chance",

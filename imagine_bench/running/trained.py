@@ -13,15 +13,13 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.protocols.task_types import Result
+from imagine_bench.protocols.runs import Result, RunSpec
 from imagine_bench.registry.entries import entrant
 from imagine_bench.registry.old_names import agent_label
-from imagine_bench.store import encoders
-from imagine_bench.store.archive import is_archive
-from imagine_bench.store.bench_folder import BenchStore, read_control
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.files import read_sealed, reading
+from imagine_bench.store.files import reading
 from imagine_bench.store.results import BenchResult, RunResult
 
 
@@ -56,15 +54,14 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
         UnknownNameError: No such encoder.
         InvalidValueError: An agent that sees other observations than frames.
     """
-    path, what = folder / "config.json", "a run's configuration; give a run's folder, .../<agent>/seed_<n>"
-    config = read_sealed(path, what)
-    with reading(path, what):
+    config = run_folder.read_config(folder)
+    with reading(folder / "config.json", "a run's configuration"):
         task = config["protocol"]["task"]
         name = agent_label(config["agent"], config["protocol"])
         seed = config["seed"]
         settings = _flat(config["settings"])
     require_control(task, str(folder))
-    with reading(path, what):
+    with reading(folder / "config.json", "a run's configuration"):
         protocol = Protocol.from_dict(config["protocol"])
     if not protocol.shows_frames_alone:
         raise InvalidValueError(
@@ -72,12 +69,12 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
             "would be asked with 64 x 64 frames alone; give the run of one that sees these."
         )
     spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
-    snapshot = load_newest(folder / "checkpoints")
+    snapshot = load_newest(folder / run_folder.CHECKPOINTS)
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
     agent = registry.make_agent(name, dataclasses.replace(spec.context(), overrides=as_it_ran))
-    with reading(folder / "checkpoints", f"a checkpoint of {name!r}"):
+    with reading(folder / run_folder.CHECKPOINTS, f"a checkpoint of {name!r}"):
         agent.restore(snapshot.agent)
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
         while agent.train_in_model():
@@ -119,7 +116,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
 
 def _has_learned(run: Path) -> bool:
     """Whether a run has had an episode on its task; one with tasks before may have a checkpoint without."""
-    snapshot = load_newest(run / "checkpoints")
+    snapshot = load_newest(run / run_folder.CHECKPOINTS)
     return snapshot is not None and snapshot.episode > 0
 
 
