@@ -93,7 +93,12 @@ def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) 
     """Raise ArtefactError unless the run in ``folder`` is this agent's and seed's of this very protocol."""
     config = read_config(folder)
     protocol_hash = digest(config.get("protocol"))
-    wanted = {"agent": protocol.written_name(agent), "seed": seed, "protocol_hash": protocol_hash, "protocol": protocol.as_dict()}
+    wanted = {
+        "agent": protocol.written_name(agent),
+        "seed": seed,
+        "protocol_hash": protocol_hash,
+        "protocol": protocol.as_dict(),
+    }
     difference = first_difference({name: config.get(name) for name in wanted}, wanted)
     if difference is not None:
         name, was, would_be = difference

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
@@ -30,10 +29,11 @@ from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
+from imagine_bench.running.counters import Counters
 from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import Run, environments
-from imagine_bench.store.counters import Counters
 from imagine_bench.testing.common import NotOffered, make_env, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
 

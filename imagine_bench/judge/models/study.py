@@ -72,7 +72,7 @@ class Judgement:
     seeds: tuple[int, ...] = (0, 1, 2)
     samples: int = SAMPLES  #: Futures imagined of each question
     appearance: str = "clean"
-    policy: str = "random"  #: Who collects the data, as :data:`.data.collect.POLICIES`
+    policy: str = "random"  #: Who collects the data, as :data:`.running.collect.POLICIES`
     #: A bundled name or a file, for the models that read what it gives; the others see through the task's own
     encoder: str | None = None
 
