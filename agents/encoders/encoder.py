@@ -183,7 +183,7 @@ class Encoder:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
         if card.offer:
-            from ..offered_encoder import OfferedEncoder  # noqa: PLC0415 - it is made of this
+            from .offered import OfferedEncoder  # noqa: PLC0415 - it is made of this
 
             return OfferedEncoder(network, probe, card, device)
         return cls(network, probe, card, device)
@@ -222,7 +222,7 @@ def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]
 
 def _empty_network(card: EncoderCard) -> EncoderNetwork:
     if card.offer:
-        from ..offered_encoder import OfferedNetwork  # noqa: PLC0415 - it is made of this
+        from .offered import OfferedNetwork  # noqa: PLC0415 - it is made of this
 
         return OfferedNetwork(card.offer, card.latent_size)
     if card.recipe.kind == "latents":

@@ -209,6 +209,9 @@ class List:
             "encoders": {**bundled(), **registry.usable(registry.ENCODER_GROUP)},
         }.items():
             print(f"{title:22}{', '.join(names)}")
+        for guest in registry.absent_guests():
+            names = [name for each in guest.names.values() for name in each]
+            print(f"{'not installed':22}{', '.join(names)} ({guest.install})")
         for error in registry.refused_offers().values():
             print(f"\n{error}")
 

@@ -39,6 +39,7 @@ from imagine_bench.registry.entries import RegressorEntry as RegressorEntry
 from imagine_bench.registry.entries import TaskEntry as TaskEntry
 from imagine_bench.registry.entries import WorldModelEntry as WorldModelEntry
 from imagine_bench.registry.entries import entrant, parse_options, read_mapping
+from imagine_bench.registry.guests import Guest, guest_of, guests
 from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
 
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
@@ -157,10 +158,22 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
     there = offers(group)
     if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
         raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
+    guest = guest_of(name, group) if name not in there else None
+    if guest is not None:
+        raise SetupError(
+            f"The {_GROUPS[group].what} {name} is in the package {guest.package}, which is not installed. "
+            f"Install it with: {guest.install}"
+        )
     entry = there[require_known(_GROUPS[group].what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
     return entry
+
+
+def absent_guests() -> list[Guest]:
+    """The guests of this suite that are not installed here."""
+    installed = guest_packages()
+    return [guest for guest in guests() if guest.package not in installed]
 
 
 def guest_packages() -> dict[str, frozenset[str]]:

@@ -41,10 +41,6 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }
 
-_TRUE_STATE = "the true macrostate (privileged: other learners see frames)"
-_COUNT_TABLE_SETTINGS = "imagine_bench.agents.tabular.settings:HYPERPARAMETERS"
-_LIBRARY_SETTINGS = "imagine_bench.agents.library.settings:HYPERPARAMETERS"
-
 AGENTS: dict[str, AgentEntry] = {
     "random": AgentEntry(
         make="imagine_bench.agents.baselines:make_random",
@@ -77,13 +73,6 @@ AGENTS: dict[str, AgentEntry] = {
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
     ),
-    "drqn": AgentEntry(
-        make="imagine_bench.agents.memory.drqn:make",
-        settings="imagine_bench.agents.memory.settings:DRQN",
-        title="DQN + memory",
-        description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
-        "sequences as R2D2 does.",
-    ),
     "imagination_memory": AgentEntry(
         make="imagine_bench.agents.memory.imagination:make",
         title="imagination + memory",
@@ -105,31 +94,6 @@ AGENTS: dict[str, AgentEntry] = {
         description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "
         "also show what it imagines and query an oracle.",
     ),
-    "sb3_dqn": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_dqn",
-        needs_encoder=False,
-        settings=_LIBRARY_SETTINGS,
-        external_training_loop=True,
-        title="SB3 DQN (pixels)",
-        observes=OBSERVATIONS,
-        description="Stable-Baselines3's DQN with its convolutional policy, trained on pixels in its own loop.",
-    ),
-    "sb3_qrdqn": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_qrdqn",
-        needs_encoder=False,
-        settings=_LIBRARY_SETTINGS,
-        external_training_loop=True,
-        title="SB3 QR-DQN (pixels)",
-        observes=OBSERVATIONS,
-        description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
-    ),
-    "sb3_dqn_latents": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_dqn",
-        settings=_LIBRARY_SETTINGS,
-        external_training_loop=True,
-        title="SB3 DQN (latents)",
-        description="Stable-Baselines3's DQN on the latents that the suite's own DQN sees.",
-    ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
@@ -145,141 +109,6 @@ AGENTS: dict[str, AgentEntry] = {
         settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
         title="DQN, more updates",
         description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
-    ),
-    "count_table": AgentEntry(
-        make="imagine_bench.agents.tabular.count_table:make",
-        encoder_kind="codes",
-        settings=_COUNT_TABLE_SETTINGS,
-        description="A control: counts what followed each action in each code of a frame, and plans by value "
-        "iteration; explores by chance as DQN does.",
-    ),
-    "count_table_directed": AgentEntry(
-        make="imagine_bench.agents.tabular.count_table:make_directed",
-        encoder_kind="codes",
-        settings=_COUNT_TABLE_SETTINGS,
-        title="count table, directed",
-        description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
-    ),
-    "count_table_own": AgentEntry(
-        make="imagine_bench.agents.tabular.own:make",
-        needs_encoder=False,
-        title="count table, own eyes",
-        settings="imagine_bench.agents.tabular.settings:OWN",
-        description="A control: like count table, directed, but it learns to see from its own frames as factored.",
-    ),
-    **{
-        f"{name}{twin}": AgentEntry(
-            make=f"imagine_bench.agents.tabular.dyna_q:make_{name}{twin}",
-            encoder_kind="codes",
-            settings=f"imagine_bench.agents.tabular.settings:{name.upper()}",
-            needs_encoder=not twin,
-            privileged=bool(twin),
-            title=f"{title} (true state)" if twin else title,
-            description=f"{description}; its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
-        )
-        for name, title, description in (
-            ("q_learning", "Q-learning", "Learns values in a table from real transitions"),
-            ("dyna_q", "Dyna-Q", "Q-learning, also from transitions that its model recalls: imagination's ancestor"),
-        )
-        for twin in ("", "_macrostate")
-    },
-    "dreamer_v3": AgentEntry(
-        make="imagine_bench.agents.library.dreamer:make",
-        needs_encoder=False,
-        title="DreamerV3 (pixels)",
-        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
-        description="sheeprl's DreamerV3: a recurrent world model of pixels, and a policy trained in its imagination.",
-    ),
-    "sb3_ppo_latents": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_ppo",
-        settings=_LIBRARY_SETTINGS,
-        external_training_loop=True,
-        title="SB3 PPO (latents)",
-        description="Stable-Baselines3's PPO, which learns a policy, on the same latents.",
-    ),
-    "sb3_dqn_imagined": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_imagining_dqn",
-        settings="imagine_bench.agents.library.settings:IMAGINING",
-        external_training_loop=True,
-        title="SB3 DQN + imagination",
-        description="The same DQN of the library, trained on real episodes and on those that a world model imagines.",
-    ),
-    "sb3_ppo_imagined": AgentEntry(
-        make="imagine_bench.agents.library.sb3:make_imagining_ppo",
-        settings="imagine_bench.agents.library.settings:IMAGINING",
-        external_training_loop=True,
-        title="SB3 PPO + imagination",
-        description="The same PPO of the library, trained on real episodes and on those that a world model imagines.",
-    ),
-    "imagination_exact": AgentEntry(
-        make="imagine_bench.agents.controls.exact:make",
-        privileged=True,
-        title="imagination, exact model",
-        description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
-    ),
-    "imagination_exact_filter": AgentEntry(
-        make="imagine_bench.agents.controls.exact:make_filter",
-        privileged=True,
-        title="imagination, exact filter",
-        description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
-        "right by the rules.",
-    ),
-    "dqn_efficient": AgentEntry(
-        make="imagine_bench.agents.controls.efficient:make",
-        title="DQN, data-efficient",
-        settings="imagine_bench.agents.controls.settings:EFFICIENT",
-        description="A control: the DQN with many updates, n-step targets and periodic resets, as SR-SPR and BBF.",
-    ),
-    "dqn_codes": AgentEntry(
-        make="imagine_bench.agents.dqn:make",
-        settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
-        encoder_kind="codes",
-        title="DQN (codes)",
-        description="A control: the DQN, which reads the discrete codes that factored:given sees in place of latents.",
-    ),
-    "dqn_swaps": AgentEntry(
-        make="imagine_bench.agents.controls.swaps:make",
-        encoder_kind="codes",
-        title="DQN (codes), swaps",
-        settings="imagine_bench.agents.controls.settings:SWAPPING",
-        description="A control: the same, also trained on real transitions that have untouched factors of others "
-        "(CoDA).",
-    ),
-    "count_table_directed_macrostate": AgentEntry(
-        make="imagine_bench.agents.tabular.count_table:make_directed_macrostate",
-        settings=_COUNT_TABLE_SETTINGS,
-        needs_encoder=False,
-        privileged=True,
-        encoder_kind="codes",
-        title="count table, directed (true state)",
-        description=f"A control: the same R-max; its state is {_TRUE_STATE}.",
-    ),
-    **{
-        f"posterior_sampling{twin}": AgentEntry(
-            make=f"imagine_bench.agents.tabular.posterior_sampling:make{twin}",
-            encoder_kind="codes",
-            settings="imagine_bench.agents.tabular.settings:POSTERIOR_SAMPLING",
-            needs_encoder=not twin,
-            privileged=bool(twin),
-            title="posterior sampling" + " (true state)" * bool(twin),
-            description="A control: a count table that follows, each episode, a model drawn from what it believes "
-            f"(PSRL); its state is {_TRUE_STATE if twin else 'the code of a frame'}.",
-        )
-        for twin in ("", "_macrostate")
-    },
-    "dreamer_v3_latents": AgentEntry(
-        make="imagine_bench.agents.library.dreamer:make",
-        title="DreamerV3 (latents)",
-        settings="imagine_bench.agents.library.dreamer_settings:HYPERPARAMETERS",
-        description="DreamerV3 on the latents that the suite's own DQN sees.",
-    ),
-    "lewm": AgentEntry(
-        make="imagine_bench.agents.library.lewm:make",
-        needs_encoder=False,
-        title="LeWM (pixels)",
-        settings="imagine_bench.agents.library.lewm_settings:HYPERPARAMETERS",
-        description="torch-world's LeWM: a latent world model of pixels without rewards; plans toward frames that "
-        "earned most.",
     ),
 }
 

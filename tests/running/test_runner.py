@@ -267,7 +267,7 @@ def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> N
 
 
 def test_every_registered_agent_has_a_target() -> None:
-    for entry in registry.AGENTS.values():
+    for entry in registry.agents().values():
         assert callable(registry.load(entry.make))
 
 
