@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds sdist and wheel into dist/ and uses the wheel as a stranger would: .ci/build.sh VENV.
+# Builds sdist and wheel, and a wheel of each guest, into dist/ and uses them as a stranger would: .ci/build.sh VENV.
 # The stranger has an environment of their own, an empty folder, and no checkout.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -9,9 +9,12 @@ trap 'rm -rf "$empty"' EXIT
 
 rm -rf dist
 "$venv/bin/uv" build -q --python "$venv/bin/python" --no-build-isolation --out-dir dist
-PYTHON="$top/$venv/bin/python" .ci/setup.sh "$empty/venv" "$(ls "$top"/dist/*.whl)"
+for guest in agents/guests/*/; do
+    "$venv/bin/uv" build -q --wheel --python "$venv/bin/python" --no-build-isolation --out-dir dist "$guest"
+done
+PYTHON="$top/$venv/bin/python" .ci/setup.sh "$empty/venv" "$top"/dist/*.whl
 mkdir "$empty/folder" && cd "$empty/folder"
 "$empty/venv/bin/imagine-bench" list >/dev/null
 "$empty/venv/bin/imagine-bench" doctor
-"$empty/venv/bin/imagine-bench" bench --task arrow_puzzle --preset smoke --agents random dqn oracle
+"$empty/venv/bin/imagine-bench" bench --task arrow_puzzle --preset smoke --agents random dqn oracle q_learning
 ls "$top"/dist/*

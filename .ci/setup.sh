@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs the project into its own virtual environment: .ci/setup.sh [VENV [WHEEL]]. Every make target calls it first;
+# Installs the project into its own virtual environment: .ci/setup.sh [VENV [WHEEL...]]. Every make target calls it first;
 # where nothing changed it ends at once. It repairs an environment that was moved, interrupted or whose Python is gone.
 #
 # PYTHON names the interpreter, 3.11 to 3.14. Without it python3, python3.14 to python3.11 and one of uv's are tried in
@@ -10,7 +10,8 @@ cd "$(dirname "$0")/.."
 
 readonly venv=${1:-.venv}
 project=(-e .)
-[ -z "${2:-}" ] || project=("$2")
+for guest in agents/guests/*/; do project+=(-e "$guest"); done
+[ $# -lt 2 ] || project=("${@:2}")
 readonly project
 readonly lock=.ci/requirements.lock
 readonly versions="3.11 3.12 3.13 3.14"
@@ -137,7 +138,7 @@ install_all() {
     install --no-deps --require-hashes -r "$lock" || { why="the packages of $lock could not be installed; see above"; return 1; }
     install_torch || { why="torch $torch could not be installed; see above"; return 1; }
     install --no-deps --no-build-isolation "${project[@]}" || { why="the project itself could not be installed; see above"; return 1; }
-    problems=$("$venv/bin/python" -m pip check 2>&1 | grep '^imagine-bench ') || true
+    problems=$("$venv/bin/python" -m pip check 2>&1 | grep '^imagine-bench') || true
     [ -z "$problems" ] || { why="$problems; $lock is out of date, run 'make lock'"; return 1; }
 }
 
@@ -189,7 +190,7 @@ check_gl() {
     fail "$problem Then run the same command again."
 }
 
-key="$(cat pyproject.toml "$lock" .ci/setup.sh | cksum) $here"
+key="$(cat pyproject.toml agents/guests/*/pyproject.toml "$lock" .ci/setup.sh | cksum) $here"
 if [ "$(cat "$venv/.ready" 2>/dev/null)" = "$key" ] && [ -x "$venv/bin/python" ] && [ -z "${PYTHON:-}" ]; then exit 0; fi
 if [ ! -e "$venv" ]; then
     say "installing into $venv (once; about a minute)"

@@ -36,7 +36,8 @@ class RandomAgent(_FixedPolicy):
     """Uniformly random macro-actions, when it is tested too."""
 
     def __init__(self, n_actions: int, rng: np.random.Generator) -> None:
-        self._n_actions, self._rng = n_actions, rng
+        self._n_actions = n_actions
+        self._rng = rng
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Any action, each equally likely."""
@@ -59,7 +60,8 @@ class OracleAgent(_FixedPolicy):
     """
 
     def __init__(self, optimal_policy: Callable[[tuple[int, ...], int], int]) -> None:
-        self._optimal_policy, self._step = optimal_policy, 0
+        self._optimal_policy = optimal_policy
+        self._step = 0
 
     def begin_episode(self) -> None:
         """Forget the episode so far."""

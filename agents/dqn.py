@@ -47,11 +47,16 @@ class Controller(nn.Module):
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: ControllerSettings, generator: torch.Generator,
+        self,
+        latent_size: int,
+        n_actions: int,
+        settings: ControllerSettings,
+        generator: torch.Generator,
         network: nn.Module | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
-        self.n_actions, self.settings = n_actions, settings
+        self.n_actions = n_actions
+        self.settings = settings
         self.network = self.target = network or mlp((latent_size, *settings.hidden, n_actions), generator)
         if settings.target_rate < 1.0:
             self.target = copy.deepcopy(self.network).requires_grad_(False)
@@ -105,7 +110,9 @@ class DQN:
     def __init__(
         self, perception: Perception, n_actions: int, settings: DQNSettings, seeds: SeedTree, device: torch.device
     ) -> None:
-        self.perception, self.n_actions, self.settings = perception, n_actions, settings
+        self.perception = perception
+        self.n_actions = n_actions
+        self.settings = settings
         self.rng = seeds.child("exploration").generator()
         self._replay = torch.Generator(device).manual_seed(seeds.child("replay").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
@@ -180,9 +187,11 @@ class DQN:
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """Transitions of a memory, with the rewards that the controller is to learn from."""
-        count, settings = self.settings.controller.batch_size, self.settings.memory
+        count = self.settings.controller.batch_size
+        settings = self.settings.memory
         if settings.priority > 0.0 and isinstance(memory, RealMemory):
-            exponent, correction = settings.priority, settings.priority_correction
+            exponent = settings.priority
+            correction = settings.priority_correction
             return memory.sample_prioritised(count, self._replay, exponent=exponent, correction=correction)
         return memory.sample(count, self._replay)
 
@@ -197,22 +206,27 @@ class DQN:
         arrays |= snapshot.prefixed("real", self.real.arrays())
         arrays["generator/replay"] = snapshot.generator_array(self._replay)
         values = {
-            "steps": self.steps, "updates": self.updates, "real_added": self.real.added,
-            "exploration": self.rng.bit_generator.state, "meters": self.meters.state(),
+            "steps": self.steps,
+            "updates": self.updates,
+            "real_added": self.real.added,
+            "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
-        }  # fmt: skip
+        }
         return AgentState(arrays=arrays, values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         snapshot.require_fit(state, self.state())
-        arrays, values = state.arrays, state.values
+        arrays = state.arrays
+        values = state.values
         snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
         snapshot.load_generator(self._replay, arrays["generator/replay"])
         self.real.load(snapshot.below("real", arrays), values["real_added"])
         self.meters.restore(values["meters"])
         self.rng.bit_generator.state = values["exploration"]
-        self.steps, self.updates = values["steps"], values["updates"]
+        self.steps = values["steps"]
+        self.updates = values["updates"]
 
 
 def build(hyperparameters: Hyperparameters[DQNSettings], context: AgentContext) -> DQN:

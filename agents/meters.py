@@ -34,7 +34,8 @@ class Meters:
     def read(self) -> dict[str, float]:
         """The means since the last call, of the names that were measured."""
         means = {name: total / self._counts[name] for name, total in self._sums.items() if self._counts[name] > 0}
-        self._sums, self._counts = {}, {}
+        self._sums = {}
+        self._counts = {}
         return means
 
     def state(self) -> dict[str, list[float]]:

@@ -56,7 +56,8 @@ class _Ring:
     _has_outcomes = True
 
     def __init__(self, capacity: int, latent_size: int, device: torch.device) -> None:
-        self.capacity, self.added = capacity, 0
+        self.capacity = capacity
+        self.added = 0
         self._columns = {name: torch.zeros(capacity, latent_size, device=device) for name in self._latents}
         if self._has_outcomes:
             self._columns["action"] = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -103,7 +104,8 @@ class RealMemory(_Ring):
         self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool
     ) -> None:
         """Store one transition between posteriors (mu, sigma), each of shape (Z,)."""
-        row, columns = self.added % self.capacity, self._columns
+        row = self.added % self.capacity
+        columns = self._columns
         columns["mu"][row], columns["sigma"][row] = posterior
         columns["next_mu"][row], columns["next_sigma"][row] = next_posterior
         columns["action"][row], columns["reward"][row], columns["terminated"][row] = action, reward, float(terminated)
@@ -156,7 +158,8 @@ class RealMemory(_Ring):
 class StartMemory(_Ring):
     """Posteriors of the latents that real episodes began with."""
 
-    _latents, _has_outcomes = ("mu", "sigma"), False
+    _latents = ("mu", "sigma")
+    _has_outcomes = False
 
     def add(self, posterior: Posterior) -> None:
         """Store the posterior (mu, sigma) of one start, each of shape (Z,)."""
@@ -183,7 +186,8 @@ class ImaginedMemory(_Ring):
 
     def add(self, batch: Batch) -> None:
         """Store every transition of a batch."""
-        end, kept = self.added + len(batch.z), min(len(batch.z), self.capacity)
+        end = self.added + len(batch.z)
+        kept = min(len(batch.z), self.capacity)
         index = torch.arange(end - kept, end, device=self._columns["z"].device) % self.capacity
         for name, column in self._columns.items():
             column[index] = getattr(batch, name)[-kept:]

@@ -154,7 +154,8 @@ def _walk(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any, Any]
     """Name, value, type and range of every setting."""
     hints = get_type_hints(type(settings))
     for part in fields(settings):
-        value, name = getattr(settings, part.name), f"{prefix}{part.name}"
+        value = getattr(settings, part.name)
+        name = f"{prefix}{part.name}"
         if is_dataclass(value):
             yield from _walk(value, f"{name}.")
         else:

@@ -78,7 +78,8 @@ def require_fit(given: AgentState, own: AgentState, *, equal: Collection[str] = 
         _require_equal(part, given.values[part], own.values[part])
     _require_same_names(given.arrays, own.arrays)
     for name, ours in own.arrays.items():
-        theirs, start = given.arrays[name], 1 if name.startswith(_ROWS_VARY) else 0
+        theirs = given.arrays[name]
+        start = 1 if name.startswith(_ROWS_VARY) else 0
         if (theirs.dtype, theirs.shape[start:]) != (ours.dtype, ours.shape[start:]):
             raise ArtefactError(
                 f"{name!r} in the snapshot is {theirs.dtype} {theirs.shape}, in this agent {ours.dtype} {ours.shape}; "

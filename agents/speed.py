@@ -23,7 +23,8 @@ from .regressors.bayesian_mdn import BayesianMDN
 from .regressors.settings import MDNSettings
 from .replay import Batch
 
-LATENTS, ACTIONS = 24, 6
+LATENTS = 24
+ACTIONS = 6
 """Those of the arrow puzzle's bundled encoders."""
 _SIZES = (2, 256, 256, 256, mdn.output_size(10, 3))
 """Those of a regressor of chapter 4."""
@@ -46,8 +47,10 @@ class _PlainMLP(nn.Module):
 
     def __init__(self, sizes: tuple[int, ...], members: int, dropout: float, draws: torch.Generator) -> None:
         super().__init__()
-        self.dropout, self.draws = dropout, draws
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.dropout = dropout
+        self.draws = draws
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
             self.weights.append(torch.randn(members, n_in, n_out, generator=draws) * math.sqrt(2.0 / (n_in + n_out)))
             self.biases.append(torch.zeros(members, 1, n_out))
@@ -70,7 +73,9 @@ class PlainWorldModel:
     """
 
     def __init__(self, latents: int, actions: int, settings: WorldModelSettings, draws: torch.Generator) -> None:
-        self.latents, self.actions, self.settings = latents, actions, settings
+        self.latents = latents
+        self.actions = actions
+        self.settings = settings
         outputs = mdn.output_size(settings.components, latents)
         shapes = [
             ((latents + actions, *settings.dynamics_hidden, outputs), settings.members),
@@ -164,7 +169,8 @@ def training(networks: int, rows: int, updates: int, rounds: int) -> tuple[float
     prepare_torch("cpu")
     settings = MDNSettings(precision=settle("auto", "cpu"))
     draws = [torch.Generator().manual_seed(index) for index in range(networks)]
-    together, alone = BayesianMDN(2, 3, settings, draws), [BayesianMDN(2, 3, settings, [one]) for one in draws]
+    together = BayesianMDN(2, 3, settings, draws)
+    alone = [BayesianMDN(2, 3, settings, [one]) for one in draws]
     x, y = (torch.randn(networks, rows, size, generator=draws[0]) for size in (2, 3))
 
     def as_one() -> None:

@@ -11,7 +11,9 @@ from typing import Any
 
 _LONGEST = 200
 _SHORT = reprlib.Repr()
-_SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = _LONGEST, _LONGEST, 60
+_SHORT.maxstring = _LONGEST
+_SHORT.maxother = _LONGEST
+_SHORT.maxlong = 60
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxarray = 10
 
 
@@ -47,7 +49,9 @@ class UnknownNameError(ImagineBenchError, ValueError):
         closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
         hint = f" Did you mean {closest[0]!r}?" if closest else ""
         super().__init__(f"No {kind} {brief(word)}.{hint} Known: {', '.join(names) or 'none'}.")
-        self.kind, self.given, self.known = kind, given, tuple(names)
+        self.kind = kind
+        self.given = given
+        self.known = tuple(names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.kind, self.given, self.known)  # worker processes send errors back
@@ -82,10 +86,23 @@ class RunFailedError(ImagineBenchError):
 
 
 EXTRAS = {
-    "torch": "agents", "matplotlib": "report", "PIL": "report", "rerun": "rerun", "ray": "ray", "pygame": "play",
-    "minari": "data", "pyarrow": "data", "stable_baselines3": "peers", "sb3_contrib": "peers", "sheeprl": "peers",
-    "torch_world": "peers", "hydra": "peers", "tensorboard": "tracking", "wandb": "tracking", "submitit": "slurm",
-}  # fmt: skip
+    "torch": "agents",
+    "matplotlib": "report",
+    "PIL": "report",
+    "rerun": "rerun",
+    "ray": "ray",
+    "pygame": "play",
+    "minari": "data",
+    "pyarrow": "data",
+    "stable_baselines3": "peers",
+    "sb3_contrib": "peers",
+    "sheeprl": "peers",
+    "torch_world": "peers",
+    "hydra": "peers",
+    "tensorboard": "tracking",
+    "wandb": "tracking",
+    "submitit": "slurm",
+}
 """The extra of this package that brings a module."""
 
 

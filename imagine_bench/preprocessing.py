@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import require_known
 
-STRIP_WIDTH, CELL_WIDTH = 22, 18
+STRIP_WIDTH = 22
+CELL_WIDTH = 18
 """Pixels; of three strips each shares one column with each neighbour."""
 _STRIP_STARTS = {1: (21,), 2: (9, 32), 3: (0, 21, 42)}
-_HAND_ROWS, _FAR_ROWS, _NEAR_ROWS = np.arange(10, 28), np.arange(28, 46), np.arange(46, 64)
+_HAND_ROWS = np.arange(10, 28)
+_FAR_ROWS = np.arange(28, 46)
+_NEAR_ROWS = np.arange(46, 64)
 _GRAY = "gray_strips"
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 

@@ -91,8 +91,10 @@ def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray
     Raises:
         InvalidValueError: Another shape or type, or a row that is no macrostate of the machine.
     """
-    macrostates, states = np.asarray(macrostates), states_of(rules)
-    known, width = set(states), len(states[0])
+    macrostates = np.asarray(macrostates)
+    states = states_of(rules)
+    known = set(states)
+    width = len(states[0])
     if macrostates.ndim != 2 or macrostates.shape[1] != width or not np.issubdtype(macrostates.dtype, np.integer):
         given = f"{macrostates.dtype} of shape {macrostates.shape}"
         raise InvalidValueError(f"Macrostates must be integers of shape (N, {width}), not {given}.")
@@ -120,7 +122,8 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
 
     listed = getattr(rules, "states", None)
     index = {state: row for row, state in enumerate(dict.fromkeys(listed or rules.start_states))}
-    queue, steps = list(index), dict.fromkeys(index, 0)
+    queue = list(index)
+    steps = dict.fromkeys(index, 0)
     pairs: list[tuple[int, int, float, float]] = []  # action, row, reward, success
     goes_on: list[tuple[float, int, int, int]] = []  # probability, action, row, next row
     for state in queue:  # grows
@@ -130,8 +133,10 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
         for action in range(rules.n_actions):
             total = reward = success = 0.0
             for outcome in rules.outcomes(state, action):
-                after, share = outcome.macrostate, outcome.probability
-                total, reward = total + share, reward + share * outcome.reward
+                after = outcome.macrostate
+                share = outcome.probability
+                total = total + share
+                reward = reward + share * outcome.reward
                 success += share * outcome.success
                 if listed and after not in index:
                     raise InvalidValueError(f"Action {action} in macrostate {state} leads to {after}; list it, too.")
@@ -145,9 +150,11 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
                 raise InvalidValueError(f"Outcomes of action {action} in macrostate {state} sum to {total}, not 1.")
             pairs.append((action, row, reward, success))
     shape = (rules.n_actions, len(index))
-    facts_of, shares = np.array(pairs).reshape(-1, 4), np.array(goes_on).reshape(-1, 4)
+    facts_of = np.array(pairs).reshape(-1, 4)
+    shares = np.array(goes_on).reshape(-1, 4)
     where = tuple(facts_of[:, :2].astype(np.int64).T)
-    reward_of, success_of = np.zeros(shape), np.zeros(shape)
+    reward_of = np.zeros(shape)
+    success_of = np.zeros(shape)
     reward_of[where], success_of[where] = facts_of[:, 2], facts_of[:, 3]
     action_of, row_of, column_of = shares[:, 1:].astype(np.int64).T
     alive = csr_array((shares[:, 0], (action_of * len(index) + row_of, column_of)), shape=(reward_of.size, len(index)))
@@ -201,7 +208,8 @@ class HorizonOptimum:
 def horizon_optimum(tables: RuleTables, horizon: int) -> HorizonOptimum:
     """Solve a machine for a finite horizon of at least 1 action, exactly."""
     shape = tables.reward.shape
-    success, returns = np.zeros(shape[1]), np.zeros(shape[1])
+    success = np.zeros(shape[1])
+    returns = np.zeros(shape[1])
     actions = np.empty((horizon, shape[1]), dtype=np.int16)
     everywhere = np.arange(shape[1])
     for left in range(horizon):
@@ -217,7 +225,8 @@ def shortest_plans(tables: RuleTables) -> NDArray[np.int64]:
     """The fewest macro-actions after which a success is possible from each macrostate, -1 where none is. Shape (S,)."""
     n_states = tables.reward.shape[1]
     links = tables.alive.tocoo()
-    before, after = links.row % n_states, links.col
+    before = links.row % n_states
+    after = links.col
     lengths = np.where((tables.success > 0.0).any(axis=0), 1, -1)
     steps = 1
     while (lengths == steps).any():
@@ -244,10 +253,14 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     alive = tables.alive.multiply(policy.ravel()[:, None]).tocoo()
     n_states = policy.shape[1]
     alive = type(tables.alive)((alive.data, (alive.row % n_states, alive.col)), shape=(n_states, n_states))
-    reward, success = (policy * tables.reward).sum(axis=0), (policy * tables.success).sum(axis=0)
+    reward = (policy * tables.reward).sum(axis=0)
+    success = (policy * tables.success).sum(axis=0)
     failure = 1.0 - np.asarray(alive.sum(axis=1)).ravel() - success
     zeros = np.zeros(alive.shape[0])
-    successes, failures, returns, length = zeros, zeros, zeros, zeros
+    successes = zeros
+    failures = zeros
+    returns = zeros
+    length = zeros
     for _ in range(horizon):
         successes = success + alive @ successes
         failures = failure + alive @ failures
@@ -269,7 +282,9 @@ def fewest_actions(rules: Rules, start: State) -> int:
     Raises:
         InvalidValueError: No success can be reached from ``start``.
     """
-    reached, seen, steps = {start}, {start}, 0
+    reached = {start}
+    seen = {start}
+    steps = 0
     while reached:
         steps += 1
         outcomes = [o for state in reached for action in range(rules.n_actions) for o in rules.outcomes(state, action)]

@@ -14,11 +14,20 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError, require_known
 
 Purpose = Literal[
-    "training", "evaluation", "tuning", "encoder_training", "encoder_probe", "recording", "planning",
-    "earlier_training", "feedback", "dataset",
-]  # fmt: skip
+    "training",
+    "evaluation",
+    "tuning",
+    "encoder_training",
+    "encoder_probe",
+    "recording",
+    "planning",
+    "earlier_training",
+    "feedback",
+    "dataset",
+]
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
-_SEED_BITS, _EPISODE_BITS = 24, 32
+_SEED_BITS = 24
+_EPISODE_BITS = 32
 SEEDS = 1 << _SEED_BITS
 """Seeds of runs lie below."""
 TUNING_SEEDS = 1000

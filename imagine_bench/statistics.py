@@ -71,7 +71,8 @@ def interval(
         return math.nan, math.nan
     value, error, freedom = _location(values, trials, trim)
     half = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom)) * error
-    low, high = value - half, value + half
+    low = value - half
+    high = value + half
     return (max(low, 0.0), min(high, 1.0)) if share or trials is not None else (low, high)
 
 
@@ -162,7 +163,8 @@ def probability_of_improvement(treated: ArrayLike, base: ArrayLike) -> float:
 
     Over all pairs of their runs, (n,) and (m,).
     """
-    a, b = _runs(treated)[:, None], _runs(base)[None]
+    a = _runs(treated)[:, None]
+    b = _runs(base)[None]
     return float(((a > b) + 0.5 * (a == b)).mean())
 
 
@@ -172,7 +174,8 @@ def difference(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None
     Runs of one seed share starts and first weights, but what training makes of them does not agree: of the kept benches
     the correlation over seeds is about 0.1, so they are not paired. ``trials`` and ``trim`` are as in :func:`interval`.
     """
-    a, b = _runs(treated), _runs(base)
+    a = _runs(treated)
+    b = _runs(base)
     if min(len(a), len(b)) < 2:
         return Estimate(round(iqm(a) - iqm(b), _DIGITS), math.nan, math.nan)
     value, error, freedom = _contrast(a, b, trials, trim)
@@ -188,7 +191,8 @@ def holm(p_values: ArrayLike) -> Floats:
     Those that are NaN are no tests. Shape as given, (tests,).
     """
     given = np.asarray(p_values, dtype=np.float64)
-    adjusted, tested = np.full(given.shape, np.nan), np.flatnonzero(~np.isnan(given))
+    adjusted = np.full(given.shape, np.nan)
+    tested = np.flatnonzero(~np.isnan(given))
     order = tested[np.argsort(given[tested], kind="stable")]
     adjusted[order] = np.minimum(np.maximum.accumulate(given[order] * np.arange(len(order), 0, -1)), 1.0)
     return adjusted
@@ -199,7 +203,8 @@ def detectable(treated: ArrayLike, base: ArrayLike, *, cells: int, trials: int |
 
     From the spread of their runs, at the strictest level of :func:`holm`; NaN where one run shows no spread.
     """
-    a, b = _runs(treated), _runs(base)
+    a = _runs(treated)
+    b = _runs(base)
     if min(len(a), len(b)) < 2:
         return math.nan
     _, error, freedom = _contrast(a, b, trials, _TRIM)
@@ -222,14 +227,17 @@ def ratio(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, pai
     Its ends are NaN where the mean of ``base`` is not clear of zero, so that the ratio has no upper end; its value,
     where that mean is zero. ``paired`` says that values at the same index are of the same run.
     """
-    a, b = _runs(treated), _runs(base)
-    mean_a, mean_b = float(a.mean()), float(b.mean())
+    a = _runs(treated)
+    b = _runs(base)
+    mean_a = float(a.mean())
+    mean_b = float(b.mean())
     if mean_b == 0.0:
         return Estimate(math.nan, math.nan, math.nan)
     value = mean_a / mean_b
     if min(len(a), len(b)) < 2:
         return Estimate(value, math.nan, math.nan)
-    over, under = _location(a, trials, 0.0), _location(b, trials, 0.0)
+    over = _location(a, trials, 0.0)
+    under = _location(b, trials, 0.0)
     shared = float(np.cov(a, b)[0, 1]) / len(a) if paired else 0.0
     freedom = len(a) - 1 if paired else _welch(over, under)
     t = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom))
@@ -260,7 +268,8 @@ def _location(values: Floats, trials: int | None, trim: float) -> _Location:
 
 def _contrast(a: Floats, b: Floats, trials: int | None, trim: float) -> tuple[float, float, float]:
     """Difference of two trimmed means, its standard error and degrees of freedom (Welch 1947)."""
-    first, second = _location(a, trials, trim), _location(b, trials, trim)
+    first = _location(a, trials, trim)
+    second = _location(b, trials, trim)
     return round(first.value - second.value, _DIGITS), math.hypot(first.error, second.error), _welch(first, second)
 
 

@@ -15,10 +15,10 @@ import pytest
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
-from imagine_bench.protocols.task_types import task_types
 from imagine_bench.registry.entries import parse_settings
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.running.launchers.local import LocalPool
+from imagine_bench.running.task_types import task_types
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.studies.catalogue import STUDIES

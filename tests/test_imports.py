@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -29,10 +30,10 @@ ARROWS: dict[str, set[str]] = {
     "exact": {"registry"},
     "protocols": {"registry", "exact"},
     "store": {"registry", "protocols", "exact", "statistics"},
-    "data": {*_DATA, "exact", "statistics"},
-    "running": {*_DATA, "data"},
+    "data": {"registry", "store"},
+    "running": {*_DATA, "data", "exact", "statistics"},
     "judge": {*_DATA, "running", "data", "statistics"},
-    "recording": {*_DATA, "judge"},
+    "recording": {*_DATA, "judge", "running"},
     "studies": {*_DATA, "running", "judge", "statistics"},
     "suite": {*_DATA, "running", "statistics"},
     "report": {*_DATA, "exact", "running", "judge", "studies", "suite", "statistics", "reference"},
@@ -78,7 +79,11 @@ _HEAVY = {
     "pyarrow": "imagine_bench/data",
     "minari": "imagine_bench/data",
 }
-_SOURCES = sorted(path for room in ("imagine_bench", "tasks", "agents") for path in (_TOP / room).rglob("*.py"))
+_EVERYTHING = sorted(path for room in ("imagine_bench", "tasks", "agents") for path in (_TOP / room).rglob("*.py"))
+_SOURCES = [path for path in _EVERYTHING if "guests" not in path.relative_to(_TOP).parts]
+_GUESTS = sorted((_TOP / "agents" / "guests").glob("*/src/**/*.py"))
+_STABLE = frozenset(re.findall(r"`(imagine_bench\.[\w.]+)`", (_TOP / "docs/reference/api.md").read_text()))
+"""The modules that docs/reference/api.md lists: those that other packages may import."""
 _NUMPY_RANDOM = {"Generator", "SeedSequence", "default_rng", "PCG64", "BitGenerator"}
 _TORCH_DRAWS = {"rand", "randn", "randint", "randperm", "bernoulli", "multinomial", "normal", "rand_like", "randn_like"}
 _TENSOR_DRAWS = {"normal_", "uniform_", "bernoulli_", "exponential_", "random_", "multinomial"}
@@ -170,6 +175,19 @@ def _global_draws(tree: ast.AST) -> Iterator[str]:
             yield from _undirected(node, node.func)
 
 
+def guest_offences(path: Path, source: str) -> list[str]:
+    """Every import of a guest that the documentation does not list, and every draw from a global generator."""
+    tree = ast.parse(source)
+    found = [
+        f"{name} is not listed in docs/reference/api.md"
+        for name in imports(tree, path)
+        if name.partition(".")[0] == "imagine_bench"
+        and not name.startswith("imagine_bench.agents.guests.")  # of its own package
+        and not {name, name.rpartition(".")[0]} & _STABLE
+    ]
+    return found + list(_global_draws(tree))
+
+
 def _undirected(call: ast.Call, function: ast.Attribute) -> Iterator[str]:
     """Draws that name no generator."""
     directed = any(keyword.arg == "generator" for keyword in call.keywords)
@@ -192,6 +210,23 @@ def test_the_arrows_go_one_way() -> None:
 @pytest.mark.parametrize("path", _SOURCES, ids=lambda path: str(path.relative_to(_TOP)))
 def test_the_arrows_hold(path: Path) -> None:
     assert offences(path, path.read_text()) == []
+
+
+@pytest.mark.parametrize("path", _GUESTS, ids=lambda path: path.name)
+def test_guests_import_documented_modules_only(path: Path) -> None:
+    assert guest_offences(path, path.read_text()) == []
+
+
+def test_an_undocumented_import_of_a_guest_would_be_seen() -> None:
+    path = _GUESTS[0].parent / "new.py"
+    (private,) = guest_offences(
+        path, "from imagine_bench.agents.dqn import DQN\nfrom imagine_bench.agents.speed import x"
+    )
+    assert private.startswith("imagine_bench.agents.speed.x is not listed")
+    (whole,) = guest_offences(path, "import imagine_bench.store.files")
+    assert whole.startswith("imagine_bench.store.files is not listed")
+    (inside,) = guest_offences(path, "def f():\n    from imagine_bench.agents import baselines")
+    assert inside.startswith("imagine_bench.agents.baselines is not listed")
 
 
 @pytest.mark.parametrize(

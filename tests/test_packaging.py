@@ -27,7 +27,7 @@ def packages() -> dict[str, Path]:
     """Every folder with Python in it, by the name of the package it installs as."""
     found = {}
     for room in ("imagine_bench", *_ROOMS):
-        for init in (_TOP / room).rglob("*.py"):
+        for init in (path for path in (_TOP / room).rglob("*.py") if "guests" not in path.relative_to(_TOP).parts):
             parts = init.parent.relative_to(_TOP).parts
             found[".".join(parts if room == "imagine_bench" else ("imagine_bench", *parts))] = init.parent
     return found

@@ -13,6 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 TOOLS = "awk bash cat chmod cksum cp dirname grep head id mkdir mktemp rm tail uname".split()
+GUESTS = ("controls", "peers")
 LOCK = "--no-deps --require-hashes -r .ci/requirements.lock"
 # An interpreter that pretends: it makes an environment of itself and notes what it should install.
 PRETENDER = r"""
@@ -36,8 +37,9 @@ class Checkout:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / ".ci").mkdir(parents=True)
-        for name in ("pyproject.toml", ".ci/setup.sh", ".ci/requirements.lock"):
+        guests = [f"agents/guests/{guest}/pyproject.toml" for guest in GUESTS]
+        for name in ("pyproject.toml", ".ci/setup.sh", ".ci/requirements.lock", *guests):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
         self.path = folder.parent / f"{folder.name}-bin"
         self.path.mkdir()
@@ -137,7 +139,8 @@ def test_an_interpreter_that_was_named_is_the_only_one(ready: Checkout) -> None:
 
 def test_packages_come_from_the_lock_with_hashes(ready: Checkout) -> None:
     installs = [line.partition("--retries 1 ")[2] for line in ready.log() if " install " in line]
-    assert installs[1] == LOCK and installs[-1] == "--no-deps --no-build-isolation -e ."
+    guests = "".join(f" -e agents/guests/{guest}/" for guest in GUESTS)
+    assert installs[1] == LOCK and installs[-1] == f"--no-deps --no-build-isolation -e .{guests}"
     plain = {line for line in installs if "--no-deps" not in line}
     assert plain == set() or (sys.platform != "linux" and len(plain) == 1), "only torch outside Linux brings others"
     assert ready.setup() == (0, ""), "again, nothing is left to do"

@@ -24,9 +24,17 @@ from .training import draw_frames, train_encoder
 
 
 def retrain(
-    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, out: Path, steps: int | None = None,
-    batch: int | None = None, latents: int | None = None, device: str = "cpu",
-) -> str:  # fmt: skip
+    spec: TaskSpec,
+    *,
+    recipe: str | Recipe,
+    appearance: str,
+    seed: int,
+    out: Path,
+    steps: int | None = None,
+    batch: int | None = None,
+    latents: int | None = None,
+    device: str = "cpu",
+) -> str:
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
@@ -58,9 +66,14 @@ def retrain(
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
         show = partial(_show, bar)
         encoder = train_encoder(
-            spec, recipe=recipe, appearance=appearance, seed=seed, progress=show, unfinished=unfinished,
+            spec,
+            recipe=recipe,
+            appearance=appearance,
+            seed=seed,
+            progress=show,
+            unfinished=unfinished,
             device=device,
-        )  # fmt: skip
+        )
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
     frames, macrostates = draw_frames(spec, appearance_of_tests(appearance), COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())

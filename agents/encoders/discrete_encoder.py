@@ -57,8 +57,10 @@ class DiscreteEncoder(EncoderNetwork):
 
     def __init__(self, code_sizes: tuple[int, ...], channels: int, height: int, width: int) -> None:
         super().__init__()
-        self.code_sizes, self.latent_size = tuple(code_sizes), sum(code_sizes)
-        factors, pixels = len(code_sizes), channels * -(-height // POOL) * -(-width // POOL)
+        self.code_sizes = tuple(code_sizes)
+        self.latent_size = sum(code_sizes)
+        factors = len(code_sizes)
+        pixels = channels * -(-height // POOL) * -(-width // POOL)
         self.register_buffer("background", torch.zeros(channels, height, width))
         self.register_buffer("appearance", torch.zeros(self.latent_size, channels, height, width))
         self.register_buffer("basis", torch.zeros(factors, FEATURES, pixels))

@@ -85,7 +85,9 @@ class Encoder:
     """Frames to latents and back, with no gradient and no randomness, and an evaluation-only reader (``probe``)."""
 
     def __init__(self, network: EncoderNetwork, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
-        self.card, self.latent_size, self.device = card, card.latent_size, torch.device(device)
+        self.card = card
+        self.latent_size = card.latent_size
+        self.device = torch.device(device)
         self.network = network.to(self.device).requires_grad_(False).eval()
         self.probe = probe.to(self.device).requires_grad_(False).eval()
         self._preprocess = preprocess(card.preprocessing)
@@ -181,7 +183,7 @@ class Encoder:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
         if card.offer:
-            from ..offered_encoder import OfferedEncoder  # noqa: PLC0415 - it is made of this
+            from .offered import OfferedEncoder  # noqa: PLC0415 - it is made of this
 
             return OfferedEncoder(network, probe, card, device)
         return cls(network, probe, card, device)
@@ -220,7 +222,7 @@ def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]
 
 def _empty_network(card: EncoderCard) -> EncoderNetwork:
     if card.offer:
-        from ..offered_encoder import OfferedNetwork  # noqa: PLC0415 - it is made of this
+        from .offered import OfferedNetwork  # noqa: PLC0415 - it is made of this
 
         return OfferedNetwork(card.offer, card.latent_size)
     if card.recipe.kind == "latents":

@@ -23,7 +23,10 @@ _HEADING = 80  # pixels
 _LABEL = 150  # pixels, left of the rows
 _CAPTION = 60  # pixels, below the rows
 _CAPTION_LETTERS = 26  # in a line of it
-_INK, _MUTED, _WRONG, _PAPER = (20, 20, 20), (110, 110, 110), (190, 20, 20), (255, 255, 255)
+_INK = (20, 20, 20)
+_MUTED = (110, 110, 110)
+_WRONG = (190, 20, 20)
+_PAPER = (255, 255, 255)
 
 
 def sample_sheet(
@@ -34,7 +37,8 @@ def sample_sheet(
     At most :data:`COLUMNS` ``frames`` (N, 64, 64, 3) are shown; ``macrostates`` (N, M) are the truth, to mark
     misreadings.
     """
-    frames, macrostates = frames[:COLUMNS], macrostates[:COLUMNS]
+    frames = frames[:COLUMNS]
+    macrostates = macrostates[:COLUMNS]
     latents = Latents(*encoder.encode(frames))
     rows: dict[str, NDArray[Any]] = {
         "camera": frames,

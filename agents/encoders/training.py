@@ -60,7 +60,8 @@ class FrameSet:
 
 def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
     """All that frames of a task may show: every macrostate, and where something is hidden, those with -1 for it."""
-    states, sight = states_of(spec.rules), spec.sight
+    states = states_of(spec.rules)
+    sight = spec.sight
     seen = [] if sight is None else [what for step in (0, 1) for s in states for _, what in sight.seen(s, step)]
     return np.array(list(dict.fromkeys((*states, *seen))), dtype=np.int64)
 
@@ -106,9 +107,13 @@ def learning_rate_at(recipe: Recipe, step: int) -> float:
 
 
 def train_vae(
-    vae: Vae, data: FrameSet, recipe: Recipe, generator: torch.Generator, progress: Progress,
+    vae: Vae,
+    data: FrameSet,
+    recipe: Recipe,
+    generator: torch.Generator,
+    progress: Progress,
     unfinished: Unfinished | None = None,
-) -> float:  # fmt: skip
+) -> float:
     """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds of it, earlier processes' included.
 
     The VAE stays on its device; what is drawn is drawn by ``generator``, on the CPU.
@@ -118,12 +123,17 @@ def train_vae(
         ArtefactError: What is unfinished is damaged or another training.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
-    n, first, order, begun_s = len(data.images), 0, torch.empty(0, dtype=torch.int64), time.process_time()
+    n = len(data.images)
+    first = 0
+    order = torch.empty(0, dtype=torch.int64)
+    begun_s = time.process_time()
     device = next(vae.parameters()).device
     data = replace(data, images=data.images.to(device))
     at_once = _PART if device.type == "cpu" else recipe.batch
     if unfinished is not None and (kept := unfinished.load()) is not None:
-        first, order, begun_s = kept["step"], kept["order"], begun_s - kept["cpu_s"]
+        first = kept["step"]
+        order = kept["order"]
+        begun_s = begun_s - kept["cpu_s"]
         vae.load_state_dict(kept["vae"])
         optimiser.load_state_dict(kept["optimiser"])
         generator.set_state(kept["generator"])
@@ -135,7 +145,8 @@ def train_vae(
     for step in range(first, recipe.steps):
         while len(order) < recipe.batch:
             order = torch.cat([order, torch.randperm(n, generator=generator)])
-        rows, order = order[: recipe.batch], order[recipe.batch :]
+        rows = order[: recipe.batch]
+        order = order[recipe.batch :]
         noise = torch.randn((len(rows), vae.latent_size), generator=generator)
         optimiser.param_groups[0]["lr"] = learning_rate_at(recipe, step)
         optimiser.zero_grad()
@@ -154,9 +165,15 @@ def train_vae(
 
 
 def train_encoder(
-    spec: TaskSpec, *, recipe: str | Recipe, appearance: str, seed: int, progress: Progress | None = None,
-    unfinished: Path | None = None, device: str = "cpu",
-) -> Encoder:  # fmt: skip
+    spec: TaskSpec,
+    *,
+    recipe: str | Recipe,
+    appearance: str,
+    seed: int,
+    progress: Progress | None = None,
+    unfinished: Path | None = None,
+    device: str = "cpu",
+) -> Encoder:
     """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
 
     A recipe is a name among the task's ``RECIPES``, or settings of one's own. ``seed`` is the root of the seed tree:
@@ -244,9 +261,14 @@ def _laps(clock: dict[str, float]) -> dict[str, float]:
 
 
 def _trained_vae(
-    recipe: Recipe, preprocessing: str, data: FrameSet, generator: torch.Generator, progress: Progress,
-    unfinished: Unfinished | None, device: str,
-) -> tuple[Vae, float]:  # fmt: skip
+    recipe: Recipe,
+    preprocessing: str,
+    data: FrameSet,
+    generator: torch.Generator,
+    progress: Progress,
+    unfinished: Unfinished | None,
+    device: str,
+) -> tuple[Vae, float]:
     vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
     initialise(vae, generator)
     if isinstance(vae, MlpVae):
@@ -274,7 +296,8 @@ def _measure(
     network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
 ) -> dict[str, Any]:
     """What the card says of an encoder on frames that no training saw."""
-    latents, right = latents_of(network, held_out), held_out.macrostates
+    latents = latents_of(network, held_out)
+    right = held_out.macrostates
     kl = network.information(latents.mu, 2.0 * latents.sigma.log())
     read = {"linear": accuracy(linear, latents.mu, right), "mlp": accuracy(probe, latents.mu, right)}
     read["mlp_sampled"] = accuracy(probe, latents.sample(generator), right)

@@ -20,7 +20,9 @@ class Unfinished:
     """Keeps a training in a file of three times its weights; ``what`` are words that only this training has."""
 
     def __init__(self, path: Path, what: str) -> None:
-        self._path, self._what, self._saved_s = path, what, time.monotonic()
+        self._path = path
+        self._what = what
+        self._saved_s = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
         """What was kept, or None. Raises ArtefactError: damaged or of another training; the file is left untouched."""
@@ -39,7 +41,8 @@ class Unfinished:
         if time.monotonic() - self._saved_s < _SAVE_EVERY_S:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        partial, content = self._path.with_name(f"{self._path.name}.partial"), io.BytesIO()
+        partial = self._path.with_name(f"{self._path.name}.partial")
+        content = io.BytesIO()
         torch.save((self._what, kept()), content)  # to a full disk torch itself would end in an error of its own
         with partial.open("wb") as stream:
             stream.write(content.getbuffer())

@@ -88,8 +88,10 @@ class MlpVae(Vae):
 
     def __init__(self, recipe: Recipe, channels: int, height: int, width: int, *, groups: int) -> None:
         super().__init__()
-        self._groups, self.latent_size = groups, groups * recipe.latents
-        self._image_shape, self._precision = (channels, height, width), recipe.pixel_std**-2
+        self._groups = groups
+        self.latent_size = groups * recipe.latents
+        self._image_shape = (channels, height, width)
+        self._precision = recipe.pixel_std**-2
         sizes = (channels // groups * height * width, *recipe.widths)
         self.encoder = _mlp(*sizes, 2 * recipe.latents)
         self.decoder = _mlp(recipe.latents, *reversed(sizes))

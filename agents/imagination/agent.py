@@ -44,11 +44,18 @@ class ImaginingAgent(DQN):
     imagination_kind = Imagination
 
     def __init__(
-        self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
+        self,
+        perception: Perception,
+        n_actions: int,
+        settings: Settings,
+        seeds: SeedTree,
+        device: torch.device,
+        *,
         filtered: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(perception, n_actions, settings, seeds, device)
-        size, node = perception.latent_size, seeds.child("imagination")
+        size = perception.latent_size
+        node = seeds.child("imagination")
         self.imagination = self.imagination_kind(
             size, n_actions, settings, filtered=filtered, seeds=node, device=device
         )
@@ -69,7 +76,8 @@ class ImaginingAgent(DQN):
 
     def learn_model(self) -> None:
         """N_E updates of the world model on real transitions."""
-        model, draws = self.imagination.model, self.imagination.generators
+        model = self.imagination.model
+        draws = self.imagination.generators
         with self.meters.cpu_time("time/model_s"):
             for batch in self.draw_model_batches(draws["replay"]):
                 losses = model.update(batch, draws["dropout"])
@@ -87,7 +95,8 @@ class ImaginingAgent(DQN):
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
-        batch, weight = super().draw_batch(memory), self.settings.imagination.curiosity
+        batch = super().draw_batch(memory)
+        weight = self.settings.imagination.curiosity
         if weight == 0.0 or memory is not self.real:
             return batch
         paid = weight * self.imagination.ignorance(batch.z, batch.action, self.imagination.generators["dropout"])
@@ -107,7 +116,8 @@ class ImaginingAgent(DQN):
 
     def state(self) -> AgentState:
         """A snapshot, world model and imagined memory included."""
-        state, own = super().state(), self.imagination
+        state = super().state()
+        own = self.imagination
         state.arrays.update(snapshot.prefixed("imagination", own.arrays()))
         state.values.update(filtered=own.filter.active, imagined_added=own.memory.added)
         return state
@@ -149,10 +159,12 @@ class ImaginingAgent(DQN):
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
         """As many samples as :data:`_BRANCHES`; see :class:`.capabilities.OutcomePredictor`."""
-        z, shape = self.perception.encoder.encode(frames)[0], (len(frames), self.n_actions, _BRANCHES)
+        z = self.perception.encoder.encode(frames)[0]
+        shape = (len(frames), self.n_actions, _BRANCHES)
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         action = np.tile(np.repeat(np.arange(self.n_actions), _BRANCHES), len(frames))
-        z, weights = z.repeat_interleave(self.n_actions * _BRANCHES, dim=0), self.imagination.draw_weights(generator)
+        z = z.repeat_interleave(self.n_actions * _BRANCHES, dim=0)
+        weights = self.imagination.draw_weights(generator)
         next_z, reward, p_terminated = _predict(self.imagination, z, action, weights, generator)
         read = self.perception.encoder.read_macrostate(next_z)
         return ExpectedOutcomes(
@@ -178,7 +190,8 @@ class ImaginingAgent(DQN):
 
     def _rollout(self, start: Tensor, steps: list[tuple[Tensor, Tensor, Imagined]]) -> ImaginedRollout:
         values, actions, imagined = zip(*steps, strict=True)
-        encoder, imagination = self.perception.encoder, self.imagination
+        encoder = self.perception.encoder
+        imagination = self.imagination
         latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
         parts = [decompose(step.samples) for step in imagined]
         nothing = torch.zeros_like(imagined[0].reward)  # on the device of what follows
@@ -204,14 +217,18 @@ class ImaginingAgent(DQN):
 
 
 def build(
-    kind: type[_Kind], context: AgentContext, *, filtered: bool,
+    kind: type[_Kind],
+    context: AgentContext,
+    *,
+    filtered: bool,
     hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS,
-) -> _Kind:  # fmt: skip
+) -> _Kind:
     """An imagining agent of a kind, with or without the filter; the precision is that of its device."""
     settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
     precision = settle(settings.model.precision, context.device)
     settings = replace(settings, model=replace(settings.model, precision=precision))
-    device, perception = prepare_torch(context.device), load_perception(context)
+    device = prepare_torch(context.device)
+    perception = load_perception(context)
     return kind(perception, context.n_actions, settings, context.seeds, device, filtered=filtered)
 
 
@@ -225,7 +242,8 @@ def _predict(
     imagination: Imagination, z: Tensor, action: NDArray[np.int64], weights: Weights, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""
-    model, settings = imagination.model, imagination.settings
+    model = imagination.model
+    settings = imagination.settings
     samples = model.members * (1 if weights.dynamics is None else settings.weight_samples)
     size = max(1, _PREDICTIONS // samples)
     parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)

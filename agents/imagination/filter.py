@@ -57,7 +57,8 @@ class EpistemicFilter:
                 "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
                 "imagination.weight_samples above 1, or imagination.reward_threshold to null."
             )
-        self.settings, self.active = settings.imagination, active
+        self.settings = settings.imagination
+        self.active = active
         self._reduce = reduction(self.settings.reduction)
         self.threshold = self.settings.threshold
 

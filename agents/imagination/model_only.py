@@ -39,14 +39,21 @@ class ModelOnlyTraining:
     def __init__(
         self, imagination: Imagination, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device
     ) -> None:
-        self.imagination, self._n_actions, self.settings = imagination, n_actions, settings
-        self._seeds, self._device = seeds, device
+        self.imagination = imagination
+        self._n_actions = n_actions
+        self.settings = settings
+        self._seeds = seeds
+        self._device = device
         self.begin(0)
 
     def begin(self, real_step: int) -> None:
         """Forget everything and start with a new controller, for what was learned up to ``real_step``."""
-        seeds, device, size = self._seeds.child(real_step), self._device, self.imagination.model.latent_size
-        self.real_step, self.episodes, self.steps = real_step, 0, 0
+        seeds = self._seeds.child(real_step)
+        device = self._device
+        size = self.imagination.model.latent_size
+        self.real_step = real_step
+        self.episodes = 0
+        self.steps = 0
         self._generator = torch.Generator(device).manual_seed(seeds.child("episodes").integer())
         weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
         self.controller = Controller(size, self._n_actions, self.settings.controller, weights)
@@ -59,10 +66,14 @@ class ModelOnlyTraining:
         The filter, where there is one, ends it before the first transition that it discards. ``real`` is read by a
         moving threshold only. DivergedError if the controller's loss is no longer finite.
         """
-        imagination, settings, generator = self.imagination, self.settings.imagination, self._generator
+        imagination = self.imagination
+        settings = self.settings.imagination
+        generator = self._generator
         weights = imagination.draw_weights(generator)
         imagination.filter.move_threshold(imagination.model, real, weights.dynamics, generator)
-        z, predicted, kept = starts.sample(1, generator), 0, 0
+        z = starts.sample(1, generator)
+        predicted = 0
+        kept = 0
         gathered = torch.zeros(1, device=z.device)
         while kept < settings.depth:
             chance = max(epsilon(self.steps, self.settings.controller), settings.exploration)
@@ -79,7 +90,8 @@ class ModelOnlyTraining:
                 batch = self._memory.sample(self.settings.controller.batch_size, generator)
                 meters.add("loss/bellman_imagined", self.controller.update(batch))
             self.steps += 1
-            kept, z = kept + 1, step.next_z
+            kept = kept + 1
+            z = step.next_z
             if bool(terminated):
                 break
         meters.add("imagination/acceptance_rate", kept, predicted)
@@ -89,8 +101,11 @@ class ModelOnlyTraining:
     def values(self) -> dict[str, int]:
         """Counters, JSON-serialisable."""
         return {
-            "real_step": self.real_step, "episodes": self.episodes, "steps": self.steps, "imagined": self._memory.added
-        }  # fmt: skip
+            "real_step": self.real_step,
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "imagined": self._memory.added,
+        }
 
     def arrays(self) -> snapshot.Arrays:
         """Copies of weights, moments, target network, memory and generator."""
@@ -103,7 +118,8 @@ class ModelOnlyTraining:
     def load(self, arrays: snapshot.Arrays, values: dict[str, int]) -> None:
         """Take up the results of :meth:`arrays` and :meth:`values`."""
         self.begin(values["real_step"])
-        self.episodes, self.steps = values["episodes"], values["steps"]
+        self.episodes = values["episodes"]
+        self.steps = values["steps"]
         snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
         self._memory.load(snapshot.below("memory", arrays), values["imagined"])
         snapshot.load_generator(self._generator, arrays["generator"])
@@ -116,9 +132,15 @@ class ModelOnlyAgent(ImaginingAgent):
     """
 
     def __init__(
-        self, perception: Perception, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device, *,
+        self,
+        perception: Perception,
+        n_actions: int,
+        settings: Settings,
+        seeds: SeedTree,
+        device: torch.device,
+        *,
         filtered: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(perception, n_actions, settings, seeds, device, filtered=filtered)
         self.training = ModelOnlyTraining(self.imagination, n_actions, settings, seeds.child("model_only"), device)
         self._starts = StartMemory(_STARTS, perception.latent_size, device)

@@ -77,10 +77,17 @@ class Imagination:
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: Settings, *, filtered: bool, seeds: SeedTree,
+        self,
+        latent_size: int,
+        n_actions: int,
+        settings: Settings,
+        *,
+        filtered: bool,
+        seeds: SeedTree,
         device: torch.device,
-    ) -> None:  # fmt: skip
-        self._all_settings, self.settings = settings, settings.imagination
+    ) -> None:
+        self._all_settings = settings
+        self.settings = settings.imagination
         self.filter = EpistemicFilter(settings, active=filtered)
         self.generators = {
             name: torch.Generator(device).manual_seed(seeds.child(name).integer())
@@ -145,7 +152,8 @@ class Imagination:
         if self.settings.predicts_with == "network" and weights.dynamics is not None:
             samples = self.model.predict(z, action, None)
         elif self.settings.predicts_with == "sample":
-            rows, count = torch.arange(len(z), device=z.device), len(samples.means) // members
+            rows = torch.arange(len(z), device=z.device)
+            count = len(samples.means) // members
             chosen = torch.randint(count, (len(z),), generator=generator, device=z.device)
             samples = samples.map(lambda values: values.unflatten(0, (members, count))[:, chosen, rows])
         return mdn.average(samples, members)
@@ -199,25 +207,31 @@ class Imagination:
             real: What really happened so far.
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
-        settings, generator, scale = self.settings, self.generators["rollouts"], self.settings.confidence_scale
+        settings = self.settings
+        generator = self.generators["rollouts"]
+        scale = self.settings.confidence_scale
         sampled = self.filter.active or scale is not None or settings.predicts_with != "network"
         weights = self.draw_weights(self.generators["dropout"]) if sampled else Weights(None, None)
         self.filter.move_threshold(self.model, real, weights.dynamics, self.generators["replay"])
-        z, predicted, accepted = self._starts(current, real), 0, 0
+        z = self._starts(current, real)
+        predicted = 0
+        accepted = 0
         gathered = torch.zeros(len(z), device=z.device)
         for _ in range(settings.depth):
             action = self.act(controller, z, max(epsilon, settings.exploration), generator)
             step = self.step(z, action, weights, generator)
             terminated = step.p_terminated > TERMINAL
             keep = self.admits(z, action, step, gathered)
-            predicted, accepted = predicted + len(z), accepted + int(keep.sum())
+            predicted = predicted + len(z)
+            accepted = accepted + int(keep.sum())
             if keep.any():
                 weight = self.confidence(step, gathered)
                 imagined = Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight)
                 self.memory.add(imagined.where(keep))
             gathered = self.gathered_with(step, gathered)
             going_on = keep & ~terminated
-            z, gathered = step.next_z[going_on], gathered[going_on]
+            z = step.next_z[going_on]
+            gathered = gathered[going_on]
             if len(z) == 0:
                 break
         return Counts(settings.breadth, predicted, accepted)

@@ -61,14 +61,17 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
             raise InvalidValueError(
                 f"The pool of starts has shape {starts.shape}; give at least one of shape (P, {model.latent_size})."
             )
-        self.imagination, self.starts = imagination, starts
-        self.num_envs, self.horizon = num_envs, horizon
+        self.imagination = imagination
+        self.starts = starts
+        self.num_envs = num_envs
+        self.horizon = horizon
         self._generator = torch.Generator(imagination.generators["rollouts"].device)
         self.single_observation_space = gymnasium.spaces.Box(-LATENT_LIMIT, LATENT_LIMIT, (model.latent_size,))
         self.single_action_space = gymnasium.spaces.Discrete(model.n_actions)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
-        self._z, self._steps = np.empty((0, model.latent_size), np.float32), np.zeros(num_envs, np.int64)
+        self._z = np.empty((0, model.latent_size), np.float32)
+        self._steps = np.zeros(num_envs, np.int64)
         self._gathered = torch.zeros(num_envs, device=self._generator.device)
 
     def reset(
@@ -91,7 +94,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
             raise InvalidValueError(
                 f"Actions {actions} must be {self.num_envs} in [0, {self.imagination.model.n_actions})."
             )
-        generator, imagination = self._generator, self.imagination
+        generator = self._generator
+        imagination = self.imagination
         generator.manual_seed(int(self.np_random.integers(2**63)))
         z, action = (
             torch.tensor(values, device=generator.device) for values in (self._z, np.asarray(actions, np.int64))
@@ -137,7 +141,8 @@ class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
         if world.num_envs != 1:
             raise InvalidValueError(f"This world has {world.num_envs} episodes side by side; give one of num_envs 1.")
         self.world = world
-        self.observation_space, self.action_space = world.single_observation_space, world.single_action_space
+        self.observation_space = world.single_observation_space
+        self.action_space = world.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

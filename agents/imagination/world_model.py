@@ -88,12 +88,20 @@ class WorldModel(nn.Module):
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator, *,
+        self,
+        latent_size: int,
+        n_actions: int,
+        settings: WorldModelSettings,
+        generator: torch.Generator,
+        *,
         predicted: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
-        self.latent_size, self.n_actions, self.settings = latent_size, n_actions, settings
-        self.members, self.predicted = settings.members, latent_size if predicted is None else predicted
+        self.latent_size = latent_size
+        self.n_actions = n_actions
+        self.settings = settings
+        self.members = settings.members
+        self.predicted = latent_size if predicted is None else predicted
         outputs = mdn.output_size(settings.components, self.predicted)
         sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
         self.dynamics = _member_mlp(sizes, self.members, settings, generator)
@@ -167,7 +175,8 @@ class WorldModel(nn.Module):
         """
         if weights is None:
             return self._mixture(z, action, None)
-        rows, samples = len(z), weights[0].shape[1]
+        rows = len(z)
+        samples = weights[0].shape[1]
         masks = tuple(mask.repeat_interleave(rows, dim=1) for mask in weights)
         mixture = self._mixture(z.repeat(samples, 1), action.repeat(samples), masks)  # [E, T N, ...]
         return mixture.map(lambda values: values.reshape(-1, rows, *values.shape[2:]))
@@ -184,7 +193,8 @@ class WorldModel(nn.Module):
 
         Weights are from :meth:`draw_reward_weights`.
         """
-        inputs, masks = self.head.inputs(z, action, next_z), [mask.squeeze(0) for mask in weights]
+        inputs = self.head.inputs(z, action, next_z)
+        masks = [mask.squeeze(0) for mask in weights]
         rewards = sample_outputs(self.head.reward_network, inputs, masks)[..., 0]  # [T, N]
         return rewards.std(dim=0, correction=0) * self.settings.reward_scale
 

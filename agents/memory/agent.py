@@ -52,15 +52,21 @@ class RememberingAgent(DQN, ABC):
 
     def begin_episode(self) -> None:
         """Forget what was seen; see :class:`.capabilities.EpisodeRememberer`."""
-        self._seen, self._lived = Past(), Past()
+        self._seen = Past()
+        self._lived = Past()
 
     def new_memory(self, device: torch.device) -> SequenceMemory:
         """One that is empty, of sequences."""
-        settings, size = self.settings.recurrence, self.perception.plain.latent_size
+        settings = self.settings.recurrence
+        size = self.perception.plain.latent_size
         return SequenceMemory(
-            self.settings.memory.real, size, device,
-            units=settings.units, burn_in=settings.burn_in, recurrence=lambda: self.recurrence,
-        )  # fmt: skip
+            self.settings.memory.real,
+            size,
+            device,
+            units=settings.units,
+            burn_in=settings.burn_in,
+            recurrence=lambda: self.recurrence,
+        )
 
     @property
     @abstractmethod
@@ -85,13 +91,21 @@ class RememberingAgent(DQN, ABC):
 
     def store(self, transition: Transition) -> Tensor:
         """Add a real transition to the memory, with what was remembered before; the state it began in (Z + H,)."""
-        lived, frame, plain = self._lived, transition.observation.frame, self.perception.plain
+        lived = self._lived
+        frame = transition.observation.frame
+        plain = self.perception.plain
         state, before = self.perception.recall([*lived.frames, frame], lived.actions)
         then = plain.posterior(transition.next_observation.frame)
         self.real.add_step(
-            plain.posterior(frame), transition.action, transition.reward, then, transition.terminated,
-            step=len(lived.frames), before=lived.actions[-1] if lived.actions else START, stored=before,
-        )  # fmt: skip
+            plain.posterior(frame),
+            transition.action,
+            transition.reward,
+            then,
+            transition.terminated,
+            step=len(lived.frames),
+            before=lived.actions[-1] if lived.actions else START,
+            stored=before,
+        )
         lived.frames.append(frame)
         lived.actions.append(transition.action)
         if transition.terminated or transition.truncated:

@@ -73,7 +73,8 @@ class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
 
     def draw_model_batches(self, generator: torch.Generator) -> Iterator[Batch]:
         """Replayed sequences as transitions between states, through which losses reach what remembers."""
-        settings, length = self.settings.model, self.settings.recurrence.sequence
+        settings = self.settings.model
+        length = self.settings.recurrence.sequence
         for _ in range(settings.updates_per_step):
             sequences = self.real.draw(
                 settings.batch_size, length, generator, spread=settings.spread, balance=settings.balance

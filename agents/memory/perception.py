@@ -21,8 +21,11 @@ class StateEncoder(Encoder):
 
     def __init__(self, encoder: Encoder, units: int, recurrence: Callable[[], Recurrence]) -> None:
         # everything is done by the encoder that is given
-        self.card, self.device, self.latent_size = encoder.card, encoder.device, encoder.latent_size + units
-        self._encoder, self._recurrence = encoder, recurrence
+        self.card = encoder.card
+        self.device = encoder.device
+        self.latent_size = encoder.latent_size + units
+        self._encoder = encoder
+        self._recurrence = recurrence
 
     @torch.no_grad()
     def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
@@ -33,7 +36,8 @@ class StateEncoder(Encoder):
     def remembering(self, mu: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
         """The same from their posteriors (N, Z)."""
         recurrence = self._recurrence()
-        blank, first = recurrence.blank(len(mu)), torch.full((len(mu), 1), START, device=mu.device)
+        blank = recurrence.blank(len(mu))
+        first = torch.full((len(mu), 1), START, device=mu.device)
         memory = recurrence(mu.unsqueeze(1), first, blank)[:, 0]
         return torch.cat([mu, memory], dim=-1), torch.cat([sigma, torch.zeros_like(memory)], dim=-1)
 
@@ -53,7 +57,8 @@ class Remembering(Perception):
 
     def __init__(self, plain: Perception, units: int, recurrence: Callable[[], Recurrence]) -> None:
         super().__init__(StateEncoder(plain.encoder, units, recurrence))
-        self.plain, self._recurrence = plain, recurrence
+        self.plain = plain
+        self._recurrence = recurrence
 
     def posterior(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the state of a lone frame, each of shape (Z + H,)."""
@@ -68,7 +73,8 @@ class Remembering(Perception):
         ``actions`` are the macro-actions between them.
         """
         z = torch.stack([self.plain.posterior(frame)[0] for frame in frames]).unsqueeze(0)  # [1, T, Z]
-        recurrence, previous = self._recurrence(), torch.tensor([[START, *actions]], device=z.device)
+        recurrence = self._recurrence()
+        previous = torch.tensor([[START, *actions]], device=z.device)
         blank = recurrence.blank(1)
         memory = recurrence(z, previous, blank)[0]  # [T, H]
         return torch.cat([z[0, -1], memory[-1]]), memory[-2] if len(memory) > 1 else blank[0]

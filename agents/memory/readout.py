@@ -51,13 +51,15 @@ def fit(memory: SequenceMemory, recurrence: Recurrence, encoder: Encoder, sizes:
     """Ridge regression from memories to what was seen last, over the newest replayed episodes."""
     rows = memory.arrays()
     starts = np.flatnonzero(rows["step"] == 0)[-_EPISODES:]
-    features, labels = [recurrence.blank(0)], [np.zeros((0, len(sizes)), dtype=np.int64)]
+    features = [recurrence.blank(0)]
+    labels = [np.zeros((0, len(sizes)), dtype=np.int64)]
     for begin, end in pairwise([*starts, len(rows["step"])]):
         mu = torch.as_tensor(rows["mu"][begin:end], device=encoder.device)
         previous = torch.as_tensor(rows["before"][begin:end], device=encoder.device)
         features.append(recurrence(mu.unsqueeze(0), previous.unsqueeze(0), recurrence.blank(1))[0])
         labels.append(last_seen(encoder.read_macrostate(mu), sizes))
-    x, y = torch.cat(features), np.concatenate(labels)
+    x = torch.cat(features)
+    y = np.concatenate(labels)
     x = torch.cat([x, torch.ones_like(x[:, :1])], dim=1)  # [N, H + 1]
     seen = tuple(size if (column != NEVER_SEEN).any() else 0 for size, column in zip(sizes, y.T, strict=True))
     parts = [np.arange(size) == column[:, None] for size, column in zip(seen, y.T, strict=True)]  # never seen: all 0

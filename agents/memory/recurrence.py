@@ -17,7 +17,8 @@ class Recurrence(nn.Module):
 
     def __init__(self, latent_size: int, n_actions: int, units: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.units, device = units, generator.device
+        self.units = units
+        device = generator.device
         with torch.device("meta"):  # torch would draw weights from its global generator
             gru = nn.GRU(latent_size + n_actions, units, batch_first=True)
         self.gru = gru.to_empty(device=device)

@@ -58,23 +58,39 @@ class SequenceMemory(RealMemory):
     """
 
     def __init__(
-        self, capacity: int, latent_size: int, device: torch.device, *, units: int, burn_in: int,
+        self,
+        capacity: int,
+        latent_size: int,
+        device: torch.device,
+        *,
+        units: int,
+        burn_in: int,
         recurrence: Callable[[], Recurrence],
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(capacity, latent_size, device)
-        self._recurrence, self._burn_in = recurrence, burn_in
+        self._recurrence = recurrence
+        self._burn_in = burn_in
         self._columns |= {name: torch.zeros(capacity, dtype=torch.int64, device=device) for name in ("step", "before")}
         self._columns["stored"] = torch.zeros(capacity, units, device=device)
 
     def add_step(
-        self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool, *,
-        step: int, before: int, stored: Tensor,
-    ) -> None:  # fmt: skip
+        self,
+        posterior: Posterior,
+        action: int,
+        reward: float,
+        next_posterior: Posterior,
+        terminated: bool,
+        *,
+        step: int,
+        before: int,
+        stored: Tensor,
+    ) -> None:
         """Store transition ``step`` of an episode, which goes on from the one stored last unless that is 0.
 
         ``before`` is the macro-action before it, or :data:`START`; ``stored`` what was remembered then, shape (H,).
         """
-        row, columns = self.added % self.capacity, self._columns
+        row = self.added % self.capacity
+        columns = self._columns
         columns["step"][row], columns["before"][row], columns["stored"][row] = step, before, stored
         self.add(posterior, action, reward, next_posterior, terminated)
 
@@ -83,7 +99,8 @@ class SequenceMemory(RealMemory):
     ) -> Sequences:
         """Sequences of at most ``length`` transitions that begin with drawn ones; see :meth:`RealMemory.sample`."""
         drawn = self._draw(count, generator, self._weights(balance) if balance else None)
-        columns, step = self._columns, drawn["step"]
+        columns = self._columns
+        step = drawn["step"]
         oldest = self.added - len(self)
         number = oldest + (drawn["rows"] - oldest) % self.capacity  # how many were stored before it
         burned = torch.minimum(step.clamp_max(self._burn_in), number - oldest)
@@ -97,11 +114,13 @@ class SequenceMemory(RealMemory):
         late, there = rows(number, length)
         valid = there & (columns["step"][late] - torch.arange(length, device=step.device) == step.unsqueeze(1))
         longest = int(valid.sum(dim=1).max())
-        late, valid = late[:, :longest], valid[:, :longest]
+        late = late[:, :longest]
+        valid = valid[:, :longest]
         mu = torch.cat([columns["mu"][early], drawn["mu"].unsqueeze(1), columns["next_mu"][late]], dim=1)
         sigma = torch.cat([columns["sigma"][early], drawn["sigma"].unsqueeze(1), columns["next_sigma"][late]], dim=1)
         noise = torch.empty(mu.shape, device=generator.device).normal_(generator=generator)
-        z, many = torch.addcmul(mu, sigma, noise * spread), early.shape[1]
+        z = torch.addcmul(mu, sigma, noise * spread)
+        many = early.shape[1]
         return Sequences(
             stored=columns["stored"][first % self.capacity],
             burned=burned,

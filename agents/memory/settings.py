@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from ..dqn_settings import HYPERPARAMETERS as DQN
 from ..dqn_settings import DQNSettings
 from ..imagination.settings import HYPERPARAMETERS as IMAGINATION
 from ..imagination.settings import Settings
@@ -44,19 +43,27 @@ _FAST: Mapping[str, Override] = {
     "recurrence.sequence": Override(10, "as long as most episodes are"),
 }
 _SLOW_TARGET = Override(0.05, "without a target network the values of states that are still being learned swing")
-_FAST_DQN = {**_FAST, "controller.target_rate": _SLOW_TARGET}
+FAST_DQN = {**_FAST, "controller.target_rate": _SLOW_TARGET}
 _FAST_IMAGINATION = {
-    **_FAST_DQN,
+    **FAST_DQN,
     "model.batch_size": Override(32, "CPU time; each row is a sequence of several transitions"),
 }
 _UNUSED = frozenset({"memory.priority", "memory.priority_correction"})
-_S = TypeVar("_S", RecurrentDQNSettings, RecurrentSettings)
+S = TypeVar("S", RecurrentDQNSettings, RecurrentSettings)
 
 
-def _with_memory(
-    kind: type[_S], base: Hyperparameters[DQNSettings] | Hyperparameters[Settings], fast: Mapping[str, Override]
-) -> Hyperparameters[_S]:
-    """Those of an agent without memory, and how it remembers; sequences are not prioritised."""
+def with_memory(
+    kind: type[S], base: Hyperparameters[DQNSettings] | Hyperparameters[Settings], fast: Mapping[str, Override]
+) -> Hyperparameters[S]:
+    """The hyper-parameters of an agent without memory, with settings of its memory added.
+
+    Replayed sequences are not prioritised, so the settings of priorities are unused.
+
+    Args:
+        kind: The class of the settings that are made.
+        base: The hyper-parameters of the agent without memory.
+        fast: Overrides of every set but ``published``.
+    """
     groups = {}
     for name, group in base.groups.items():
         sets = {each: {**changes, **({} if each == "published" else fast)} for each, changes in group.sets.items()}
@@ -64,5 +71,4 @@ def _with_memory(
     return Hyperparameters(groups)
 
 
-DRQN = _with_memory(RecurrentDQNSettings, DQN, _FAST_DQN)
-IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)
+IMAGINATION_MEMORY = with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)

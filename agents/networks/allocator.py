@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 
-_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
+_TRIM_THRESHOLD = -1
+_TOP_PAD = -2
+_MMAP_THRESHOLD = -3
 """Parameters of ``mallopt`` (glibc, malloc.h)."""
 _MIB = 2**20
 

@@ -41,12 +41,20 @@ class NormedMLP(nn.Module):
     """
 
     def __init__(
-        self, sizes: Sequence[int], *, generators: Sequence[torch.Generator], dropout: float,
+        self,
+        sizes: Sequence[int],
+        *,
+        generators: Sequence[torch.Generator],
+        dropout: float,
         precision: torch.dtype = torch.float32,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
-        self.sizes, self.members, self.dropout, self.precision = tuple(sizes), len(generators), dropout, precision
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.sizes = tuple(sizes)
+        self.members = len(generators)
+        self.dropout = dropout
+        self.precision = precision
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
         self.batches = 0
         self._statistics: list[tuple[Tensor, Tensor]] = []
         device = generators[0].device
@@ -112,7 +120,8 @@ class NormedMLP(nn.Module):
         blank = torch.Generator(device=self.weights[0].device)
         network = MemberMLP(self.sizes, members=self.members, dropout=self.dropout, generator=blank)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            mean, variance = self.get_buffer(f"mean_{layer}"), self.get_buffer(f"variance_{layer}")
+            mean = self.get_buffer(f"mean_{layer}")
+            variance = self.get_buffer(f"variance_{layer}")
             scaled = weight * (variance + EPSILON).rsqrt().mT  # [E, out, in]
             network.weights[layer].copy_(scaled.mT)
             network.biases[layer].copy_((bias - scaled @ mean).mT)

@@ -18,14 +18,13 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, brief
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.page import report_page, texts
+from imagine_bench.running.counters import EvaluationCounts, Played
 from imagine_bench.running.evaluation import Env, replay
 from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.archive import is_archive
-from imagine_bench.store.bench_folder import BenchStore, read_control
-from imagine_bench.store.counters import EvaluationCounts, Played
+from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import Checkpoint
 

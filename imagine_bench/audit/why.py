@@ -22,12 +22,12 @@ from imagine_bench.rules import states_of
 from imagine_bench.running.evaluation import Env
 from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import make_env
+from imagine_bench.running.trained import Trained, learners, load_trained, protocol_of_agents
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import csv_text, lock, make_folder, write_bytes, write_json
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import KeptEpisodes
-from imagine_bench.store.trained import Trained, learners, load_trained, protocol_of_agents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class Tested:
 def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
     """Find the causes for every learner of a bench, keep them in its folder, and write its report anew.
 
-    The bench is as in :func:`.analysis.chosen`, ``encoder`` as in :func:`imagine_bench.store.trained.load_trained`.
+    The bench is as in :func:`.analysis.chosen`, ``encoder`` as in :func:`imagine_bench.running.trained.load_trained`.
     Returns what to print.
 
     Raises:

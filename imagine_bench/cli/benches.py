@@ -9,18 +9,20 @@ from typing import Annotated, Any
 import tyro
 
 from imagine_bench import registry
+from imagine_bench.cli.observers import Observed
 from imagine_bench.cli.options import ANY, NEWEST, added_up, listed, only, require_values, shown
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import ProtocolData, digest
-from imagine_bench.protocols.task_types import Encoders, Result, task_types, type_of
+from imagine_bench.protocols.runs import Encoders, Result
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.control import load_bench_of_agents
 from imagine_bench.running.launchers.jobs import LAUNCHERS, launcher
-from imagine_bench.store.archive import is_archive, load_archive
-from imagine_bench.store.bench_folder import newest_bench, read_control, read_protocol
+from imagine_bench.running.task_types import load_so_far, task_types
+from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.store.merge import load_so_far, merge
+from imagine_bench.store.merge import merge
 from imagine_bench.store.results import BenchResult
 
 _LISTS = ("agents", "seeds", "budgets", "after")
@@ -107,8 +109,8 @@ class Bench:
     def __call__(self) -> None:
         """Plan, run, report."""
         wanted, encoders = self.planned()
-        where = launcher(self.launcher, self.workers)
-        _show(bench(wanted, encoders, root=self.out, launcher=where).folder)
+        where = Observed(launcher(self.launcher, self.workers))
+        _show(bench(wanted, encoders, root=self.out, launcher=where))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +139,10 @@ class Report:
             print(f"Metrics: {track(folder, self.track)}")
             return
         others = added_up("merge", self.merge)
-        _show(folder, merge([_load_control(each) for each in (folder, *others)], self.out) if others else None)
+        if others:
+            _show(merge([load_bench_of_agents(each) for each in (folder, *others)], self.out))
+        else:
+            _show(load_so_far(folder))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +180,7 @@ class Study:
             )
         found = registry.offered(self.name or "factors", STUDIES, registry.STUDY_GROUP)
         study = (found if self.file is None else load_study(self.file)).only(added_up("variants", self.variants))
-        where = launcher(self.launcher, self.workers)
+        where = Observed(launcher(self.launcher, self.workers))
         lines = run_study(study, self.task, root=self.out, launcher=where)
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
         folder = self.out / file_name(registry.task_name(self.task)) / f"study-{study.name}-{runs}"
@@ -204,26 +209,16 @@ class List:
             "encoders": {**bundled(), **registry.usable(registry.ENCODER_GROUP)},
         }.items():
             print(f"{title:22}{', '.join(names)}")
+        for guest in registry.absent_guests():
+            names = [name for each in guest.names.values() for name in each]
+            print(f"{'not installed':22}{', '.join(names)} ({guest.install})")
         for error in registry.refused_offers().values():
             print(f"\n{error}")
 
 
-_REPORTS = {"control": "imagine_bench.report", "regression": "imagine_bench.regression.report"}
-"""Modules that report benches of each type of task."""
-
-
-def _load_control(folder: Path) -> BenchResult:
-    """A bench of agents, finished or not, or in the form it is kept in."""
-    read_control(folder)
-    return load_archive(folder) if is_archive(folder) else load_so_far(folder)
-
-
-def _show(folder: Path, result: Result | None = None) -> None:
-    """Write a bench's report, or that of another result of its type, and print its table and where everything lies."""
-    kind = type_of(read_protocol(folder))
-    if result is None:
-        result = load_archive(folder) if is_archive(folder) else kind.load_so_far(folder)
-    report = next(_REPORTS[name] for name, each in task_types().items() if each is kind)
+def _show(result: Result) -> None:
+    """Write a bench's report, and print its table and where everything lies."""
+    report = "imagine_bench.report" if isinstance(result, BenchResult) else "imagine_bench.regression.report"
     print(registry.load(f"{report}:summary_table")(result))  # first, as it needs no place to write
     page = registry.load(f"{report}:write_report")(result)
     print(f"\nReport:     {page}")

@@ -48,8 +48,8 @@ class Dataset:
 
     def __call__(self) -> None:
         """Collect, or describe."""
-        from imagine_bench.data.collect import collect, describe, policy_of  # noqa: PLC0415 - slow, and only for this
         from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset  # noqa: PLC0415
+        from imagine_bench.running.collect import collect, describe, policy_of  # noqa: PLC0415 - slow, and only for this
         from imagine_bench.tools.standard_data import standard_sets  # noqa: PLC0415 - as above
 
         if (self.task is None) == (self.describe is None and not self.standard):

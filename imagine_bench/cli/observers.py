@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
@@ -15,11 +18,16 @@ from imagine_bench.judge.imagination_quality import (
     open_loop,
     open_loop_starts,
 )
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.rules import states_of
+from imagine_bench.running.control import run_control
+from imagine_bench.running.launchers.jobs import Failure, Job, Launcher
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.seeding import SeedTree, evaluation_split
 from imagine_bench.store import run_folder
+from imagine_bench.store.results import RunResult
 
 
 class OpenLoopObserver(RunObserver):
@@ -30,7 +38,7 @@ class OpenLoopObserver(RunObserver):
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``open_loop`` of an agent that imagines."""
-        if not isinstance(run.agent, Imaginer):
+        if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
             return {}
         if self._starts is None:  # the same at every budget
             self._starts = open_loop_starts(
@@ -70,7 +78,7 @@ class ExamplesObserver(RunObserver):
 
     def at_end(self, run: Run) -> AtEnd:
         """``imagined`` from several starts, and ``sampled_rollouts`` from one."""
-        if not isinstance(run.agent, Imaginer):
+        if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
             return {}
         run.tell("imagining", at_once=True)
         agent, task, appearance, seeds = run.agent, run.task, run.protocol.appearance_in_tests, SeedTree(run.spec.seed)
@@ -106,3 +114,31 @@ class RecordingObserver(RunObserver):
                 path=run_folder.recording_path(run.folder),
             )
         return {}
+
+
+OBSERVERS = tuple(
+    f"{__name__}:{observer.__name__}"
+    for observer in (OpenLoopObserver, BeliefsObserver, ExamplesObserver, RecordingObserver)
+)
+"""What looks at every run of a bench, in this order, each as ``"module:attr"``."""
+
+
+class Observed:
+    """A launcher whose runs are looked at by :data:`OBSERVERS`."""
+
+    def __init__(self, launcher: Launcher) -> None:
+        self._launcher = launcher
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job by the launcher within; see :class:`.Launcher`."""
+        observed = [replace(job, spec=replace(job.spec, observers=OBSERVERS)) for job in jobs]
+        return self._launcher.launch(observed, on_progress)
+
+
+def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
+    """Do a run in this process, looked at by :data:`OBSERVERS`; returns its result, None if it pauses before its end.
+
+    Raises as :func:`.runner.run`.
+    """
+    run_control(replace(spec, observers=OBSERVERS), folder, on_progress)
+    return run_folder.load_run(folder) if run_folder.is_done(folder) else None

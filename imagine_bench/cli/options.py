@@ -9,8 +9,8 @@ from typing import Any
 import tyro
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.protocols.task_types import task_type
 from imagine_bench.registry import task_name
+from imagine_bench.running.task_types import task_type
 from imagine_bench.store.bench_folder import require_either
 
 PRESETS_OWN = "(default: the preset's)"

@@ -58,7 +58,9 @@ class BeliefRules:
     states = None
 
     def __init__(self, rules: Rules, sight: Sight, play: Iterable[State], horizon: int) -> None:
-        self._rules, self._sight, self.n_actions = rules, sight, rules.n_actions
+        self._rules = rules
+        self._sight = sight
+        self.n_actions = rules.n_actions
         self._settled = last_step_that_matters(sight, play, horizon)
         self._met: set[Belief] = set()
         share = 1.0 / len(rules.start_states)
@@ -137,17 +139,20 @@ class OptimalPolicy:
     """
 
     def __init__(self, rules: Rules, sight: Sight | None, horizon: int) -> None:
-        self._rules, self._horizon = rules, horizon
+        self._rules = rules
+        self._horizon = horizon
         self._tables = tabulate(rules)
         self._best = horizon_optimum(self._tables, horizon).actions
         self._beliefs: BeliefRules | None = None
         self._rows: dict[State, int] = {}
         if sight is not None:
-            self._sight, self._play = sight, [state for state in self._tables.index if not rules.is_terminal(state)]
+            self._sight = sight
+            self._play = [state for state in self._tables.index if not rules.is_terminal(state)]
             self._beliefs = BeliefRules(rules, sight, self._play, horizon)
             with suppress(TooManyBeliefsError):
                 known = tabulate(cast(Rules, self._beliefs), depth=horizon)
-                self._rows, self._belief_best = known.index, horizon_optimum(known, horizon).actions
+                self._rows = known.index
+                self._belief_best = horizon_optimum(known, horizon).actions
         self._episode: list[tuple[Belief, int]] = []
         """By step: what was known, and the action that was asked for then."""
 

@@ -18,7 +18,9 @@ from imagine_bench.interfaces import Floats, Rules, TaskSpec
 from imagine_bench.rules import RuleTables, evaluate, horizon_optimum, shortest_plans, tabulate
 
 _PROVED = 1e-6  # of a success probability
-_LEARNERS, _FEWEST, _PAIRS = 10, 2, 20_000
+_LEARNERS = 10
+_FEWEST = 2
+_PAIRS = 20_000
 """Learners behind an information floor: the most, the fewest, and (macrostate, action) pairs that they share."""
 
 
@@ -57,10 +59,13 @@ class Certificate:
 
 def certificate(spec: TaskSpec) -> Certificate:
     """Compute the certificate of a task: its rules, its horizon, and what its frames show."""
-    tables, full = tabulate(spec.rules), machine(spec.rules)
-    starts, best = tables.starts, horizon_optimum(tables, spec.horizon)
+    tables = tabulate(spec.rules)
+    full = machine(spec.rules)
+    starts = tables.starts
+    best = horizon_optimum(tables, spec.horizon)
     chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / spec.n_actions), spec.horizon)
-    lengths, graph = shortest_plans(tables)[starts], factor_graph(full)
+    lengths = shortest_plans(tables)[starts]
+    graph = factor_graph(full)
     seen_optimum = float(best.success[starts].mean())
     optimum = seen_optimum
     beliefs: int | None = 0
@@ -68,7 +73,8 @@ def certificate(spec: TaskSpec) -> Certificate:
     if spec.sight is not None:
         optimum, beliefs = _with_memory(spec, tables, seen_optimum)
         found = best_without_memory(spec.rules, spec.sight, spec.horizon, bound=optimum)
-        memoryless, bound = found.value, found.bound
+        memoryless = found.value
+        bound = found.bound
     return Certificate(
         macrostates=len(full.coordinates),
         starts=len(starts),
@@ -127,7 +133,8 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     rows["reward and end"] = "; ".join(f"{what} by [{scopes}]" for what, scopes in found.outcomes)
     rows["facts"] = f"{found.facts} local entries and conditions, of at most {found.width} coordinates each"
     if found.floor is not None:
-        floor, part = found.floor, " (of the certain part alone)" if found.random else ""
+        floor = found.floor
+        part = " (of the certain part alone)" if found.random else ""
         rows["information"] = (
             f"{floor.transitions:.0f} ± {floor.standard_error:.0f} transitions, {floor.episodes:.0f} episodes, until a "
             f"learner with ideal codes and this graph knows an optimal policy{part}"
@@ -159,7 +166,8 @@ def _names(spec: TaskSpec, scope: Scope) -> str:
 
 
 def _outcomes(spec: TaskSpec, full: Machine, graph: FactorGraph) -> tuple[tuple[str, str], ...]:
-    now, then = list(spec.macrostate_names), [f"{name} then" for name in spec.macrostate_names]
+    now = list(spec.macrostate_names)
+    then = [f"{name} then" for name in spec.macrostate_names]
     names = {"next": then, "choice": [*now, "action"], "both": [*now, "action", *then]}[graph.read]
     rows = []
     for claim in graph.claims:

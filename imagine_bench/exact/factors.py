@@ -89,8 +89,10 @@ def factor_graph(machine: Machine) -> FactorGraph:
 
 def _factors(machine: Machine, action: int) -> Iterator[Factor]:
     first, last = np.searchsorted(machine.pair, [action * machine.n_play, (action + 1) * machine.n_play])
-    before, after = machine.before[first:last], machine.coordinates[machine.after[first:last]]
-    now, weight = machine.coordinates[: machine.n_play], machine.probability[first:last]
+    before = machine.before[first:last]
+    after = machine.coordinates[machine.after[first:last]]
+    now = machine.coordinates[: machine.n_play]
+    weight = machine.probability[first:last]
     moved = [i for i in range(now.shape[1]) if (after[:, i] != now[before, i]).any()]
     for children in _drawn_together(moved, before, after, weight):
         law = _laws(before, keys(after, children), weight, machine.n_play)
@@ -143,7 +145,8 @@ def _smallest(now: NDArray[np.int64], law: NDArray[np.int64], children: Scope) -
 
 
 def _points(machine: Machine) -> tuple[str, NDArray[np.int64], NDArray[np.int64]]:
-    now, then = machine.coordinates[machine.before], machine.coordinates[machine.after]
+    now = machine.coordinates[machine.before]
+    then = machine.coordinates[machine.after]
     choice = np.hstack([now, machine.action[:, None]])
     for read, values in (("next", then), ("choice", choice), ("both", np.hstack([choice, then]))):
         key = keys(values, range(values.shape[1]))
@@ -159,7 +162,8 @@ def _claims(points: NDArray[np.int64], label: NDArray[np.int64]) -> tuple[tuple[
     while len(left := np.unique(label)) > 1:
         claim = _next_claim(points, label, left)
         claims.append(claim)
-        points, label = points[label != claim.class_], label[label != claim.class_]
+        points = points[label != claim.class_]
+        label = label[label != claim.class_]
     return tuple(claims), int(left[0])
 
 
@@ -173,7 +177,8 @@ def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArr
             is_it = label == class_
             for scope in scopes:
                 key = np.unique(keys(points, scope), return_inverse=True)[1].reshape(-1)
-                total, of_it = np.bincount(key), np.bincount(key, weights=is_it)
+                total = np.bincount(key)
+                of_it = np.bincount(key, weights=is_it)
                 forces = (total == of_it)[key]
                 if forces.any():
                     so_far.append((scope, np.where(forces, key, -1)))
@@ -187,7 +192,8 @@ def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArr
 def _cover(class_: int, forced: list[tuple[Scope, NDArray[np.int64]]]) -> LocalClass:
     """A small set of scopes: again and again the one that covers the most of what is left."""
     covered = np.zeros(len(forced[0][1]), dtype=np.bool_)
-    scopes, conditions = [], 0
+    scopes = []
+    conditions = 0
     wanted = np.logical_or.reduce([key >= 0 for _, key in forced])
     while not (covered == wanted).all():
         scope, key = max(forced, key=lambda each: int(((each[1] >= 0) & ~covered).sum()))

@@ -43,8 +43,10 @@ class _Knowledge:
     """What is known of each local entry, and what that leaves possible. ``Q`` points, ``E`` dynamics entries."""
 
     def __init__(self, machine: Machine, graph: FactorGraph) -> None:
-        self.machine, self.graph = machine, graph
-        shape, first = (machine.n_actions, machine.n_play), 0
+        self.machine = machine
+        self.graph = graph
+        shape = (machine.n_actions, machine.n_play)
+        first = 0
         touched: list[list[NDArray[np.int64]]] = [[] for _ in range(machine.n_actions)]
         for factor in graph.factors:
             touched[factor.action].append(factor.entry + first)
@@ -65,7 +67,8 @@ class _Knowledge:
                 columns.append(number + count)
                 count += int(number.max()) + 1
             self.conditions.append(np.stack(columns, axis=1))
-        self.true, self.false = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        self.true = np.zeros(count, dtype=np.bool_)
+        self.false = np.zeros(count, dtype=np.bool_)
         read = sorted({i for claim in graph.claims for scope in claim.scopes for i in scope})
         self.alike = np.unique(keys(graph.points, read), return_inverse=True)[1].reshape(-1)  # points that are one
         self.class_of = np.full(int(self.alike.max()) + 1, -1)  # what was observed
@@ -73,7 +76,8 @@ class _Knowledge:
 
     def learn(self, outcome: int) -> bool:
         """Take in a transition; whether more than the absence of a condition was learned."""
-        machine, point = self.machine, int(self.graph.point[outcome])
+        machine = self.machine
+        point = int(self.graph.point[outcome])
         mine = self.entries[machine.action[outcome], machine.before[outcome]]
         news = not self.known[mine].all()
         self.known[mine] = True
@@ -89,7 +93,8 @@ class _Knowledge:
 
     def _resolve(self) -> bool:
         """A clause of which one condition is left shows that it is true."""
-        open_, news = [], False
+        open_ = []
+        news = False
         for index, point in self.clauses:
             conditions = self.conditions[index][point]
             left = np.unique(conditions[~self.false[conditions]])
@@ -125,7 +130,9 @@ class _Learner:
     def __init__(self, machine: Machine, graph: FactorGraph, horizon: int) -> None:
         from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
 
-        self.machine, self.graph, self.horizon = machine, graph, horizon
+        self.machine = machine
+        self.graph = graph
+        self.horizon = horizon
         self.knows = _Knowledge(machine, graph)
         n = machine.n_play * machine.n_actions
         columns = np.arange(len(machine.pair))
@@ -145,9 +152,11 @@ class _Learner:
 
     def solve(self) -> bool:
         """Plan optimistically; whether every start is settled. Leaves the facts wanted and the plan."""
-        machine, n = self.machine, self.machine.n_play
+        machine = self.machine
+        n = self.machine.n_play
         possible = self.knows.possible()[:, self.graph.point]  # [C, N]
-        sure, alive = possible.sum(axis=0) == 1, (possible & ~self.ends[:, None]).any(axis=0)
+        sure = possible.sum(axis=0) == 1
+        alive = (possible & ~self.ends[:, None]).any(axis=0)
         entries_known = self.knows.known[self.knows.entries].all(axis=2)
         best = np.where(possible, self.pay[:, None], -np.inf)
         ended = np.where(self.ends[:, None], best, -np.inf).max(axis=0)  # [N]
@@ -161,13 +170,16 @@ class _Learner:
             if change < _EPS:
                 break
         optimal = (q >= q.max(axis=0) - _EPS) & np.isfinite(q)
-        settled, count = np.ones(len(value), dtype=np.bool_), -1
+        settled = np.ones(len(value), dtype=np.bool_)
+        count = -1
         while settled.sum() != count:
             count = settled.sum()
             bad = ~sure | (alive & ~settled[machine.after])
             known = entries_known & ~((self.any_outcome @ bad).reshape(self.shape) > 0)
             settled[:n] = (optimal & known).any(axis=0)
-        self.entries_known, self.sure, self.alive = entries_known, sure, alive
+        self.entries_known = entries_known
+        self.sure = sure
+        self.alive = alive
         self.plan = np.where((optimal & known).any(axis=0), (optimal & known).argmax(axis=0), optimal.argmax(axis=0))
         open_starts = machine.starts[~settled[machine.starts]]
         self._want(np.unique(open_starts), settled)
@@ -190,11 +202,13 @@ class _Learner:
 
     def _want(self, starts: NDArray[np.int64], settled: NDArray[np.bool_]) -> None:
         """The unknown facts that the plans from some starts touch."""
-        knows, machine = self.knows, self.machine
+        knows = self.knows
+        machine = self.machine
         self.wanted = np.zeros(len(knows.known), dtype=np.bool_)
         self.wanted_conditions = np.zeros(len(knows.true), dtype=np.bool_)
         self.unsure = np.empty(0, dtype=np.int64)  # the points that those decide
-        met, front = np.zeros(machine.n_play, dtype=np.bool_), starts
+        met = np.zeros(machine.n_play, dtype=np.bool_)
+        front = starts
         while len(front):
             met[front] = True
             actions = self.plan[front]
@@ -225,7 +239,8 @@ class _Learner:
 
     def novelty(self, row: int) -> NDArray[np.int64]:
         """How many wanted facts each action may show. Shape (A,)."""
-        knows, found = self.knows, np.zeros(self.machine.n_actions, dtype=np.int64)
+        knows = self.knows
+        found = np.zeros(self.machine.n_actions, dtype=np.int64)
         for action in range(self.machine.n_actions):
             entries = np.unique(knows.entries[action, row])
             found[action] = (self.wanted & ~knows.known)[entries].sum()
@@ -265,10 +280,13 @@ class _Learner:
 
 def learn(machine: Machine, graph: FactorGraph, horizon: int, rng: np.random.Generator) -> Lesson:
     """Let one learner learn until it is done."""
-    learner, transitions, episodes = _Learner(machine, graph, horizon), 0, 0
+    learner = _Learner(machine, graph, horizon)
+    transitions = 0
+    episodes = 0
     done = learner.solve()
     while not done and transitions < MOST:
-        row, episodes = int(rng.choice(machine.starts)), episodes + 1
+        row = int(rng.choice(machine.starts))
+        episodes = episodes + 1
         for step in range(horizon):
             action = learner.choose(row, horizon - step, rng)
             first, last = learner.first[action * machine.n_play + row : action * machine.n_play + row + 2]

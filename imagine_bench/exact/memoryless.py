@@ -18,7 +18,8 @@ from imagine_bench.interfaces import Rules, Sight, State
 
 _Seen = tuple[tuple[State, ...], State]
 """The macrostates whose frames are still to come, the newest last, and what is shown now."""
-MOST, SOLVED = 30_000, 8_000
+MOST = 30_000
+SOLVED = 8_000
 """Occupancies up to which a policy is looked for, and up to which the programme is solved."""
 NODES = 20
 _GAIN = 1e-7
@@ -93,20 +94,24 @@ def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: floa
     value = _climb(layers, choices, {})
     if value < bound - _GAIN and sum(len(each.links) for each in layers) <= SOLVED:
         policy, proved = _solve(layers, choices, nodes)
-        value, bound = max(value, _climb(layers, choices, policy)), min(bound, proved)
+        value = max(value, _climb(layers, choices, policy))
+        bound = min(bound, proved)
     return Memoryless(value=value, bound=float(max(bound, value)))
 
 
 def _climb(layers: list[_Layer], choices: dict[tuple[State, int], int], policy: dict[State, int]) -> float:
     """Change a policy, one action at a time, while that helps; its value then."""
     policy = {**{shown: action for shown, action in reversed(choices)}, **policy}
-    value, better = _value(layers, policy), True
+    value = _value(layers, policy)
+    better = True
     while better:
         better = False
         for shown, action in choices:
             other = policy | {shown: action}
             if action != policy[shown] and (found := _value(layers, other)) > value + _GAIN:
-                policy, value, better = other, found, True
+                policy = other
+                value = found
+                better = True
     return value
 
 
@@ -138,7 +143,8 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: i
     entries: list[tuple[float, int, int]] = []
     low: list[float] = []
     high: list[float] = []
-    gain, most = np.zeros(total), np.ones(total)
+    gain = np.zeros(total)
+    most = np.ones(total)
     for shown in dict.fromkeys(shown for shown, _ in choices):  # one action each
         entries += [(1.0, len(low), at) for (what, _), at in choices.items() if what == shown]
         low.append(1.0)
@@ -172,7 +178,8 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: i
 
 def _value(layers: list[_Layer], policy: dict[State, int]) -> float:
     """The success probability of a policy, exactly."""
-    now, won = layers[0].most, 0.0
+    now = layers[0].most
+    won = 0.0
     for layer in layers:
         after: dict[_Seen, float] = defaultdict(float)
         for here, weight in now.items():

@@ -47,7 +47,8 @@ class StartingFrom:
     """Rules as they are, with some of their starts."""
 
     def __init__(self, rules: Rules, starts: tuple[State, ...]) -> None:
-        self._rules, self.start_states = rules, starts
+        self._rules = rules
+        self.start_states = starts
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._rules, name)
@@ -102,7 +103,8 @@ def by_pairs(rules: Rules, first: int, second: int, held_out: int, rng: np.rando
     """
     starts = rules.start_states
     found = sorted({(state[first], state[second]) for state in starts})
-    pairs, chosen = list(found), set[tuple[int, int]]()
+    pairs = list(found)
+    chosen = set[tuple[int, int]]()
     for index in rng.permutation(len(found)).tolist():
         left = [pair for pair in pairs if pair != found[index]]
         if len(chosen) < held_out and all({pair[i] for pair in left} == {pair[i] for pair in found} for i in (0, 1)):

@@ -20,9 +20,15 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation, Transition
 
 _TYPES = {
-    "lengths": np.int64, "frames": np.uint8, "action_masks": np.int8, "actions": np.int64, "rewards": np.float64,
-    "terminated": np.bool_, "truncated": np.bool_, "success": np.bool_,
-}  # fmt: skip
+    "lengths": np.int64,
+    "frames": np.uint8,
+    "action_masks": np.int8,
+    "actions": np.int64,
+    "rewards": np.float64,
+    "terminated": np.bool_,
+    "truncated": np.bool_,
+    "success": np.bool_,
+}
 FRAME_SHAPE = (64, 64, 3)
 
 
@@ -52,7 +58,8 @@ class Episodes:
                 raise InvalidValueError(f"{name} holds {given}, not {dtype.__name__}")
         if self.lengths.ndim != 1 or not len(self.lengths) or self.lengths.min() < 1:
             raise InvalidValueError("lengths must be those of one or more episodes, each of at least 1")
-        episodes, steps = len(self.lengths), int(self.lengths.sum())
+        episodes = len(self.lengths)
+        steps = int(self.lengths.sum())
         masks = self.action_masks.shape[-1] if self.action_masks.ndim == 2 else 0
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("actions", "rewards", "terminated", "truncated"), (steps,))
         shapes |= {"frames": (steps + episodes, *FRAME_SHAPE), "action_masks": (steps + episodes, masks)}
@@ -89,7 +96,8 @@ class Episodes:
 
     def steps(self, episode: int) -> tuple[slice, slice]:
         """Where an episode's transitions lie, and where its frames."""
-        begin, length = int(self.lengths[:episode].sum()), int(self.lengths[episode])
+        begin = int(self.lengths[:episode].sum())
+        length = int(self.lengths[episode])
         return slice(begin, begin + length), slice(begin + episode, begin + episode + length + 1)
 
     def transitions(self, episode: int) -> Iterator[Transition]:
@@ -98,10 +106,13 @@ class Episodes:
         frames = [Observation(frame=frame) for frame in self.frames[rows]]
         for index, step in enumerate(range(steps.start, steps.stop)):
             yield Transition(
-                observation=frames[index], action=int(self.actions[step]), reward=float(self.rewards[step]),
-                next_observation=frames[index + 1], terminated=bool(self.terminated[step]),
+                observation=frames[index],
+                action=int(self.actions[step]),
+                reward=float(self.rewards[step]),
+                next_observation=frames[index + 1],
+                terminated=bool(self.terminated[step]),
                 truncated=bool(self.truncated[step]),
-            )  # fmt: skip
+            )
 
     def first(self, transitions: int) -> Episodes:
         """The first so many transitions, the last episode cut off there where it is longer.
@@ -115,15 +126,21 @@ class Episodes:
         count = int(np.searchsorted(ends, transitions)) + 1
         truncated = self.truncated[:transitions].copy()
         truncated[-1] = not self.terminated[transitions - 1]
-        lengths, success = self.lengths[:count].copy(), self.success[:count].copy()
+        lengths = self.lengths[:count].copy()
+        success = self.success[:count].copy()
         lengths[-1] -= ends[count - 1] - transitions
         success[-1] &= ends[count - 1] == transitions
         frames = slice(transitions + count)
         return Episodes(
-            lengths=lengths, frames=self.frames[frames], action_masks=self.action_masks[frames],
-            actions=self.actions[:transitions], rewards=self.rewards[:transitions],
-            terminated=self.terminated[:transitions], truncated=truncated, success=success,
-        )  # fmt: skip
+            lengths=lengths,
+            frames=self.frames[frames],
+            action_masks=self.action_masks[frames],
+            actions=self.actions[:transitions],
+            rewards=self.rewards[:transitions],
+            terminated=self.terminated[:transitions],
+            truncated=truncated,
+            success=success,
+        )
 
     @cached_property
     def hash(self) -> str:

@@ -98,7 +98,8 @@ def _require_shapes(offered: dict[str, NDArray[Any]], said: str, asked: tuple[in
             right = right and 0 not in given
         else:
             shape = (rows, depth) if each in (*UNCERTAINTIES, "accepted") else (rows, futures, depth)
-            right, wanted = array.shape == shape, str(shape)
+            right = array.shape == shape
+            wanted = str(shape)
         if not right:
             raise InvalidValueError(f"{said} gave {each} of shape {array.shape}; give {wanted}.")
 

@@ -22,9 +22,9 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout, begin_episode
 from imagine_bench.judge.imagination_quality import beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state
+from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import SeedTree, episode_seed, is_tuning_seed
 from imagine_bench.store.results import ComparedRollout
-from imagine_bench.store.trained import Trained
 
 
 @dataclass(frozen=True, kw_only=True)

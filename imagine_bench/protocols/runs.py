@@ -1,11 +1,12 @@
-"""What a run is, and how far it is."""
+"""What a run is, how far it is, and what a type of task brings along so that its benches can be run and read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
+from typing import Protocol as Interface
 
 from imagine_bench import registry
 from imagine_bench.exact.beliefs import optimal_policy_of
@@ -14,6 +15,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.seeding import SeedTree
 
+P = TypeVar("P", bound=ProtocolData)
 P_co = TypeVar("P_co", bound=ProtocolData, covariant=True)
 Phase = Literal["training", "training in the model", "testing", "imagining", "recording", "done", "failed"]
 
@@ -30,6 +32,7 @@ class RunSpec(Generic[P_co]):
     until: int | None = None  #: Budget after which it pauses, or None to the end
     checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
     cores: int = 1  #: How many it may use; they change no result
+    observers: tuple[str, ...] = ()  #: What looks at it, each the ``"module:attr"`` of a :class:`.runner.RunObserver`
 
     @property
     def work(self) -> int:
@@ -78,3 +81,45 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+
+Encoders = Mapping[str, Path]
+"""The encoder artefacts of a bench, by kind, none where nothing needs one, and its ``"dataset"``, a folder."""
+
+
+class FinishedRun(Interface):
+    """What runs of every type leave."""
+
+    @property
+    def recording(self) -> Path | None:
+        """Its Rerun recording, or None."""
+
+
+class Result(Interface):
+    """What benches of every type measured: one run an agent and seed, in a folder."""
+
+    @property
+    def runs(self) -> Sequence[FinishedRun]:
+        """One an agent and seed."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the bench's files lie."""
+
+    @property
+    def missing(self) -> Sequence[str]:
+        """What an unfinished bench lacks, one sentence a run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskType(Generic[P]):
+    """What a type of task brings along."""
+
+    tasks: Callable[[], Mapping[str, object]]  #: Gives its tasks, by name
+    learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
+    draws: bool  #: Whether its runs need OpenGL
+    protocol: type[P]  #: The class of its protocols
+    presets: Mapping[str, Mapping[str, Any]]  #: What each protocol preset changes, by name
+    #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
+    plan: Callable[..., tuple[P, Encoders]]
+    run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
+    load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported

@@ -55,7 +55,8 @@ def playing(layout: rrb.Container) -> rrb.Blueprint:
 def _imagined_now() -> rrb.Horizontal:
     name = "The agent's own plan from here: what would really happen (above), what it imagines (below)"
     strip = rrb.Spatial2DView(origin="/imagined/filmstrip", name=name, background=[255, 255, 255])
-    name, hidden = "Uncertainty by depth: epistemic pink, aleatoric blue, modal green", rrb.PlotLegend(visible=False)
+    name = "Uncertainty by depth: epistemic pink, aleatoric blue, modal green"
+    hidden = rrb.PlotLegend(visible=False)
     bars = rrb.BarChartView(origin="/imagined/uncertainty", name=name, plot_legend=hidden)
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
 

@@ -63,7 +63,8 @@ def record_run(
         UnknownNameError: Unknown task or agent.
         SetupError: The folder cannot be written.
     """
-    spec, entry = registry.task(task), registry.agent_entry(name)
+    spec = registry.task(task)
+    entry = registry.agent_entry(name)
     make_folder(path.parent)
     scene = env.unwrapped
     if isinstance(scene, SceneReader):
@@ -71,12 +72,17 @@ def record_run(
     seen, info = env.reset(seed=episode_seed("recording", seed, 1))
     begin_episode(agent)
     first = Observation.of(seen, info, privileged=entry.privileged)
-    values, imagines = isinstance(agent, ValueReader), isinstance(agent, Imaginer)
+    values = isinstance(agent, ValueReader)
+    imagines = isinstance(agent, Imaginer)
     several = imagines and is_random(spec.rules)
     layout = blueprint(
-        target_m=look_target_m(scene), values=values, imagines=imagines, several=several,
-        sees=isinstance(agent, SeeingLearner), explores=_novelty(agent, first, SeedTree(seed)) is not None,
-    )  # fmt: skip
+        target_m=look_target_m(scene),
+        values=values,
+        imagines=imagines,
+        several=several,
+        sees=isinstance(agent, SeeingLearner),
+        explores=_novelty(agent, first, SeedTree(seed)) is not None,
+    )
     with recording_file(path, task, layout) as recording:
         recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
         if isinstance(scene, SceneReader):
@@ -91,7 +97,8 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
 
     The one of index ``chosen``, which is carried out, is marked by an arrow head.
     """
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     width = max(len(name) for name in names)
     rows = []
     for index, (name, value) in enumerate(zip(names, values, strict=True)):
@@ -111,9 +118,15 @@ class _EpisodeRecorder:
     def __init__(
         self, recording: Recording, spec: TaskSpec, agent: Agent, appearance: str, *, privileged: bool, seed: int
     ) -> None:
-        self._recording, self._spec, self._agent, self._appearance = recording, spec, agent, appearance
-        self._privileged, self._seed = privileged, seed
-        self._clock_s, self._env_step, self._episode = 0.0, -1, list[State]()
+        self._recording = recording
+        self._spec = spec
+        self._agent = agent
+        self._appearance = appearance
+        self._privileged = privileged
+        self._seed = seed
+        self._clock_s = 0.0
+        self._env_step = -1
+        self._episode = list[State]()
 
     def record(self, env: gymnasium.Env[Any, np.int64], episode: int) -> None:
         """One greedy real episode, numbered from 1."""
@@ -125,7 +138,9 @@ class _EpisodeRecorder:
         if episode == 1:
             self._log_learning_to_see()
         self._episode = []
-        done, step, heading = False, 0, f"### Episode {episode}: a new start"
+        done = False
+        step = 0
+        heading = f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
             action = int(self._agent.act(observation, explore=False))
@@ -139,7 +154,8 @@ class _EpisodeRecorder:
             self._clock_s += macro_duration_s(env.unwrapped)
             observation = self._log_frame(env.unwrapped, episode, seen, info)
             self._recording.scalar("/real/reward", float(reward))
-            done, step = terminated or truncated, step + 1
+            done = terminated or truncated
+            step = step + 1
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
             outcome = f"Done: {self._spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
@@ -186,7 +202,8 @@ class _EpisodeRecorder:
 
         Of an agent with memory also what a read-out finds in it.
         """
-        spec, truth = self._spec, info["macrostate"]
+        spec = self._spec
+        truth = info["macrostate"]
         remembered = truth
         if isinstance(self._agent, MemoryReader):
             remembered = self._agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
@@ -201,7 +218,8 @@ class _EpisodeRecorder:
         """The Q-values: a curve each, and a table with bars, the chosen one marked."""
         if not isinstance(self._agent, ValueReader):
             return
-        names, values = self._spec.action_names, self._agent.q_values(observation)
+        names = self._spec.action_names
+        values = self._agent.q_values(observation)
         for name, value in zip(names, values, strict=True):
             self._recording.scalar(f"/real/q_values/{entity_name(name)}", value)
         self._recording.text("/real/q_table", q_table(names, values, action))
@@ -226,7 +244,8 @@ class _EpisodeRecorder:
         """The agent's greedy plan, imagined from here and set beside what would really happen."""
         if not isinstance(self._agent, Imaginer):
             return
-        spec, seeds = self._spec, SeedTree(self._seed)
+        spec = self._spec
+        seeds = SeedTree(self._seed)
         rng = seeds.child("recording", episode, step).generator()
         rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
         seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "before": self._episode}
@@ -246,13 +265,15 @@ class _EpisodeRecorder:
         for index, (kind, color) in enumerate(_KINDS.items()):
             imagined = np.asarray(getattr(compared.rollout, kind), dtype=np.float64)
             values = np.pad(imagined, (0, IMAGINED_DEPTH - len(imagined)))
-            places, widths = 1.0 + np.arange(len(values)) + 0.27 * (index - 1), np.full(len(values), 0.25)
+            places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
+            widths = np.full(len(values), 0.25)
             bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
             self._recording.log(f"/imagined/uncertainty/{kind}", bars)
 
     def _by_depth(self, compared: ComparedRollout, root: str) -> None:
         """The same rollout along ``imagined_depth``; depth 0 is the real start."""
-        rollout, recording = compared.rollout, self._recording
+        rollout = compared.rollout
+        recording = self._recording
         curves: dict[str, NDArray[Any]] = {
             **{f"uncertainty/{kind}": getattr(rollout, kind) for kind in _KINDS},
             "prediction/reward": rollout.rewards,

@@ -22,9 +22,9 @@ from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
+from imagine_bench.running.trained import Trained
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
-from imagine_bench.store.trained import Trained
 
 _LOOK_S = 2.0  # how long the scene stands still while the plan is shown, before and after the arm moves
 
@@ -53,12 +53,21 @@ class _PlanRecorder:
     """Records one plan after the other on a common clock."""
 
     def __init__(
-        self, recording: Recording, trained: Trained, env: gymnasium.Env[Any, Any], count: int,
+        self,
+        recording: Recording,
+        trained: Trained,
+        env: gymnasium.Env[Any, Any],
+        count: int,
         max_epistemic: float | None,
-    ) -> None:  # fmt: skip
-        self._recording, self._trained, self._env = recording, trained, env
-        self._count, self._max_epistemic = count, max_epistemic
-        self._clock_s, self._env_step, self._number = 0.0, 0, 0
+    ) -> None:
+        self._recording = recording
+        self._trained = trained
+        self._env = env
+        self._count = count
+        self._max_epistemic = max_epistemic
+        self._clock_s = 0.0
+        self._env_step = 0
+        self._number = 0
 
     def record(self, number: int) -> None:
         """One plan: the scene stands, the plan appears, the arm does it, and its outcome is shown."""
@@ -90,12 +99,15 @@ class _PlanRecorder:
         scene: Any = self._env.unwrapped
         self._recording.set_clocks(self._clock_s, env_step=self._env_step)
         if isinstance(scene, SceneReader):
-            sequences, motion = {"env_step": self._env_step, "plan": self._number}, scene.motion()
+            sequences = {"env_step": self._env_step, "plan": self._number}
+            motion = scene.motion()
             log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
 
     def _show(self, plan: Plan, done: int) -> None:
         """What was imagined, and what is real so far."""
-        recording, compared, rollout = self._recording, plan.compared, plan.compared.rollout
+        recording = self._recording
+        compared = plan.compared
+        rollout = plan.compared.rollout
         real = compared.start_frame if done == 0 else compared.real_frames[done - 1]
         imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
         recording.log("/real/frame", rr.Image(real))

@@ -82,7 +82,8 @@ def look_target_m(scene: Any) -> NDArray[np.float64]:
 
 
 def _drawable(shape: Shape3D) -> rr.AsComponents:
-    center, quaternion = shape.pose_in_body[None, :3], _xyzw(shape.pose_in_body[None, 3:])
+    center = shape.pose_in_body[None, :3]
+    quaternion = _xyzw(shape.pose_in_body[None, 3:])
     color = (np.clip(shape.rgba, 0.0, 1.0) * 255).astype(np.uint8)
     style: dict[str, Any] = {"colors": [color], "fill_mode": "solid"}
     if shape.kind == "mesh":
@@ -92,7 +93,8 @@ def _drawable(shape: Shape3D) -> rr.AsComponents:
     if shape.kind in {"sphere", "ellipsoid"}:
         radii = shape.size if shape.kind == "ellipsoid" else np.full(3, shape.size[0])
         return rr.Ellipsoids3D(half_sizes=[radii], centers=center, quaternions=quaternion, **style)
-    radius, length = [shape.size[0]], 2.0 * shape.size[1]
+    radius = [shape.size[0]]
+    length = 2.0 * shape.size[1]
     if shape.kind == "cylinder":
         return rr.Cylinders3D(lengths=[length], radii=radius, centers=center, quaternions=quaternion, **style)
     if shape.kind == "capsule":  # Rerun's begins at its origin, ours has it in the middle
@@ -118,7 +120,8 @@ def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
 
 def rotated(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate vectors (..., 3) by a unit quaternion (w, x, y, z)."""
-    w, axis = quaternion_wxyz[0], quaternion_wxyz[1:]
+    w = quaternion_wxyz[0]
+    axis = quaternion_wxyz[1:]
     twice = 2.0 * np.cross(axis, vectors)
     return np.asarray(vectors + w * twice + np.cross(axis, twice))
 

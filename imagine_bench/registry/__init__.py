@@ -39,6 +39,7 @@ from imagine_bench.registry.entries import RegressorEntry as RegressorEntry
 from imagine_bench.registry.entries import TaskEntry as TaskEntry
 from imagine_bench.registry.entries import WorldModelEntry as WorldModelEntry
 from imagine_bench.registry.entries import entrant, parse_options, read_mapping
+from imagine_bench.registry.guests import Guest, guest_of, guests
 from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
 
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
@@ -68,18 +69,6 @@ _GROUPS = {
     ),
     WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
 }
-TASK_TYPES = {
-    "control": "imagine_bench.running.control:CONTROL",
-    "regression": "imagine_bench.regression.task_type:REGRESSION",
-}
-"""The types of task, each the ``"module:attr"`` of a :class:`.protocols.task_types.TaskType`."""
-
-OBSERVERS = tuple(
-    f"imagine_bench.cli.observers:{name}"
-    for name in ("OpenLoopObserver", "BeliefsObserver", "ExamplesObserver", "RecordingObserver")
-)
-"""What looks at every control run, in this order, each the ``"module:attr"`` of a
-:class:`.running.runner.RunObserver` without arguments."""
 
 
 def load(target: str) -> Any:
@@ -142,7 +131,8 @@ def offers(group: str) -> Mapping[str, Any]:
     """
     found: dict[str, Any] = {}
     for point in entry_points(group=group):
-        what, kind = _GROUPS[group].what, load(_GROUPS[group].kind)
+        what = _GROUPS[group].what
+        kind = load(_GROUPS[group].kind)
         package = point.dist.name if point.dist else point.module
         offer = f"The package {package} offers {point.value} as {what} {point.name}"
         if point.name in found or point.name in _GROUPS[group].own():
@@ -168,10 +158,22 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
     there = offers(group)
     if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
         raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
+    guest = guest_of(name, group) if name not in there else None
+    if guest is not None:
+        raise SetupError(
+            f"The {_GROUPS[group].what} {name} is in the package {guest.package}, which is not installed. "
+            f"Install it with: {guest.install}"
+        )
     entry = there[require_known(_GROUPS[group].what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
     return entry
+
+
+def absent_guests() -> list[Guest]:
+    """The guests of this suite that are not installed here."""
+    installed = guest_packages()
+    return [guest for guest in guests() if guest.package not in installed]
 
 
 def guest_packages() -> dict[str, frozenset[str]]:
@@ -238,9 +240,11 @@ def register_env(entry: TaskEntry) -> None:
     gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
     if entry.env.startswith("imagine_bench."):
         gymnasium.register(
-            vector_id(entry.env_id), vector_entry_point="imagine_bench.tasks.vector_env:make",
-            max_episode_steps=entry.horizon, kwargs={"env": entry.env, **entry.options},
-        )  # fmt: skip
+            vector_id(entry.env_id),
+            vector_entry_point="imagine_bench.tasks.vector_env:make",
+            max_episode_steps=entry.horizon,
+            kwargs={"env": entry.env, **entry.options},
+        )
 
 
 def vector_id(env_id: str) -> str:
@@ -297,7 +301,8 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], gro
         UnknownNameError: No such hyper-parameter set or config group.
         InvalidValueError: A value of the wrong type or out of its range.
     """
-    entry, own = agent_entry(agent), entrant(agent).agent in AGENTS
+    entry = agent_entry(agent)
+    own = entrant(agent).agent in AGENTS
     with _guests_faults(f"Agent {agent} (settings {entry.settings})", own=own):
         given = own_settings(agent, overrides)
         return load(entry.settings).resolve(hyperparameters, given, group) if entry.settings else None
@@ -331,7 +336,8 @@ def task(name: str) -> TaskSpec:
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
             raise TypeError(f"it is {brief(spec)} and no TaskSpec")
-    listed, values = getattr(spec.rules, "states", None), tuple(map(len, spec.macrostate_values))
+    listed = getattr(spec.rules, "states", None)
+    values = tuple(map(len, spec.macrostate_values))
     counts = tuple(1 + max(column) for column in zip(*listed, strict=True)) if listed else values
     for what, ours, theirs in (
         ("id", name if name in known else spec.id, spec.id),
@@ -351,7 +357,8 @@ def task(name: str) -> TaskSpec:
 
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    entry, own = agent_entry(name), entrant(name).agent in AGENTS
+    entry = agent_entry(name)
+    own = entrant(name).agent in AGENTS
     with _guests_faults(f"Agent {name} ({entry.make})", own=own):
         agent: Agent = load(entry.make)(context)
     return agent
@@ -395,7 +402,8 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
-    entry, own = regressor_entry(name), entrant(name).agent in REGRESSORS
+    entry = regressor_entry(name)
+    own = entrant(name).agent in REGRESSORS
     with _guests_faults(f"Regressor {name} ({entry.make})", own=own):
         regressor: Regressor = load(entry.make)(context)
     return regressor

@@ -61,7 +61,8 @@ def _changes(top: Path) -> str:
     """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do."""
     differing = _output("git", "-C", str(top), "diff", "--name-only", "HEAD", "--", *_CODE) or ""
     new = _output("git", "-C", str(top), "ls-files", "--others", "--exclude-standard", "--", *_CODE) or ""
-    digest, names = hashlib.sha256(), sorted({*differing.splitlines(), *new.splitlines()})
+    digest = hashlib.sha256()
+    names = sorted({*differing.splitlines(), *new.splitlines()})
     for name in names:
         digest.update(name.encode())
         if (top / name).is_file():

@@ -11,6 +11,8 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MOVED = {
+    "imagine_bench.agents.library": "imagine_bench.agents.encoders",
+    "imagine_bench.agents.library.latent_observation": "imagine_bench.agents.encoders.latent_observation",
     "imagine_bench.capabilities": "imagine_bench.interfaces.capabilities",
     "imagine_bench.data.episodes": "imagine_bench.interfaces.episodes",
     "imagine_bench.entrants": "imagine_bench.registry.entries",
@@ -27,7 +29,7 @@ class _MovedModules(MetaPathFinder, Loader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        return ModuleSpec(fullname, self) if fullname in MOVED else None
+        return ModuleSpec(fullname, self, is_package=True) if fullname in MOVED else None
 
     def exec_module(self, module: ModuleType) -> None:
         new = MOVED[module.__name__]

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 
 from imagine_bench.registry.entries import Entrant, entrant
 
-FIRST, TODAY = 1, 2
+FIRST = 1
+TODAY = 2
 """Editions of agents' names: that of files that name none, and that of every new protocol."""
 LABEL_OF_OLD_AGENT = {"factored_own": "factored", "factored": "factored:given"}
 """Today's label of each agent that had another name in edition 1 (until 2026-11-28)."""

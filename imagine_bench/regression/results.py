@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
+from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
 from imagine_bench.store.codec import Arrays, grouped, read_arrays, table_rows, table_text, write_arrays
 from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import require_one_setting
@@ -60,6 +61,7 @@ class RegressionResult:
     environment: Mapping[str, Any]
     folder: Path
     wall_s: float
+    missing: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
@@ -132,3 +134,15 @@ def load_run(folder: Path) -> RegressionRun:
         folder=folder,
         recording=recording if recording.is_file() else None,
     )
+
+
+def load_result(folder: Path) -> RegressionResult:
+    """Read a finished bench of regressors.
+
+    Raises:
+        ArtefactError: It is no bench of regressors, a run is missing, or a file is damaged.
+    """
+    protocol = read_protocol_as(folder, RegressionProtocol)
+    found = BenchStore(folder, protocol).load(lambda run: load_run(run) if run_folder.is_done(run) else None)
+    runs = tuple(run for run in found.values() if run is not None)
+    return RegressionResult(protocol=protocol, runs=runs, **bench_facts(folder))

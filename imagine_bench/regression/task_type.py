@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from imagine_bench import registry
-from imagine_bench.protocols.task_types import TaskType
+from imagine_bench.protocols.runs import TaskType
 from imagine_bench.regression.protocol import PRESETS, RegressionProtocol, plan
-from imagine_bench.regression.results import RegressionResult, load_run
+from imagine_bench.regression.results import load_result
 from imagine_bench.regression.runner import run
-from imagine_bench.store.bench_folder import load_bench
 
 REGRESSION = TaskType(
     tasks=registry.regressions,
@@ -17,7 +16,5 @@ REGRESSION = TaskType(
     presets=PRESETS,
     plan=plan,
     run=run,
-    load_run=load_run,
-    load_so_far=load_bench,
-    result=RegressionResult,
+    load_so_far=load_result,
 )

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.protocols.task_types import task_type
 from imagine_bench.registry.machine import describe_environment
+from imagine_bench.running.task_types import task_type
+from imagine_bench.running.trained import require_control
 from imagine_bench.store.bench_folder import newest_bench, require_either
-from imagine_bench.store.trained import require_control
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:

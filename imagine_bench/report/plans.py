@@ -20,9 +20,9 @@ from imagine_bench.judge.plans import Plan, make_plans, require_threshold
 from imagine_bench.report.analysis import chosen, markdown, provenance
 from imagine_bench.report.text import percent
 from imagine_bench.running.progress import counted
-from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.running.task_types import load_bench
+from imagine_bench.running.trained import Trained, best_run, load_trained, protocol_of_agents
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
-from imagine_bench.store.trained import Trained, best_run, load_trained, protocol_of_agents
 
 _COLUMNS = (
     *("plan", "start", "shortest", "planned", "done", "solved", "optimal", "refused", "as_imagined", "faults"),
@@ -43,7 +43,7 @@ def plan_report(
 
     ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
     or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
-    :func:`imagine_bench.store.trained.load_trained`. The first ``recorded`` plans go to ``record``.
+    :func:`imagine_bench.running.trained.load_trained`. The first ``recorded`` plans go to ``record``.
     Returns what to print.
 
     Raises:

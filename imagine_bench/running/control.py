@@ -14,16 +14,17 @@ from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.protocols.data import digest
-from imagine_bench.protocols.runs import OnProgress, RunSpec
-from imagine_bench.protocols.task_types import Encoders, TaskType
+from imagine_bench.protocols.runs import Encoders, OnProgress, RunSpec, TaskType
 from imagine_bench.registry.entries import entrant
 from imagine_bench.rules import states_of
 from imagine_bench.running import runner
 from imagine_bench.running.queries import require_able
 from imagine_bench.running.run_state import make_env
-from imagine_bench.store import encoders, run_folder
+from imagine_bench.store import encoders
+from imagine_bench.store.archive import load_archive
+from imagine_bench.store.bench_folder import is_archive, read_control
 from imagine_bench.store.merge import load_so_far
-from imagine_bench.store.results import BenchResult, RunResult
+from imagine_bench.store.results import BenchResult
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
@@ -136,14 +137,18 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
     return {**own, **dict.fromkeys(sorted(replaced), path)}
 
 
-def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
-    """Do a run, looked at by every registered observer; see :func:`.runner.run`."""
-    *askers, recorder = registry.OBSERVERS
-    names = [*askers, recorder] if spec.protocol.shows_frames_alone else [recorder]  # the others ask with frames
-    return runner.run(spec, folder, on_progress, [registry.load(name)() for name in names])
+def run_control(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
+    """Do a run, looked at by its observers; see :func:`.runner.run`."""
+    runner.run(spec, folder, on_progress, [registry.load(name)() for name in spec.observers])
+
+
+def load_bench_of_agents(folder: Path) -> BenchResult:
+    """Read a bench of agents, finished or not, or in the form it is kept in; raises as :func:`.merge.load_so_far`."""
+    read_control(folder)
+    return load_archive(folder) if is_archive(folder) else load_so_far(folder)
 
 
 CONTROL = TaskType(
     tasks=registry.tasks, learners=registry.agents, draws=True, protocol=Protocol, presets=PRESETS, plan=plan_control,
-    run=run_observed, load_run=run_folder.load_run, load_so_far=load_so_far, result=BenchResult,
+    run=run_control, load_so_far=load_so_far,
 )  # fmt: skip

@@ -13,8 +13,8 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, State, Transition
 from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.running.counters import Counters, EvaluationCounts, Played
 from imagine_bench.seeding import Purpose, episode_seed
-from imagine_bench.store.counters import Counters, EvaluationCounts, Played
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]

@@ -13,8 +13,8 @@ from imagine_bench import registry
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.capabilities import EpisodeRememberer
+from imagine_bench.running.counters import Played
 from imagine_bench.running.run_state import Run
-from imagine_bench.store.counters import Played
 
 LEAST_EPISODES = 50
 """Fewer are over before lanes are made."""

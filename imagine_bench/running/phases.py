@@ -15,12 +15,12 @@ from imagine_bench.interfaces.capabilities import (
     begin_episode,
 )
 from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.running.counters import EvaluationCounts
 from imagine_bench.running.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
 from imagine_bench.running.lanes import episodes_in_lanes, lanes_pay
 from imagine_bench.running.queries import LabelOracle, QueryBudget, Teacher, as_seen
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.seeding import episode_seed, evaluation_split
-from imagine_bench.store.counters import EvaluationCounts
 
 
 def transfer(run: Run) -> None:

@@ -19,11 +19,11 @@ from imagine_bench.interfaces import OBSERVATIONS, Agent
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
+from imagine_bench.running.counters import Counters
 from imagine_bench.running.evaluation import ByName, Env, StartsFrom
 from imagine_bench.running.queries import Teacher, demonstrator, require_able
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.checkpoints import load_newest, save_snapshot, sweep_partial
-from imagine_bench.store.counters import Counters
 from imagine_bench.store.files import reading, sweep, writing
 
 _RECENT = 100

@@ -20,7 +20,7 @@ from imagine_bench.running import phases
 from imagine_bench.running.run_state import Run, environments
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder
-from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, OpenLoop, RunResult
+from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, OpenLoop
 
 
 class AtBudget(TypedDict, total=False):
@@ -49,10 +49,8 @@ class RunObserver:
         return {}
 
 
-def run(
-    spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observers: Sequence[RunObserver] = ()
-) -> RunResult | None:
-    """Do a run, or what is left of it, and read its result, None if it pauses before; a finished run is only read.
+def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observers: Sequence[RunObserver] = ()) -> None:
+    """Do a run, or what is left of it, as far as the budget at which it pauses. Nothing is done of a finished run.
 
     Raises:
         BusyError: Another process is at this run.
@@ -65,7 +63,6 @@ def run(
         if not run_folder.is_done(folder):
             with environments(spec.protocol) as (env, test_env):
                 _go_on(Run(spec, folder, on_progress, env, test_env), observers)
-    return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 
 def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
@@ -85,7 +82,7 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
         measured = AtEnd()
         for observer in observers:
             measured.update(observer.at_end(run))
-        run_folder.finish(run.folder, run.counters, **measured)
+        run_folder.finish(run.folder, run.counters.rows, run.counters.training(), **measured)
     run.tell("done", at_once=True)
 
 

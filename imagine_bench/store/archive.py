@@ -17,9 +17,8 @@ import numpy as np
 
 from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.old_names import agent_label
-from imagine_bench.store.bench_folder import KEPT, read_protocol
+from imagine_bench.store.bench_folder import KEPT, is_of_regression, read_control, read_protocol_values
 from imagine_bench.store.files import csv_text, json_text, read_json
 from imagine_bench.store.merge import largest_part
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
@@ -30,11 +29,6 @@ _MEANS = ("mean_return", "mean_length")
 _COSTS = ("faults", "train_cpu_s", "eval_cpu_s")
 _DERIVED = ("success_rate", "wilson_low", "wilson_high")
 """Columns for a reader's comfort; what is read back is computed anew from the counts."""
-
-
-def is_archive(folder: Path) -> bool:
-    """Whether a folder holds a bench in this form."""
-    return (folder / KEPT).is_file()
 
 
 def archive_files(result: BenchResult) -> dict[str, str]:
@@ -73,12 +67,14 @@ def load_archive(folder: Path) -> BenchResult:
         ArtefactError: It is damaged.
         InvalidValueError: It is of a task that is learned from data.
     """
-    path, whole = folder / _RESULTS, read_protocol(folder)
-    if not isinstance(whole, Protocol):
+    path = folder / _RESULTS
+    values = read_protocol_values(folder)
+    if is_of_regression(values):
         raise InvalidValueError(
-            f"{folder} keeps a bench of {whole.task}, whose tables are its .csv files; only kept results of agents "
+            f"{folder} keeps a bench of {values['task']}, whose tables are its .csv files; only kept results of agents "
             f"that act have a report. The command in its {KEPT} makes the bench anew, with one."
         )
+    whole = read_control(folder)
     rows: dict[tuple[str, int], list[Checkpoint]] = {}
     names = {"agent_names": whole.agent_names}
     try:
@@ -88,12 +84,9 @@ def load_archive(folder: Path) -> BenchResult:
         raise ArtefactError(
             f"{path} is not the table of a bench of agents: {error!r}. It was left untouched."
         ) from error
-    wanted = [(agent, seed) for agent in whole.agents for seed in whole.seeds]
-    reached = {pair: rows[pair][-1].episodes if pair in rows else 0 for pair in wanted}
+    runs = {(agent, seed): _run(folder, agent, seed, tuple(found)) for (agent, seed), found in rows.items()}
     made_with = str(read_json(folder / KEPT, "a kept bench").get("protocol_hash", ""))
-    return largest_part(
-        whole, reached, lambda agent, seed: _run(folder, agent, seed, tuple(rows[agent, seed])), folder, made_with
-    )
+    return largest_part(whole, runs, folder, made_with)
 
 
 def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
@@ -109,6 +102,11 @@ def _checkpoint(row: Mapping[str, str]) -> Checkpoint:
 
 def _run(folder: Path, agent: str, seed: int, checkpoints: tuple[Checkpoint, ...]) -> RunResult:
     return RunResult(
-        agent=agent, seed=seed, checkpoints=checkpoints, settings={}, folder=folder,
-        training_success=np.zeros(0, dtype=np.bool_), training_length=np.zeros(0, dtype=np.int64),
-    )  # fmt: skip
+        agent=agent,
+        seed=seed,
+        checkpoints=checkpoints,
+        settings={},
+        folder=folder,
+        training_success=np.zeros(0, dtype=np.bool_),
+        training_length=np.zeros(0, dtype=np.int64),
+    )

@@ -7,9 +7,9 @@ same. The latter is how a bench is shared out among machines that have no disk i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,9 +19,9 @@ from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import file_name
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
-from imagine_bench.store.checkpoints import has_checkpoint
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
+Value = TypeVar("Value", int, str)
 _MEANS = ("time/", "loss/", "imagination/")
 """Diagnostics that are means since the test before."""
 _OWN = ("agents", "seeds", "budgets", "settings_digest", "encoder", "codes", "agent_names")
@@ -33,14 +33,14 @@ def load_so_far(folder: Path) -> BenchResult:
 
     Of an unfinished one, the budgets and seeds are taken at which every agent was tested: as many results as possible,
     and no agent has more seeds or episodes than another. Agents without any result are left out where all others are
-    finished. Raises ArtefactError: it is not a bench, no seed has brought
-    every agent to the first budget, or a file is damaged.
+    finished.
+
+    Raises:
+        ArtefactError: It is not a bench, no seed has brought every agent to the first budget, or a file is damaged.
     """
     whole = read_control(folder)
     store = BenchStore(folder, whole)
-    reached = {(agent, seed): _reached(store, agent, seed) for agent in whole.agents for seed in whole.seeds}
-    store.require_own([store.run_folder(*pair) for pair, budget in reached.items() if budget])
-    part = largest_part(whole, reached, lambda agent, seed: _load(store.run_folder(agent, seed)), folder)
+    part = largest_part(whole, store.load(run_folder.load_so_far), folder)
     if part.missing:
         return part
     last = tuple(f"{agent} seed {seed}: its recording" for agent, seed in store.missing())  # tested, but not at its end
@@ -48,19 +48,19 @@ def load_so_far(folder: Path) -> BenchResult:
 
 
 def largest_part(
-    whole: Protocol,
-    reached: Mapping[tuple[str, int], int],
-    load: Callable[[str, int], RunResult],
-    folder: Path,
-    made_with: str = "",
+    whole: Protocol, runs: Mapping[tuple[str, int], RunResult | None], folder: Path, made_with: str = ""
 ) -> BenchResult:
-    """What is complete of a bench: all of it, or the table of seeds and budgets with the most results.
+    """Return what is complete of a bench: all of it, or the table of seeds and budgets with the most results.
 
-    ``reached`` is the last budget with results of every agent and seed, 0 where there are none.
+    ``runs`` has every agent and seed, None where there is nothing yet.
 
-    Raises ArtefactError: no seed has brought every agent to the first budget, or a file is damaged.
+    Raises:
+        ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
     """
+    pairs = [(agent, seed) for agent in whole.agents for seed in whole.seeds]
+    reached = {pair: _reached(runs.get(pair)) for pair in pairs}
     part = _largest_table(_without_failed(whole, reached), reached)
+    found = [runs.get((agent, seed)) for agent in part.agents for seed in part.seeds]
     missing = tuple(
         f"{agent} seed {seed}: {at:,} of {whole.budgets[-1]:,} real episodes"
         for (agent, seed), at in reached.items()
@@ -68,7 +68,7 @@ def largest_part(
     )
     return BenchResult(
         protocol=part,
-        runs=tuple(cut(load(agent, seed), part) for agent in part.agents for seed in part.seeds),
+        runs=tuple(cut(run, part) for run in found if run is not None),
         **bench_facts(folder),
         whole=whole if missing else None,
         missing=missing,
@@ -76,26 +76,20 @@ def largest_part(
     )
 
 
+def _reached(run: RunResult | None) -> int:
+    """Return the last budget at which a run was tested, 0 before the first."""
+    return run.checkpoints[-1].episodes if run is not None and run.checkpoints else 0
+
+
 def _without_failed(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:
-    """Without agents that have no result at all where all others are finished: they cost those nothing."""
+    """Leave out agents without any result where all others are finished."""
     tried = [agent for agent in whole.agents if any(reached[agent, seed] for seed in whole.seeds)]
     finished = all(reached[agent, seed] == whole.budgets[-1] for agent in tried for seed in whole.seeds)
     return dataclasses.replace(whole, agents=tuple(tried)) if tried and finished else whole
 
 
-def _reached(store: BenchStore, agent: str, seed: int) -> int:
-    """The last budget of which a run has results; they lie in its newest checkpoint until it is done."""
-    folder = store.run_folder(agent, seed)
-    if run_folder.is_done(folder):
-        return run_folder.reached(folder)
-    if not has_checkpoint(folder / "checkpoints"):
-        return 0
-    rows = run_folder.load_unfinished(folder).checkpoints  # not the table beside it, which has no digest yet
-    return rows[-1].episodes if rows else 0
-
-
 def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> Protocol:
-    """The protocol that is complete: among all cuts through the budgets, the one that leaves most results."""
+    """Return the complete protocol that has most results, among all cuts through the budgets."""
 
     def seeds_at(budget: int) -> tuple[int, ...]:
         return tuple(seed for seed in whole.seeds if all(reached[agent, seed] >= budget for agent in whole.agents))
@@ -111,16 +105,13 @@ def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> P
     return dataclasses.replace(whole, seeds=seeds, budgets=budgets[:count])
 
 
-def _load(folder: Path) -> RunResult:
-    return run_folder.load_run(folder) if run_folder.is_done(folder) else run_folder.load_unfinished(folder)
-
-
 def cut(result: RunResult, part: Protocol) -> RunResult:
-    """A run as if it had only the budgets of ``part``; what it imagined at its end is left out if it goes further."""
-    episodes, whole = part.budgets[-1], result.checkpoints[-1].episodes == part.budgets[-1]
+    """Return a run with the budgets of ``part`` alone; what it imagined at its end is left out if it goes further."""
+    episodes = part.budgets[-1]
+    whole = result.checkpoints[-1].episodes == episodes
     return dataclasses.replace(
         result,
-        checkpoints=_as_if_untested(result.checkpoints, part.budgets),
+        checkpoints=_at_budgets(result.checkpoints, part.budgets),
         training_success=result.training_success[:episodes],
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),
@@ -128,29 +119,33 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
     )
 
 
-def _as_if_untested(rows: Sequence[Checkpoint], budgets: Collection[int]) -> tuple[Checkpoint, ...]:
-    """The rows at some budgets; what agents said of the time since a test that is left out counts for the next."""
-    kept, since, before = list[Checkpoint](), list[Checkpoint](), 0
+def _at_budgets(rows: Sequence[Checkpoint], budgets: Collection[int]) -> tuple[Checkpoint, ...]:
+    """Return the rows at some budgets; diagnostics of a test that is left out count for the next one."""
+    kept = list[Checkpoint]()
+    since = list[Checkpoint]()
+    before = 0
     for row in rows:
         since.append(row)
         if row.episodes in budgets:
             kept.append(row if len(since) == 1 else _over(since, before))
-            since, before = [], row.env_steps
+            since = []
+            before = row.env_steps
     return tuple(kept)
 
 
 def _over(rows: Sequence[Checkpoint], before: int) -> Checkpoint:
-    """The last of some rows with the mean times a real step of all of them, who began after ``before`` steps.
+    """Return the last row with the mean times a real step over all of them, who began after ``before`` steps.
 
     Means over losses and over imagined transitions are left out: how many there were of these is not kept.
     """
-    last, steps = rows[-1], np.diff([before, *(row.env_steps for row in rows)])
-    said = {name: value for name, value in last.diagnostics.items() if not name.startswith(_MEANS)}
+    last = rows[-1]
+    steps = np.diff([before, *(row.env_steps for row in rows)])
+    diagnostics = {name: value for name, value in last.diagnostics.items() if not name.startswith(_MEANS)}
     for name in {name for row in rows for name in row.diagnostics if name.startswith("time/")}:
         values = np.array([row.diagnostics.get(name, np.nan) for row in rows])
         if np.isfinite(values).any() and steps.sum() > 0:
-            said[name] = float(np.nansum(values * steps) / steps.sum())
-    return dataclasses.replace(last, diagnostics=said)
+            diagnostics[name] = float(np.nansum(values * steps) / steps.sum())
+    return dataclasses.replace(last, diagnostics=diagnostics)
 
 
 def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
@@ -180,10 +175,12 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
 def _merged(results: Sequence[BenchResult]) -> Protocol:
     """The protocol of all of them together."""
     protocols = [result.protocol for result in results]
-    first, same = protocols[0], len({frozenset(protocol.agents) for protocol in protocols}) == 1
+    first = protocols[0]
+    same = len({frozenset(protocol.agents) for protocol in protocols}) == 1
     for result in results:
         for field in dataclasses.fields(Protocol):
-            ours, theirs = getattr(first, field.name), getattr(result.protocol, field.name)
+            ours = getattr(first, field.name)
+            theirs = getattr(result.protocol, field.name)
             if field.name not in _OWN and ours != theirs:
                 raise InvalidValueError(
                     f"{result.folder} has {field.name} {theirs!r} where {results[0].folder} has {ours!r}; benches that "
@@ -212,7 +209,7 @@ def _one(values: Sequence[str | None], complaint: str) -> str | None:
     return found[0] if found else None
 
 
-def _all(values: Sequence[tuple[Any, ...]], name: str) -> tuple[Any, ...]:
+def _all(values: Sequence[tuple[Value, ...]], name: str) -> tuple[Value, ...]:
     found = tuple(value for each in values for value in each)
     twice = sorted({value for value in found if found.count(value) > 1})
     if twice:

@@ -22,31 +22,37 @@ from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.codec import Arrays, pack, read_arrays, table_rows, table_text, unpack, write_arrays
-from imagine_bench.store.counters import Counters
 from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 
 FORMAT = "imagine_bench run 2"
-_DONE, _CONFIG, _METRICS, _RECORDING = "DONE", "config.json", "metrics.csv", "recording.rrd"
-_MEASURED, _IMAGINED, _TRAINING, _EPISODES = "measured.npz", "imagined.npz", "training.npz", "episodes.npz"
+CHECKPOINTS = "checkpoints"
+"""The folder of a run's checkpoints, below its own."""
+_DONE = "DONE"
+_CONFIG = "config.json"
+_METRICS = "metrics.csv"
+_RECORDING = "recording.rrd"
+_MEASURED = "measured.npz"
+_IMAGINED = "imagined.npz"
+_TRAINING = "training.npz"
+_EPISODES = "episodes.npz"
 _DIAGNOSTIC = "diagnostics/"
 _APART = ("diagnostics", "open_loop", "beliefs", "kept")
 """Fields of a row that have columns or a file of their own."""
-_KEPT = tuple(field.name for field in dataclasses.fields(KeptEpisodes))
 
 
 def recording_path(folder: Path) -> Path:
-    """Where a run's recording lies."""
+    """Return where a run's recording lies."""
     return folder / _RECORDING
 
 
 def is_done(folder: Path) -> bool:
-    """Whether the run in ``folder`` is finished."""
+    """Return whether the run in ``folder`` is finished."""
     return (folder / _DONE).is_file()
 
 
 def reached(folder: Path) -> int:
-    """The last budget at which the run in ``folder`` was tested, 0 before the first."""
+    """Return the last budget at which the run in ``folder`` was tested, 0 before the first."""
     path = folder / _METRICS
     with reading(path, "the metrics of a run"):
         rows = table_rows(path.read_text()) if path.is_file() else []
@@ -54,17 +60,18 @@ def reached(folder: Path) -> int:
 
 
 def check_config(folder: Path, config: Mapping[str, Any]) -> None:
-    """Write what is run into a new run folder, or see that an old one holds the same.
+    """Write what is run into a new run folder, or compare it with what an old one holds.
 
     Raises:
         ArtefactError: The folder was begun with something else.
         SetupError: It cannot be written.
     """
-    path, now = folder / _CONFIG, json.loads(json.dumps({"format": FORMAT, **config}))
+    path = folder / _CONFIG
+    now = json.loads(json.dumps({"format": FORMAT, **config}))
     if not path.exists():
         write_json(path, sealed(now))
         return
-    difference = first_difference(_config(folder), now)
+    difference = first_difference(read_config(folder), now)
     if difference is not None:
         name, was, would_be = difference
         raise ArtefactError(
@@ -74,8 +81,9 @@ def check_config(folder: Path, config: Mapping[str, Any]) -> None:
         )
 
 
-def _config(folder: Path) -> dict[str, Any]:
-    config = read_sealed(folder / _CONFIG, "a run's configuration")
+def read_config(folder: Path) -> dict[str, Any]:
+    """Return what was run: protocol, agent, seed, settings. Raises ArtefactError: it is missing or damaged."""
+    config = read_sealed(folder / _CONFIG, "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
     if config.get("format") != FORMAT:
         raise ArtefactError(f"{folder / _CONFIG} was not written as {FORMAT!r}. It was left untouched.")
     return config
@@ -83,16 +91,15 @@ def _config(folder: Path) -> dict[str, Any]:
 
 def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) -> None:
     """Raise ArtefactError unless the run in ``folder`` is this agent's and seed's of this very protocol."""
-    config = _config(folder)
-    difference = first_difference(
-        {name: config.get(name) for name in ("agent", "seed", "protocol_hash", "protocol")},
-        {
-            "agent": protocol.written_name(agent),
-            "seed": seed,
-            "protocol_hash": digest(config.get("protocol")),
-            "protocol": protocol.as_dict(),
-        },
-    )
+    config = read_config(folder)
+    protocol_hash = digest(config.get("protocol"))
+    wanted = {
+        "agent": protocol.written_name(agent),
+        "seed": seed,
+        "protocol_hash": protocol_hash,
+        "protocol": protocol.as_dict(),
+    }
+    difference = first_difference({name: config.get(name) for name in wanted}, wanted)
     if difference is not None:
         name, was, would_be = difference
         raise ArtefactError(
@@ -104,35 +111,38 @@ def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
     """Write one row a budget done so far, atomically. Raises SetupError: it cannot be written."""
     rows = []
-    for values in pack(list(checkpoints))[0]:
-        diagnostics = {_DIAGNOSTIC + name: value for name, value in sorted(values["diagnostics"].items())}
-        rows.append({**{name: value for name, value in values.items() if name not in _APART}, **diagnostics})
+    for values in pack(checkpoints)[0]:
+        row = {name: value for name, value in values.items() if name not in _APART}
+        diagnostics = sorted(values["diagnostics"].items())
+        rows.append(row | {_DIAGNOSTIC + name: value for name, value in diagnostics})
     write_bytes(folder / _METRICS, table_text(rows).encode())
 
 
 def forget(folder: Path) -> None:
     """Remove the results and checkpoints of an unfinished run, which begins anew."""
     (folder / _METRICS).unlink(missing_ok=True)
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
 
 
 def finish(
     folder: Path,
-    counters: Counters,
+    checkpoints: Sequence[Checkpoint],
+    training: Arrays,
     *,
     imagined: Sequence[ComparedRollout] = (),
     sampled_rollouts: Sequence[ComparedRollout] = (),
 ) -> None:
-    """Write the results of a run and mark it as done, or raise SetupError and leave it unmarked."""
-    write_metrics(folder, counters.rows)
-    measured = [dataclasses.replace(row, kept=None) for row in counters.rows]
-    write_arrays(folder / _MEASURED, pack(measured)[1])
-    kept = [row.kept for row in counters.rows if row.kept is not None]
-    if len(kept) == len(counters.rows):  # else it was begun by a version that kept none
+    """Write the results of a run and mark it as done, or raise SetupError and leave it unmarked.
+
+    ``training`` holds ``success`` (episodes,), ``length`` (episodes,) and what else is kept of training.
+    """
+    write_metrics(folder, checkpoints)
+    write_arrays(folder / _MEASURED, pack([dataclasses.replace(row, kept=None) for row in checkpoints])[1])
+    kept = [row.kept for row in checkpoints if row.kept is not None]
+    if len(kept) == len(checkpoints):  # else it was begun by a version that kept none
         write_arrays(folder / _EPISODES, _side_by_side(kept))
-    write_arrays(folder / _TRAINING, counters.training())
-    rollouts = {"imagined": imagined, "sampled_rollouts": sampled_rollouts}
-    write_arrays(folder / _IMAGINED, {n: a for name, each in rollouts.items() for n, a in pack(each, name)[1].items()})
+    write_arrays(folder / _TRAINING, training)
+    write_arrays(folder / _IMAGINED, pack(imagined, "imagined")[1] | pack(sampled_rollouts, "sampled_rollouts")[1])
     mark_done(folder, [_CONFIG, _METRICS, _MEASURED, _TRAINING, _IMAGINED])
 
 
@@ -141,13 +151,16 @@ def mark_done(folder: Path, names: Sequence[str]) -> None:
 
     Raises SetupError: the mark cannot be written.
     """
-    names = [*names, *(name for name in (_EPISODES, _RECORDING) if (folder / name).is_file())]
-    digests = {name: sha256(folder / name) for name in names}
+    beside = [name for name in (_EPISODES, _RECORDING) if (folder / name).is_file()]
+    digests = {name: sha256(folder / name) for name in [*names, *beside]}
     write_json(folder / _DONE, sealed({"format": FORMAT, "sha256": digests}))
 
 
 def require_done(folder: Path) -> dict[str, Any]:
-    """The configuration of a finished run. Raises ArtefactError: it is unfinished, damaged or of another format."""
+    """Return the configuration of a finished run.
+
+    Raises ArtefactError: the run is unfinished, damaged or of another format.
+    """
     done = read_sealed(folder / _DONE, "the mark of a finished run")
     if done.get("format") != FORMAT or not isinstance(done.get("sha256"), dict):
         raise ArtefactError(f"{folder / _DONE} was not written as {FORMAT!r}. It was left untouched.")
@@ -159,47 +172,54 @@ def require_done(folder: Path) -> dict[str, Any]:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    return _config(folder)
+    return read_config(folder)
 
 
 def load_run(folder: Path) -> RunResult:
     """Read a finished run. Raises ArtefactError: it is unfinished, damaged or made by something else."""
     config = require_done(folder)
-    training, rollouts = read_arrays(folder / _TRAINING), read_arrays(folder / _IMAGINED)
+    rollouts = read_arrays(folder / _IMAGINED)
+    kind = tuple[ComparedRollout, ...]
     recording = recording_path(folder)
-    return RunResult(
-        agent=agent_label(config["agent"], config["protocol"]),
-        seed=config["seed"],
-        checkpoints=_read_checkpoints(folder),
-        settings=config["settings"],
-        training_success=training["success"],
-        training_length=training["length"],
-        training_starts=training.get("starts"),
-        tried=training.get("tried"),
-        imagined=unpack(tuple[ComparedRollout, ...], None, rollouts, "imagined"),
-        sampled_rollouts=unpack(tuple[ComparedRollout, ...], None, rollouts, "sampled_rollouts"),
-        folder=folder,
+    result = _result(folder, config, _read_checkpoints(folder), read_arrays(folder / _TRAINING))
+    return dataclasses.replace(
+        result,
+        imagined=unpack(kind, None, rollouts, "imagined"),
+        sampled_rollouts=unpack(kind, None, rollouts, "sampled_rollouts"),
         recording=recording if recording.is_file() else None,
     )
 
 
-def load_unfinished(folder: Path) -> RunResult:
-    """Read a run as far as its newest checkpoint has come. Raises ArtefactError: none is there, or it is damaged."""
-    snapshot = load_newest(folder / "checkpoints")
-    if snapshot is None:  # it had one a moment ago
-        raise ArtefactError(f"{folder} is being begun anew; give the same command again.")
-    config = _config(folder)
-    with reading(folder / "checkpoints", "a run's checkpoint"):
-        counters = Counters.of(snapshot)
-    training = counters.training()
+def load_so_far(folder: Path) -> RunResult | None:
+    """Read a run as far as it has come: its results, or what its newest checkpoint holds; None before the first.
+
+    Raises ArtefactError: a file is damaged.
+    """
+    if is_done(folder):
+        return load_run(folder)
+    snapshot = load_newest(folder / CHECKPOINTS)
+    if snapshot is None:
+        return None
+    with reading(folder / CHECKPOINTS, "a run's checkpoint"):
+        rows = unpack(tuple[Checkpoint, ...], snapshot.values["rows"], snapshot.arrays, "rows")
+        training = {
+            "success": np.array(snapshot.values["success"], dtype=np.bool_),
+            "length": np.array(snapshot.values["length"], dtype=np.int64),
+        }
+    return _result(folder, read_config(folder), rows, training)
+
+
+def _result(folder: Path, config: Mapping[str, Any], rows: tuple[Checkpoint, ...], training: Arrays) -> RunResult:
     with reading(folder / _CONFIG, "a run's configuration"):
         return RunResult(
             agent=agent_label(config["agent"], config["protocol"]),
             seed=config["seed"],
-            checkpoints=tuple(counters.rows),
+            checkpoints=rows,
             settings=config["settings"],
             training_success=training["success"],
             training_length=training["length"],
+            training_starts=training.get("starts"),
+            tried=training.get("tried"),
             folder=folder,
         )
 
@@ -209,7 +229,7 @@ def _read_checkpoints(folder: Path) -> tuple[Checkpoint, ...]:
     for row in table_rows((folder / _METRICS).read_text(), texts=("solved",)):
         diagnostics = {k.removeprefix(_DIAGNOSTIC): value for k, value in row.items() if k.startswith(_DIAGNOSTIC)}
         values.append({**row, "diagnostics": diagnostics})
-    rows = unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))
+    rows: tuple[Checkpoint, ...] = unpack(tuple[Checkpoint, ...], values, read_arrays(folder / _MEASURED))
     if not (folder / _EPISODES).exists():
         return rows
     with reading(folder / _EPISODES, "the test episodes of a run"):
@@ -223,17 +243,25 @@ def _side_by_side(tests: Sequence[KeptEpisodes]) -> Arrays:
     ``actions`` are one test's behind another's. Integers are of the smallest type that holds them.
     """
     arrays: Arrays = {}
-    for name in _KEPT:
+    for name in vars(tests[0]):
         each = [getattr(test, name) for test in tests]
         array = np.concatenate(each) if name == "actions" else np.stack(each, axis=1)
-        low, high = np.min_scalar_type(array.min(initial=0)), np.min_scalar_type(array.max(initial=0))
-        arrays[name] = array.astype(np.promote_types(low, high)) if array.dtype == np.int64 else array
+        if array.dtype == np.int64:
+            low = np.min_scalar_type(array.min(initial=0))
+            high = np.min_scalar_type(array.max(initial=0))
+            array = array.astype(np.promote_types(low, high))
+        arrays[name] = array
     return arrays
 
 
 def _apart(arrays: Arrays) -> list[KeptEpisodes]:
     """The inverse of :func:`_side_by_side`."""
-    wide = {name: array.astype(np.int64) if array.dtype.kind in "iu" else array for name, array in arrays.items()}
-    ends = np.cumsum(wide["lengths"].sum(axis=0))[:-1]
-    parts = {n: np.split(array, ends) if n == "actions" else np.moveaxis(array, 1, 0) for n, array in wide.items()}
-    return [KeptEpisodes(**{name: parts[name][budget] for name in _KEPT}) for budget in range(len(ends) + 1)]
+    wide: Arrays = {
+        name: array.astype(np.int64) if array.dtype.kind in "iu" else array for name, array in arrays.items()
+    }
+    ends = np.cumsum(wide["lengths"].sum(axis=0))
+    actions = np.split(wide.pop("actions"), ends[:-1])
+    return [
+        KeptEpisodes(actions=actions[budget], **{name: array[:, budget] for name, array in wide.items()})
+        for budget in range(len(ends))
+    ]

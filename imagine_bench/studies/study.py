@@ -25,11 +25,12 @@ from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, require_types
-from imagine_bench.protocols.task_types import Encoders, task_type
+from imagine_bench.protocols.runs import Encoders
 from imagine_bench.registry import has_task
 from imagine_bench.registry import task as registered
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.launchers.jobs import Launcher
+from imagine_bench.running.task_types import task_type
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.results import BenchResult, RunResult

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.task_types import Encoders
+from imagine_bench.protocols.runs import Encoders
 from imagine_bench.running.bench import carry_out, plan
 from imagine_bench.running.launchers.jobs import Launcher, processes
+from imagine_bench.running.task_types import load_bench
 from imagine_bench.statistics import Estimate
-from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench
+from imagine_bench.store.bench_folder import BenchStore, bench_folder
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.suite.experiments import Experiment, Level, Suite
 from imagine_bench.suite.score import Scale, auroc, score

@@ -34,7 +34,8 @@ class CheckedAgent(NamedTuple):
 
 def checked_agent(name: str, task: str) -> CheckedAgent:
     """An agent as it is checked, in a task's kinematic execution. Raises as :func:`.registry.agent_entry`."""
-    spec, entry = registry.task(task), registry.agent_entry(name)
+    spec = registry.task(task)
+    entry = registry.agent_entry(name)
     context = AgentContext(
         n_actions=spec.n_actions,
         preprocessing=spec.preprocessing,
@@ -66,7 +67,9 @@ def _made(one: CheckedAgent) -> None:
 
 
 def _acts(one: CheckedAgent) -> None:
-    spec, privileged, agent = one.spec, one.entry.privileged, _trainee(one)
+    spec = one.spec
+    privileged = one.entry.privileged
+    agent = _trainee(one)
     _play(spec, agent, privileged, range(3))
     states = np.array(spec.rules.start_states[:20])
     frames = spec.render_macrostates(states, "clean", np.random.default_rng(0))
@@ -92,7 +95,9 @@ def greedy(agent: Agent, given: Sequence[Observation]) -> list[int]:
 
 
 def _goes_on(one: CheckedAgent) -> None:
-    spec, privileged, agent = one.spec, one.entry.privileged, _trainee(one)
+    spec = one.spec
+    privileged = one.entry.privileged
+    agent = _trainee(one)
     _play(spec, agent, privileged, range(3))
     snapshot = agent.state()
     kept = copy.deepcopy(snapshot)

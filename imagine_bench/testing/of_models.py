@@ -11,18 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import Episodes, content_hash
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
 from imagine_bench.judge.models.asking import call
 from imagine_bench.judge.models.ends import Gallery
 from imagine_bench.judge.models.study import make
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.testing.common import require
 
-_EPISODES, _SEED = 8, 1_000
-_HISTORY, _DEPTH, _SAMPLES = 2, 3, 4
+_EPISODES = 8
+_SEED = 1_000
+_HISTORY = 2
+_DEPTH = 3
+_SAMPLES = 4
 """Frames shown, macro-actions and futures imagined, of the longer questions."""
 _METHODS = ("fit", "imagine", "parameters")
 
@@ -62,7 +65,8 @@ def _episodes(task: str) -> Episodes:
 
 def _questions(task: str, history: int, depth: int) -> tuple[Frame, NDArray[np.int64]]:
     """The first frames of some episodes, with the macro-actions between them, and random ones after them."""
-    episodes, rng = _episodes(task), np.random.default_rng(2)
+    episodes = _episodes(task)
+    rng = np.random.default_rng(2)
     places = [episodes.steps(index) for index in range(len(episodes)) if episodes.lengths[index] >= history - 1]
     frames = np.stack([episodes.frames[rows.start : rows.start + history] for _, rows in places])
     between = np.stack([episodes.actions[steps.start : steps.start + history - 1] for steps, _ in places])
@@ -99,7 +103,8 @@ def _imagines(one: CheckedModel) -> None:
 
 
 def _asked_again(one: CheckedModel) -> None:
-    model, given = one.fitted(), (*_questions(one.task, _HISTORY, _DEPTH), _SAMPLES)
+    model = one.fitted()
+    given = (*_questions(one.task, _HISTORY, _DEPTH), _SAMPLES)
     once, again = (_arrays(one.imagine(model, *given)) for _ in range(2))
     require(once == again, "asked twice with equal generators, it imagines otherwise")
 

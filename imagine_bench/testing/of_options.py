@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
@@ -29,11 +28,12 @@ from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
+from imagine_bench.running.counters import Counters
 from imagine_bench.running.evaluation import Env, play
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.store import encoders
-from imagine_bench.store.counters import Counters
 from imagine_bench.testing.common import NotOffered, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
 
@@ -191,7 +191,7 @@ def _silent(progress: Progress) -> None:
 def _carried_out(run: Run) -> str:
     """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
     external = run.entry.external_training_loop
-    watched = _WatchedAgent(run.agent, sees=external or not run.entry.learns)
+    watched = _WatchedAgent(run.agent, sees=external or run.entry.privileged or not run.entry.learns)
     if isinstance(run.agent, ExternalTrainer):
         phases.train_externally(run, run.agent, lambda budget: None)
     if external:  # a library may learn nothing from so little: what counts is what it is shown

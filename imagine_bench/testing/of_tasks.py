@@ -48,7 +48,9 @@ def _starts(spec: TaskSpec) -> None:
 
 
 def _steps(spec: TaskSpec) -> None:
-    rng, over, state = np.random.default_rng(0), True, spec.rules.start_states[0]
+    rng = np.random.default_rng(0)
+    over = True
+    state = spec.rules.start_states[0]
     with closing(make_env(spec)) as env:
         for _ in range(_MOST):
             if over:
@@ -60,7 +62,8 @@ def _steps(spec: TaskSpec) -> None:
             allowed = [(o.macrostate, o.reward, o.terminated, o.success) for o in spec.rules.outcomes(state, action)]
             words = f"action {action} in {state} gave {found}, the rules allow {allowed}"
             require(found in allowed or bool(info["fault"]), words)
-            state, over = end, terminated or truncated
+            state = end
+            over = terminated or truncated
 
 
 def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[Any]:
@@ -84,7 +87,8 @@ def _repeats(spec: TaskSpec) -> None:
 
 def _kept(spec: TaskSpec) -> None:
     with closing(make_env(spec)) as one, closing(make_env(spec)) as other:
-        env, twin = one.unwrapped, other.unwrapped
+        env = one.unwrapped
+        twin = other.unwrapped
         if not (hasattr(env, "get_state") and hasattr(env, "set_state")):
             raise NotOffered("the environment has no get_state and set_state")
         env.reset(seed=1)
@@ -99,7 +103,9 @@ def _kept(spec: TaskSpec) -> None:
 
 def _walk(env: Any, spec: TaskSpec) -> list[Any]:
     """What follows on some random macro-actions, to the end of the episode at most."""
-    rng, found, over = np.random.default_rng(0), list[Any](), False
+    rng = np.random.default_rng(0)
+    found = list[Any]()
+    over = False
     while not over and len(found) < spec.horizon:
         frame, reward, over, _, info = env.step(int(rng.integers(spec.n_actions)))
         found.append((np.asarray(frame).tobytes(), reward, over, np.asarray(info["macrostate"]).tolist()))

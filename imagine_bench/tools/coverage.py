@@ -49,7 +49,7 @@ def populations(results: Path) -> list[Floats]:
         ArtefactError: A file that is no table of results.
     """
     found: dict[tuple[Path, str, str], list[float]] = defaultdict(list)
-    learners = {name for name, entry in registry.AGENTS.items() if entry.learns}
+    learners = {name for name, entry in registry.agents().items() if entry.learns}
     for path in sorted(results.rglob("results.csv")):
         with path.open(newline="") as file, reading(path, "a table of results"):
             for row in csv.DictReader(file):

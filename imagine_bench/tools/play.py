@@ -18,8 +18,8 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.running.trained import load_trained
 from imagine_bench.statistics import wilson
-from imagine_bench.store.trained import load_trained
 
 KEYS = "123456789" + string.ascii_lowercase
 """Of the macro-actions, in their order."""
@@ -151,7 +151,7 @@ def play(
     """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
     ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
-    environment does. ``encoder`` is as of :func:`imagine_bench.store.trained.load_trained`.
+    environment does. ``encoder`` is as of :func:`imagine_bench.running.trained.load_trained`.
 
     Raises:
         ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what

@@ -25,8 +25,8 @@ from imagine_bench.appearance import appearance_name
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, PerformanceTargets, SceneReader, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
+from imagine_bench.running.counters import Played
 from imagine_bench.seeding import SeedTree
-from imagine_bench.store.counters import Played
 from imagine_bench.store.files import require_writable, write_json
 from imagine_bench.tools.fidelity import Fidelity, measure_fidelity
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.seeding import TUNING_SEEDS
 

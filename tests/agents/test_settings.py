@@ -24,7 +24,7 @@ def hyperparameters_module(entry: registry.AgentEntry) -> str:
 
 
 ALL: dict[str, Hyperparameters[Any]] = {
-    **{name: registry.load(entry.settings) for name, entry in registry.AGENTS.items() if entry.learns},
+    **{name: registry.load(entry.settings) for name, entry in registry.agents().items() if entry.learns},
     "regressors": regressor_settings.HYPERPARAMETERS,
 }
 SETS_OF_ALL = [(agent, group, name) for agent in ALL for group in ALL[agent].groups for name in SETS]
@@ -141,7 +141,7 @@ def test_every_setting_has_a_range(agent: str) -> None:
 
 
 def test_settings_load_no_torch() -> None:
-    modules = [hyperparameters_module(entry) for entry in registry.AGENTS.values()]
+    modules = [hyperparameters_module(entry) for entry in registry.agents().values()]
     names = ", ".join(sorted({*modules, "imagine_bench.agents.regressors.settings"}))
     done = subprocess.run(
         [sys.executable, "-c", f"import {names}, sys; assert 'torch' not in sys.modules"],

@@ -19,9 +19,9 @@ from imagine_bench.report.page import report_page, texts
 from imagine_bench.report.sections.causes import causes_table, read_failures
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench
+from imagine_bench.running.task_types import load_bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.store.bench_folder import load_bench
 from imagine_bench.store.files import make_folder, write_bytes
 from imagine_bench.store.results import BenchResult
 

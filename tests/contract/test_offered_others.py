@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from guest_packages import install
-from imagine_bench.agents import offered_encoder
+from imagine_bench.agents.encoders import offered
 from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
@@ -20,8 +20,8 @@ from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.trained import load_trained
 from imagine_bench.store import encoders
-from imagine_bench.store.trained import load_trained
 
 _PYPROJECT = """
 [project]
@@ -77,8 +77,8 @@ def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(install(folder))
     monkeypatch.delitem(sys.modules, "their_things", raising=False)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(offered_encoder, "_FRAMES", 600)
-    monkeypatch.setattr(offered_encoder, "_PROBE_STEPS", 300)
+    monkeypatch.setattr(offered, "_FRAMES", 600)
+    monkeypatch.setattr(offered, "_PROBE_STEPS", 300)
     registry.offers.cache_clear()
     yield
     registry.offers.cache_clear()

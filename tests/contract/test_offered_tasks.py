@@ -21,9 +21,9 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.report.page import summary_table
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.trained import learners, load_trained
 from imagine_bench.store import encoders
 from imagine_bench.store.archive import archive_files, load_archive
-from imagine_bench.store.trained import learners, load_trained
 from imagine_bench.tools.new import new_package
 
 

@@ -10,17 +10,17 @@ import pytest
 from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.running import run_state
-from imagine_bench.running.control import run_observed
 from imagine_bench.store import encoders
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
 
 LEARNERS = [
     name
-    for name, entry in registry.AGENTS.items()
-    if entry.learns and not entry.external_training_loop and entry.make.startswith("imagine_bench.agents.")
+    for name, entry in registry.agents().items()
+    if entry.learns and not entry.external_training_loop and entry.make.startswith("imagine_bench")
 ]
 """All of the suite but those that a library trains, which begin anew; fakes of other tests are registered too."""
 
@@ -33,7 +33,7 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
     overrides = {"imagination.model_only_episodes": 5, "imagination.start_episode": 3, "reuse.reset_every": 70}
     own = tuple(registry.own_settings(agent, overrides).items())
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=own)
-    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.AGENTS[agent].encoder_kind)
+    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.agents()[agent].encoder_kind)
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)
 
@@ -72,7 +72,7 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
             do(tmp_path / "run", agent, 0.0)
     resumed = do(tmp_path / "run", agent, 0.0)
     assert measured(whole) == measured(resumed)
-    tables = agent in ("factored", "count_table_own") or registry.AGENTS[agent].encoder_kind == "codes"
+    tables = agent in ("factored", "count_table_own") or registry.agents()[agent].encoder_kind == "codes"
     assert tables or any(name.startswith("loss/") for name in whole.checkpoints[-1].diagnostics)
     assert own_values(tmp_path / "whole") == own_values(tmp_path / "run")
     before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")

@@ -12,10 +12,10 @@ from small_runs import Inline, collected, do, written
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.data.collect import collect, describe, policy_of
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
+from imagine_bench.running.collect import collect, describe, policy_of
 from imagine_bench.seeding import episode_seed
 from imagine_bench.tools import standard_data
 

@@ -18,10 +18,10 @@ import pytest
 from small_runs import FORMATS, collected, written
 
 from imagine_bench.data import npz
-from imagine_bench.data.collect import describe
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces.episodes import joined
+from imagine_bench.running.collect import describe
 
 
 @pytest.fixture(scope="module")

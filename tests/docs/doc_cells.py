@@ -16,8 +16,8 @@ import numpy as np
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.old_names import agent_label, label_today
+from imagine_bench.running.task_types import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.studies.catalogue import STUDIES
 
 ROOT = Path(__file__).parents[2]

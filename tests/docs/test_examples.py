@@ -20,7 +20,6 @@ from doc_cells import ROOT
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.models.asking import one_step
 from imagine_bench.judge.models.ends import Gallery
@@ -28,6 +27,7 @@ from imagine_bench.judge.models.study import make
 from imagine_bench.judge.models.truth import expected_reward
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.results import BenchResult
 from imagine_bench.studies.study import _plan, load_study

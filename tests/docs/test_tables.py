@@ -13,8 +13,8 @@ from doc_tables import PAGES, rewritten, tables, unmarked
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
+from imagine_bench.running.task_types import read_protocol
 from imagine_bench.store.archive import load_archive
-from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.results import BenchResult
 
 KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")

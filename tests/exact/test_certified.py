@@ -17,8 +17,8 @@ from imagine_bench.exact.splits import split_of
 from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
 from imagine_bench.running.bench import bench
+from imagine_bench.running.task_types import load_bench
 from imagine_bench.store.archive import archive_files, load_archive
-from imagine_bench.store.bench_folder import load_bench
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_the_certificate_is_that_of_the_tests_starts(result):
 
 
 def test_it_is_read_back_and_drawn(result, tmp_path, monkeypatch):
-    monkeypatch.delattr("imagine_bench.store.bench_folder.certificate")  # nothing is computed again
+    monkeypatch.delattr("imagine_bench.running.bench.certificate")  # nothing is computed again
     assert load_bench(result.folder).certificate == result.certificate
     page = write_report(dataclasses.replace(result, folder=tmp_path)).read_text()
     assert "The world" in page and 'id="certificate"' in page and "12 of them starts" not in page

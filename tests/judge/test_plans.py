@@ -28,9 +28,9 @@ from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.plans import plan_table, summarise, write_plans
 from imagine_bench.rules import fewest_actions
+from imagine_bench.running.trained import Trained, best_run
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
-from imagine_bench.store.trained import Trained, best_run
 
 TASK = registry.task("arrow_puzzle")
 
@@ -260,8 +260,8 @@ def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None
 
 def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     from imagine_bench.running.runner import run
+    from imagine_bench.running.trained import load_trained
     from imagine_bench.store import encoders
-    from imagine_bench.store.trained import load_trained
 
     tiny = (("imagination.weight_samples", 3), ("model.batch_size", 8), ("model.dynamics_hidden", (16,)))
     encoder = encoders.resolve(TASK, "clean")

@@ -25,10 +25,10 @@ from imagine_bench.report.data import collect
 from imagine_bench.report.sections.policy import followed, policies
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
+from imagine_bench.running.trained import learners, load_trained
 from imagine_bench.store import encoders
 from imagine_bench.store.files import lock, sealed
 from imagine_bench.store.results import Beliefs, BenchResult, RunResult
-from imagine_bench.store.trained import learners, load_trained
 
 HARD = registry.task("arrow_puzzle_hard")
 PICK = registry.task("pick_place")

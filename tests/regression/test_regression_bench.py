@@ -21,7 +21,6 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.regression import SCORES, Dataset, Mixtures, Prediction, RegressorContext
 from imagine_bench.judge.calibration import log_score
 from imagine_bench.protocols.runs import Progress, RunSpec
-from imagine_bench.protocols.task_types import task_types
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression import runner
@@ -32,9 +31,10 @@ from imagine_bench.regression.runner import run
 from imagine_bench.report.page import flat
 from imagine_bench.report.tables import number
 from imagine_bench.running.bench import plan
+from imagine_bench.running.task_types import task_types
+from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import read_json
-from imagine_bench.store.trained import load_trained
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 

@@ -19,10 +19,10 @@ from imagine_bench.report.figures import color
 from imagine_bench.report.page import summary_table
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import resolved_settings
+from imagine_bench.running.task_types import read_protocol
+from imagine_bench.running.trained import load_trained
 from imagine_bench.store.archive import archive_files, load_archive
-from imagine_bench.store.bench_folder import read_protocol
 from imagine_bench.store.merge import merge
-from imagine_bench.store.trained import load_trained
 
 SLOW = "dqn:controller.discount=0.99"
 _FEW = {"budgets": (2,), "evaluation_episodes": 3, "execution": "kinematic", "recorded_episodes": 0}

@@ -20,7 +20,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import environments
-from imagine_bench.store.trained import load_trained
+from imagine_bench.running.trained import load_trained
 
 _FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": "kinematic", "recorded_episodes": 1}
 

@@ -15,6 +15,7 @@ from small_runs import FORMATS, Inline, collected, final_arrays, measured, writt
 
 from imagine_bench import registry
 from imagine_bench.cli import main
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import OnProgress, RunSpec
@@ -22,7 +23,7 @@ from imagine_bench.report import summary_table, write_report
 from imagine_bench.rules import states_of
 from imagine_bench.running import run_state
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.running.control import plan_control, run_observed
+from imagine_bench.running.control import plan_control
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.results import RunResult
 

@@ -13,6 +13,7 @@ from small_runs import final_arrays, measured, small
 
 from imagine_bench import registry
 from imagine_bench.cli import main
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
@@ -20,7 +21,6 @@ from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import phases, run_state
-from imagine_bench.running.control import run_observed
 from imagine_bench.running.queries import LabelOracle, Teacher
 from imagine_bench.store import encoders
 from imagine_bench.store.codec import read_arrays

@@ -13,9 +13,9 @@ from small_runs import small
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.running.counters import Counters, EvaluationCounts
 from imagine_bench.running.run_state import Run
 from imagine_bench.store import encoders
-from imagine_bench.store.counters import Counters, EvaluationCounts
 
 
 @pytest.mark.parametrize(("wanted", "given"), [("clean", "mild"), ("mild", "clean"), ("clean", "clean")])

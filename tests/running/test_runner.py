@@ -22,15 +22,15 @@ from small_runs import context, do, final_arrays, same_but_for_time, small
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
 from imagine_bench.cli import observers
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import run_state
-from imagine_bench.running.control import run_observed
+from imagine_bench.running.counters import EvaluationCounts
 from imagine_bench.running.evaluation import play_test_episode
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.counters import EvaluationCounts
 
 
 @pytest.mark.parametrize(("seed", "purpose"), [(0, "evaluation"), (TUNING_SEEDS, "tuning")])
@@ -267,7 +267,7 @@ def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> N
 
 
 def test_every_registered_agent_has_a_target() -> None:
-    for entry in registry.AGENTS.values():
+    for entry in registry.agents().values():
         assert callable(registry.load(entry.make))
 
 

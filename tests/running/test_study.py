@@ -21,6 +21,7 @@ from small_runs import do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
+from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import true_model
@@ -28,7 +29,6 @@ from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
 from imagine_bench.rules import states_of
 from imagine_bench.running import run_state
-from imagine_bench.running.control import run_observed
 from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.store.results import Beliefs
 from imagine_bench.studies.catalogue import STUDIES

@@ -14,7 +14,8 @@ from small_runs import do, same_but_for_time, small
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import bench
 from imagine_bench.running.launchers.jobs import launcher
-from imagine_bench.store.bench_folder import BenchStore, bench_folder, load_bench, newest_bench, newest_recording
+from imagine_bench.running.task_types import load_bench
+from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
 from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import write_json
 from imagine_bench.store.results import Checkpoint, OpenLoop
@@ -46,7 +47,8 @@ def test_a_missing_run_is_an_error_that_says_how_to_go_on(tmp_path: Path) -> Non
     store = opened(tmp_path, seeds=(0, 2))
     store.begin_session(_ENVIRONMENT)
     do(store.run_folder("table", 0), seeds=(0, 2))
-    with pytest.raises(ArtefactError, match=r"missing: \[\('table', 2\)\]\. Run the same bench command again"):
+    sentence = r"lacks table seed 2: 0 of 9 real episodes\. Run the same bench command again"
+    with pytest.raises(ArtefactError, match=sentence):
         load_bench(store.folder)
 
 

@@ -12,8 +12,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
+from imagine_bench.running.counters import Counters, EvaluationCounts
 from imagine_bench.store.codec import pack, unpack
-from imagine_bench.store.counters import Counters, EvaluationCounts
 from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, KeptEpisodes, OpenLoop
 
 ARRAYS_ONLY = (OpenLoop, Beliefs, KeptEpisodes, ComparedRollout)

@@ -12,10 +12,10 @@ from small_runs import Inline, do, same_but_for_time, small
 
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.running.bench import bench
-from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.running.task_types import load_bench
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import lock, read_json, write_bytes
-from imagine_bench.store.run_folder import load_unfinished
+from imagine_bench.store.run_folder import load_so_far
 
 
 def unfinished(folder: Path) -> Path:
@@ -134,4 +134,4 @@ def test_changed_settings_of_an_unfinished_run_are_refused(tmp_path: Path) -> No
     unfinished(tmp_path)
     change(tmp_path / "config.json", settings={"rate": 0.1})
     with pytest.raises(ArtefactError, match=r"config\.json is damaged"):
-        load_unfinished(tmp_path)
+        load_so_far(tmp_path)

@@ -18,8 +18,9 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench
-from imagine_bench.store.archive import is_archive, load_archive
-from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.running.task_types import load_bench
+from imagine_bench.store.archive import load_archive
+from imagine_bench.store.bench_folder import is_archive
 from imagine_bench.store.merge import cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult
 

@@ -27,7 +27,7 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.store.bench_folder import load_bench
+from imagine_bench.running.task_types import load_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.store.merge import load_so_far
 

@@ -23,7 +23,6 @@ from tqdm import tqdm
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import AgentContext, State, TaskSpec
@@ -38,6 +37,7 @@ from imagine_bench.judge.models.truth import Questions, shares
 from imagine_bench.registry.entries import entrant, file_name
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.codec import read_arrays, write_arrays
@@ -72,7 +72,7 @@ class Judgement:
     seeds: tuple[int, ...] = (0, 1, 2)
     samples: int = SAMPLES  #: Futures imagined of each question
     appearance: str = "clean"
-    policy: str = "random"  #: Who collects the data, as :data:`.data.collect.POLICIES`
+    policy: str = "random"  #: Who collects the data, as :data:`.running.collect.POLICIES`
     #: A bundled name or a file, for the models that read what it gives; the others see through the task's own
     encoder: str | None = None
 

@@ -17,9 +17,9 @@ from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
 from imagine_bench.registry.entries import WorldModelEntry
+from imagine_bench.running.trained import Trained, load_trained
 from imagine_bench.store.files import read_json, read_sealed
 from imagine_bench.store.run_folder import load_run
-from imagine_bench.store.trained import Trained, load_trained
 
 _CONFIG = "config.json"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept

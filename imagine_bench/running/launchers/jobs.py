@@ -15,8 +15,8 @@ from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
-from imagine_bench.protocols.task_types import task_type
 from imagine_bench.registry.machine import usable_cores
+from imagine_bench.running.task_types import task_type
 from imagine_bench.store.files import make_folder, writing
 
 ONE_THREAD = dict.fromkeys(

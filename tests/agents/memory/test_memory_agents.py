@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 from fake_latents import ACTIONS, CODES, LATENTS, SMALL, FakeEncoder, context, frame, transition
-from imagine_bench.agents.memory import drqn, imagination
+from imagine_bench.agents.memory import imagination
 from imagine_bench.agents.memory.agent import RememberingAgent
 from imagine_bench.agents.memory.readout import last_seen
 from imagine_bench.agents.memory.recurrence import START, Recurrence
 from imagine_bench.agents.memory.sequences import SequenceMemory
+from imagine_bench_controls import drqn
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Observation

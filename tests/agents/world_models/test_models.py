@@ -12,12 +12,12 @@ from imagine_bench.agents.world_models import convolutional, latent
 from imagine_bench.agents.world_models.structured import StructuredModel
 
 from imagine_bench import registry
-from imagine_bench.data.collect import collect, policy_of
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
 from imagine_bench.registry.entries import entrant
+from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 

@@ -1,0 +1,52 @@
+"""Frames to latents for any Gymnasium learner: what the suite's own DQN sees, for a library's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.interfaces import Frame
+
+from .encoder import Encoder, bundled_encoder
+
+
+class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Any, Frame]):
+    """Replace each camera frame by the mean of its latents, float32 of shape (Z,).
+
+    Args:
+        env: An environment that gives frames (64, 64, 3), uint8.
+        encoder: An encoder, its file, or the name of a bundled one, such as ``"arrow_puzzle-clean"``.
+
+    Raises:
+        UnknownNameError: No encoder of this name is bundled; the message lists those that are.
+        ArtefactError: There is no such file, or it is damaged.
+        InvalidValueError: The encoder reads frames otherwise than the environment's task declares.
+    """
+
+    def __init__(self, env: gymnasium.Env[Frame, Any], encoder: Encoder | Path | str) -> None:
+        super().__init__(env)
+        self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
+        reads, declared = self.encoder.card.preprocessing, getattr(env.unwrapped, "preprocessing", None)
+        if declared not in (None, reads):
+            raise InvalidValueError(
+                f"The encoder of {self.encoder.card.task} reads frames as {reads!r}, this environment's task declares "
+                f"{declared!r}; choose an encoder of its own."
+            )
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.encoder.latent_size,), np.float32)
+
+    def observation(self, observation: Frame) -> NDArray[np.float32]:
+        """Latents (Z,) of one frame (64, 64, 3)."""
+        return self.encoder.latents(observation)
+
+
+def _path(encoder: Path | str) -> Path:
+    if isinstance(encoder, Path):
+        return encoder
+    path = bundled_encoder(encoder)
+    require_known("encoder", encoder, sorted(file.stem for file in path.parent.glob("*.safetensors")))
+    return path

@@ -1,0 +1,135 @@
+"""The registry line of each control; torch is not imported before an agent is made."""
+
+from __future__ import annotations
+
+from imagine_bench.registry import AgentEntry
+
+_COUNT_TABLE_SETTINGS = "imagine_bench_controls.tabular.settings:HYPERPARAMETERS"
+_POSTERIOR_SETTINGS = "imagine_bench_controls.tabular.settings:POSTERIOR_SAMPLING"
+_Q_LEARNING_SETTINGS = "imagine_bench_controls.tabular.settings:Q_LEARNING"
+_DYNA_Q_SETTINGS = "imagine_bench_controls.tabular.settings:DYNA_Q"
+_CODE = "its state is the code of a frame."
+_TRUE_STATE = "its state is the true macrostate (privileged: other learners see frames)."
+
+DRQN = AgentEntry(
+    make="imagine_bench_controls.drqn:make",
+    settings="imagine_bench_controls.drqn_settings:HYPERPARAMETERS",
+    title="DQN + memory",
+    description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
+    "sequences as R2D2 does.",
+)
+IMAGINATION_EXACT = AgentEntry(
+    make="imagine_bench_controls.exact:make",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    privileged=True,
+    title="imagination, exact model",
+    description="A control (privileged): like imagination, with the rules and rendered frames for its world model.",
+)
+IMAGINATION_EXACT_FILTER = AgentEntry(
+    make="imagine_bench_controls.exact:make_filter",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    privileged=True,
+    title="imagination, exact filter",
+    description="A control (privileged): like imagination, but it learns only from imagined transitions that are "
+    "right by the rules.",
+)
+DQN_EFFICIENT = AgentEntry(
+    make="imagine_bench_controls.efficient:make",
+    settings="imagine_bench_controls.settings:EFFICIENT",
+    title="DQN, data-efficient",
+    description="A control: the DQN with many updates, n-step targets and periodic resets, as SR-SPR and BBF.",
+)
+DQN_CODES = AgentEntry(
+    make="imagine_bench.agents.dqn:make",
+    settings="imagine_bench.agents.dqn_settings:HYPERPARAMETERS",
+    encoder_kind="codes",
+    title="DQN (codes)",
+    description="A control: the DQN, which reads the discrete codes that factored:given sees in place of latents.",
+)
+DQN_SWAPS = AgentEntry(
+    make="imagine_bench_controls.swaps:make",
+    settings="imagine_bench_controls.settings:SWAPPING",
+    encoder_kind="codes",
+    title="DQN (codes), swaps",
+    description="A control: the same, also trained on real transitions that have untouched factors of others (CoDA).",
+)
+COUNT_TABLE = AgentEntry(
+    make="imagine_bench_controls.tabular.count_table:make",
+    settings=_COUNT_TABLE_SETTINGS,
+    encoder_kind="codes",
+    description="A control: counts what followed each action in each code of a frame, and plans by value iteration; "
+    "explores by chance as DQN does.",
+)
+COUNT_TABLE_DIRECTED = AgentEntry(
+    make="imagine_bench_controls.tabular.count_table:make_directed",
+    settings=_COUNT_TABLE_SETTINGS,
+    encoder_kind="codes",
+    title="count table, directed",
+    description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
+)
+COUNT_TABLE_DIRECTED_MACROSTATE = AgentEntry(
+    make="imagine_bench_controls.tabular.count_table:make_directed_macrostate",
+    settings=_COUNT_TABLE_SETTINGS,
+    encoder_kind="codes",
+    needs_encoder=False,
+    privileged=True,
+    title="count table, directed (true state)",
+    description=f"A control: the same R-max; {_TRUE_STATE}",
+)
+COUNT_TABLE_OWN = AgentEntry(
+    make="imagine_bench_controls.tabular.own:make",
+    settings="imagine_bench_controls.tabular.settings:OWN",
+    needs_encoder=False,
+    title="count table, own eyes",
+    description="A control: like count table, directed, but it learns to see from its own frames as factored.",
+)
+POSTERIOR_SAMPLING = AgentEntry(
+    make="imagine_bench_controls.tabular.posterior_sampling:make",
+    settings=_POSTERIOR_SETTINGS,
+    encoder_kind="codes",
+    title="posterior sampling",
+    description="A control: a count table that follows, each episode, a model drawn from what it believes (PSRL); "
+    f"{_CODE}",
+)
+POSTERIOR_SAMPLING_MACROSTATE = AgentEntry(
+    make="imagine_bench_controls.tabular.posterior_sampling:make_macrostate",
+    settings=_POSTERIOR_SETTINGS,
+    encoder_kind="codes",
+    needs_encoder=False,
+    privileged=True,
+    title="posterior sampling (true state)",
+    description="A control: a count table that follows, each episode, a model drawn from what it believes (PSRL); "
+    f"{_TRUE_STATE}",
+)
+Q_LEARNING = AgentEntry(
+    make="imagine_bench_controls.tabular.dyna_q:make_q_learning",
+    settings=_Q_LEARNING_SETTINGS,
+    encoder_kind="codes",
+    title="Q-learning",
+    description=f"Learns values in a table from real transitions; {_CODE}",
+)
+Q_LEARNING_MACROSTATE = AgentEntry(
+    make="imagine_bench_controls.tabular.dyna_q:make_q_learning_macrostate",
+    settings=_Q_LEARNING_SETTINGS,
+    encoder_kind="codes",
+    needs_encoder=False,
+    privileged=True,
+    title="Q-learning (true state)",
+    description=f"Learns values in a table from real transitions; {_TRUE_STATE}",
+)
+DYNA_Q = AgentEntry(
+    make="imagine_bench_controls.tabular.dyna_q:make_dyna_q",
+    settings=_DYNA_Q_SETTINGS,
+    encoder_kind="codes",
+    title="Dyna-Q",
+    description=f"Q-learning, also from transitions that its model recalls: imagination's ancestor; {_CODE}",
+)
+DYNA_Q_MACROSTATE = AgentEntry(
+    make="imagine_bench_controls.tabular.dyna_q:make_dyna_q_macrostate",
+    settings=_DYNA_Q_SETTINGS,
+    encoder_kind="codes",
+    needs_encoder=False,
+    privileged=True,
+    title="Dyna-Q (true state)",
+    description=f"Q-learning, also from transitions that its model recalls: imagination's ancestor; {_TRUE_STATE}",
+)

@@ -1,0 +1,82 @@
+"""The control ``count_table_own``: a count table that learns to see as ``factored`` does, from its own frames.
+
+It has the same codes and counts, and neither structure nor uncertainty: R-max on whole codes. Whenever factors are
+found anew, it counts all remembered transitions once more by the codes that their frames have now.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from imagine_bench.agents import snapshot
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.factored.learned_perception import LearnedPerception
+
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+from .count_table import CountTableAgent
+from .settings import OWN, OwnCountTableSettings
+
+
+class OwnCountTableAgent(CountTableAgent):
+    """R-max on codes of its own; states are whole codes as numbers."""
+
+    settings: OwnCountTableSettings
+
+    def __init__(self, n_actions: int, settings: OwnCountTableSettings, seeds: SeedTree) -> None:
+        self.eyes = LearnedPerception(settings.perception, factored=False)
+        super().__init__(self._see, n_actions, settings, seeds, directed=True)
+        self._happened: list[tuple[float, bool]] = []
+        """Reward and end of every remembered transition."""
+
+    def _see(self, observation: Observation) -> int:
+        return self.eyes.code(observation.frame)[0]
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        """Remember what was seen, see anew if that is due, and count."""
+        eyes = self.eyes
+        if not eyes.full:
+            eyes.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
+            if eyes.renew():
+                self._recount()
+            self._happened.append((transition.reward, transition.terminated))
+        super().observe(transition, episode=episode)
+
+    def _recount(self) -> None:
+        """Count every remembered transition by the codes that its frames have now."""
+        self.table.clear()
+        self._plans.clear()
+        eyes = self.eyes
+        codes, _ = eyes.codes(np.stack(eyes.frames))
+        happened = zip(eyes.transitions, eyes.actions, self._happened, strict=False)
+        for (before, after), action, (reward, terminated) in happened:
+            self.table.add(codes[before][0], action, codes[after][0], reward, terminated)
+
+    def diagnostics(self) -> dict[str, float]:
+        """Also what it sees."""
+        return {**super().diagnostics(), **self.eyes.diagnostics()}
+
+    def state(self) -> AgentState:
+        """A snapshot: also the frames that it remembers."""
+        common = super().state()
+        happened: snapshot.Arrays = {
+            "replay/action": np.array(self.eyes.actions, dtype=np.int64),
+            "replay/reward": np.array([reward for reward, _ in self._happened], dtype=np.float64),
+            "replay/terminated": np.array([ended for _, ended in self._happened], dtype=np.bool_),
+        }
+        arrays: snapshot.Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
+        return AgentState(arrays=arrays, values={**common.values, **self.eyes.values()})
+
+    def restore(self, state: AgentState) -> None:
+        """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
+        super().restore(state)
+        self.eyes.load(state)
+        columns = (state.arrays[f"replay/{name}"].tolist() for name in ("reward", "terminated"))
+        self._happened = list(zip(*columns, strict=True))
+
+
+def make(context: AgentContext) -> OwnCountTableAgent:
+    """The ``count_table_own`` agent, of whatever frames are 64 x 64."""
+    prepare_torch(context.device)
+    settings = OWN.resolve(context.hyperparameters, context.overrides, context.config_group)
+    return OwnCountTableAgent(context.n_actions, settings, context.seeds)

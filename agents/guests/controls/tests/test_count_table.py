@@ -1,0 +1,159 @@
+"""The count table: value iteration against exact values, R-max on a chain, snapshots, success on the arrow puzzle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fake_codes
+import numpy as np
+import pytest
+from agent_states import goes_on, same
+from imagine_bench.agents.factored.perception import CodePerception
+from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
+from imagine_bench_controls.tabular.counts import CountTable
+from imagine_bench_controls.tabular.settings import HYPERPARAMETERS
+from small_runs import small
+
+from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+
+LENGTH, LEFT = 6, 0
+
+
+def agent(
+    *, directed: bool, n_actions: int = fake_codes.ACTIONS, seed: int = 0, name: str = "fast"
+) -> CodeCountTableAgent:
+    perception = CodePerception(fake_codes.FakeCodes(), factored=False)  # type: ignore[arg-type]
+    settings = HYPERPARAMETERS.resolve(name, {}, "chapter_5")
+    return CodeCountTableAgent(perception, n_actions, settings, SeedTree(seed), directed=directed)
+
+
+def live(learner: CodeCountTableAgent, steps: int, seed: int = 1) -> None:
+    """Train on the tiny world of wheels."""
+    rng, code = np.random.default_rng(seed), fake_codes.starts()[0]
+    for _ in range(steps):
+        action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
+        learner.observe(fake_codes.transition(code, action), episode=0)
+        code, _, ended = fake_codes.step(code, action)
+        if ended:
+            code = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))]
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_a_complete_table_has_the_exact_values(task: str) -> None:
+    """Outcomes of chance are counted in proportion to their probabilities, so the counts are the rules."""
+    spec = registry.task(task)
+    tables = rules.tabulate(spec.rules)
+    index, table = {state: i for i, state in enumerate(spec.rules.states)}, CountTable(spec.n_actions)
+    for state, i in index.items():
+        for action in range(0 if spec.rules.is_terminal(state) else spec.n_actions):
+            for outcome in spec.rules.outcomes(state, action):
+                for _ in range(round(outcome.probability * 360)):
+                    table.add(i, action, index[outcome.macrostate], outcome.reward, outcome.terminated)
+    exact, found = rules.optimal_values(tables), table.action_values(1.0, untried=0.0)
+    going_on = [i for state, i in index.items() if not spec.rules.is_terminal(state)]
+    np.testing.assert_allclose([found[i].max() for i in going_on], exact.max(axis=0)[going_on], atol=1e-3)
+
+
+def test_what_chance_decides_is_worth_its_mean() -> None:
+    table = CountTable(2)
+    assert table.action_values(0.5, untried=9.0) == {}
+    assert [table.add(7, 0, 8, 4.0, False), table.add(7, 0, 7, 0.0, True)] == [True, True]
+    assert table.add(7, 0, 7, 0.0, True) and table.add(7, 0, 7, 0.0, True)
+    values = table.action_values(0.5, untried=8.0)
+    assert values[8].tolist() == [8.0, 8.0]
+    assert values[7].tolist() == pytest.approx([(4.0 + 0.5 * 8.0) / 4, 8.0])
+    assert (table.states, table.pairs, table.largest_reward) == (2, 1, 4.0)
+
+
+def test_only_news_change_what_is_predicted() -> None:
+    table = CountTable(2)
+    assert table.add(0, 0, 1, -1.0, False)
+    assert not table.add(0, 0, 1, -1.0, False), "a certain transition seen again"
+    assert table.largest_reward == 0.0
+
+
+def explored_after(learner: CodeCountTableAgent) -> int:
+    """Steps until every pair of a chain was tried, starting each episode of 2 x LENGTH steps at its left end."""
+    following = 0
+    for step in range(20_000):
+        at = 0 if step % (2 * LENGTH) == 0 else following
+        seen = Observation(frame=fake_codes.frame((at % 3, at // 3, 0)))
+        action = learner.act(seen, explore=True)
+        following = max(at - 1, 0) if action == LEFT else min(at + 1, LENGTH - 1)
+        then = Observation(frame=fake_codes.frame((following % 3, following // 3, 0)))
+        moved = Transition(
+            observation=seen, action=action, reward=-1.0, next_observation=then, terminated=False, truncated=False
+        )
+        learner.observe(moved, episode=0)
+        if learner.table.pairs == 2 * LENGTH:
+            return step + 1
+    return 20_000
+
+
+def test_directed_exploration_tries_a_chain_in_fewer_steps() -> None:
+    directed = [explored_after(agent(directed=True, n_actions=2, seed=seed)) for seed in range(5)]
+    by_chance = [explored_after(agent(directed=False, n_actions=2, seed=seed)) for seed in range(5)]
+    assert max(directed) <= 8 * LENGTH
+    assert max(directed) < np.mean(by_chance)
+
+
+def test_directed_exploration_ends_in_greedy_actions() -> None:
+    learner = agent(directed=True)
+    live(learner, 600)
+    pairs = learner.table.pairs
+    live(learner, 100, seed=2)
+    assert learner.table.pairs == pairs == len(fake_codes.starts()) * fake_codes.ACTIONS
+    for code in fake_codes.starts():
+        seen = Observation(frame=fake_codes.frame(code))
+        values = learner.q_values(seen)
+        assert values[learner.act(seen, explore=True)] == pytest.approx(values.max())
+    assert fake_codes.success(learner) == 1.0
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_a_restored_agent_goes_on_bit_for_bit(directed: bool) -> None:
+    learner, other = agent(directed=directed), agent(directed=directed, seed=5)
+    goes_on(learner, other, live, 60)
+    seen = Observation(frame=fake_codes.frame(fake_codes.starts()[0]))
+    assert learner.q_values(seen).tobytes() == other.q_values(seen).tobytes()
+
+
+def test_tests_change_nothing() -> None:
+    learner = agent(directed=True)
+    live(learner, 30)
+    before = learner.state()
+    for code in fake_codes.starts():
+        learner.act(Observation(frame=fake_codes.frame(code)), explore=False)
+    assert same(before, learner.state())
+
+
+def test_a_snapshot_of_the_other_exploration_is_refused() -> None:
+    with pytest.raises(ArtefactError, match="'directed' is False in the snapshot and True in this agent"):
+        agent(directed=True).restore(agent(directed=False).state())
+    with pytest.raises(ArtefactError, match=r"controller\.epsilon_decay"):
+        agent(directed=True).restore(agent(directed=True, name="published").state())
+
+
+def test_its_exploration_is_the_settings_of_the_dqn() -> None:
+    dqn = registry.load("imagine_bench.agents.dqn_settings:HYPERPARAMETERS")
+    for group, settings in HYPERPARAMETERS.groups.items():
+        for name in settings.sets:
+            own, theirs = (each.resolve(name, {}, group).controller for each in (HYPERPARAMETERS, dqn))
+            for field in ("discount", "epsilon_min", "epsilon_max", "epsilon_decay"):
+                assert getattr(own, field) == getattr(theirs, field)
+
+
+@pytest.mark.parametrize("name", ["count_table", "count_table_directed"])
+def test_it_beats_chance_on_the_arrow_puzzle(tmp_path: Path, name: str) -> None:
+    task = registry.task("arrow_puzzle")
+    budget = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast")
+    spec = RunSpec(protocol=budget, agent=name, seed=1000, encoder=encoders.resolve(task, "clean", kind="codes"))
+    (row,) = run_observed(spec, tmp_path / "run", lambda progress: None).checkpoints
+    assert row.success_rate > 4 * rules.facts(task.rules, task.horizon).chance_level
+    assert row.diagnostics["table/pairs"] > 100

@@ -1,0 +1,195 @@
+"""Q-learning and Dyna-Q: the update by hand, convergence to value iteration, chance, snapshots, what may be seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import fake_codes
+import numpy as np
+import pytest
+from agent_states import goes_on, same
+from imagine_bench.agents.factored.perception import CodePerception
+from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
+from imagine_bench_controls.tabular.counts import CountTable
+from imagine_bench_controls.tabular.dyna_q import DynaQAgent
+from imagine_bench_controls.tabular.settings import DYNA_Q, Q_LEARNING
+from small_runs import small
+
+from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+
+ALWAYS_BY_CHANCE = {"controller.epsilon_min": 1.0, "controller.epsilon_max": 1.0}
+CODES = read_codes(CodePerception(fake_codes.FakeCodes(), factored=False))  # type: ignore[arg-type]
+
+
+def agent(planning: int, *, read: ReadState = CODES, seed: int = 0, **settings: Any) -> DynaQAgent:
+    own = {"table.planning_steps": planning, **{name.replace("__", "."): value for name, value in settings.items()}}
+    return DynaQAgent(read, fake_codes.ACTIONS, DYNA_Q.resolve("fast", own, "chapter_5"), SeedTree(seed))
+
+
+def live(learner: DynaQAgent, steps: int, seed: int = 1) -> None:
+    """Train on the tiny world of wheels, episodes of at most 6 steps."""
+    rng, code, length = np.random.default_rng(seed), fake_codes.starts()[0], 0
+    for _ in range(steps):
+        action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
+        learner.observe(fake_codes.transition(code, action), episode=0)
+        (code, _, ended), length = fake_codes.step(code, action), length + 1
+        if ended or length == 6:
+            code, length = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))], 0
+
+
+def transition(at: int, action: int, reward: float, then: int, *, terminated: bool = False) -> Transition:
+    """Between macrostates (at,) and (then,); frames say nothing."""
+    blank = np.zeros((64, 64, 3), dtype=np.uint8)
+    seen, following = (Observation(frame=blank, macrostate=np.array([state])) for state in (at, then))
+    return Transition(
+        observation=seen, action=action, reward=reward, next_observation=following, terminated=terminated,
+        truncated=True,
+    )  # fmt: skip
+
+
+def test_q_learning_updates_as_by_hand() -> None:
+    """Equation 2.16 with alpha 1/2, gamma 0.8; truncation bootstraps, termination does not."""
+    learner = agent(0, read=read_macrostate, table__step_size=0.5, controller__discount=0.8)
+    learner.observe(transition(1, 2, 10.0, 2), episode=0)  # 0 + (10 + 0.8 * 0 - 0) / 2 = 5
+    learner.observe(transition(0, 3, -1.0, 1), episode=0)  # 0 + (-1 + 0.8 * 5 - 0) / 2 = 1.5
+    learner.observe(transition(0, 3, -1.0, 1, terminated=True), episode=0)  # 1.5 + (-1 - 1.5) / 2 = 0.25
+    assert learner.q[1].tolist() == [0.0, 0.0, 5.0, 0.0]
+    assert learner.q[0].tolist() == [0.0, 0.0, 0.0, 0.25]
+    assert set(learner.q) == {0, 1}
+    assert learner.diagnostics()["loss/bellman"] == pytest.approx((10.0**2 + 3.0**2 + 2.5**2) / 3)
+
+
+def test_one_plan_is_one_update_of_a_pair_that_was_tried() -> None:
+    learner = agent(3, read=read_macrostate, table__step_size=0.5)
+    learner.observe(transition(1, 2, 8.0, 2, terminated=True), episode=0)
+    assert learner.q[1].tolist() == [0.0, 0.0, 8.0 - 8.0 / 2**4, 0.0], "one real update and three planned"
+
+
+def exact_values() -> dict[int, np.ndarray]:
+    """Value iteration on the whole world of wheels, discount 0.95, by the code's number."""
+    table, number = CountTable(fake_codes.ACTIONS), {code: int(np.ravel_multi_index(code, fake_codes.SIZES))
+                                                     for code in np.ndindex(*fake_codes.SIZES)}  # fmt: skip
+    for code in fake_codes.starts():
+        for action in range(fake_codes.ACTIONS):
+            following, reward, ended = fake_codes.step(code, action)
+            table.add(number[code], action, number[following], reward, ended)
+    found = table.action_values(0.95, untried=0.0)
+    return {number[code]: found[number[code]] for code in fake_codes.starts()}
+
+
+def steps_to_exact(planning: int, seed: int) -> int:
+    """Real steps of a random walk until every value is within 0.1 of the exact one (a goal is worth 10)."""
+    exact, learner = exact_values(), agent(planning, seed=seed, table__step_size=0.5, **ALWAYS_BY_CHANCE)
+    for step in range(10, 20_001, 10):
+        live(learner, 10, seed=1000 * seed + step)
+        if all(np.abs(learner.q.get(s, np.zeros(4)) - values).max() < 0.1 for s, values in exact.items()):
+            return step
+    return 20_000
+
+
+def test_planning_needs_a_third_of_the_real_steps() -> None:
+    planned, real = ([steps_to_exact(steps, seed) for seed in range(3)] for steps in (50, 0))
+    assert max(real) < 20_000, "both end at value iteration's values"
+    assert 3 * np.mean(planned) <= np.mean(real)
+
+
+def test_what_chance_decides_is_planned_by_its_mean() -> None:
+    """One of four tests paid 8: planning goes to the mean 2, not to the last test's 0 nor to 8."""
+    learner = agent(400, read=read_macrostate, table__step_size=0.01)
+    for reward in (8.0, 0.0, 0.0, 0.0):
+        learner.observe(transition(0, 1, reward, 1, terminated=True), episode=0)
+    assert learner.q[0][1] == pytest.approx(2.0, abs=0.75)
+    means = [learner.q[0][1]]
+    for _ in range(20):
+        learner.plan()
+        means.append(learner.q[0][1])
+    assert np.mean(means) == pytest.approx(2.0, abs=0.2)
+
+
+def test_exploration_draws_among_equals_and_only_those() -> None:
+    seen = transition(0, 0, 0.0, 1).observation
+    for epsilon, best in ((0.0, [1.0, 0.0, 1.0, 0.0]), (0.6, [0.0, 0.0, 1.0, 0.0])):
+        chance = {"controller.epsilon_min": epsilon, "controller.epsilon_max": epsilon}
+        learner = agent(0, read=read_macrostate, **chance)
+        learner.q[0] = np.array(best)
+        taken = np.bincount([learner.act(seen, explore=True) for _ in range(2000)], minlength=4) / 2000
+        share = (1 - epsilon) / sum(best) * np.array(best) + epsilon / 4
+        np.testing.assert_allclose(taken, share, atol=0.05)
+        assert learner.act(seen, explore=False) == np.argmax(best)
+
+
+@pytest.mark.parametrize("planning", [0, 5])
+def test_a_restored_agent_goes_on_bit_for_bit(planning: int) -> None:
+    learner, other = agent(planning), agent(planning, seed=5)
+    other.restore(learner.state())
+    saved = goes_on(learner, other, live, 60)
+    assert learner.state().values["steps"] == 120
+    learner.restore(saved)
+    assert same(learner.state(), saved) and learner.steps == 60
+    assert not same(learner.state(), other.state())
+    live(learner, 60, seed=3)
+    assert same(learner.state(), other.state())
+
+
+def test_tests_change_nothing() -> None:
+    learner = agent(5)
+    live(learner, 30)
+    before = learner.state()
+    for code in fake_codes.starts():
+        seen = Observation(frame=fake_codes.frame(code))
+        assert learner.q_values(seen)[learner.act(seen, explore=False)] == learner.q_values(seen).max()
+    assert same(before, learner.state())
+    live(learner, 30)
+    assert not same(before, learner.state())
+
+
+def test_a_snapshot_of_other_planning_is_refused() -> None:
+    with pytest.raises(ArtefactError, match=r"table\.planning_steps' is 5 in the snapshot and 0 in this agent"):
+        agent(0).restore(agent(5).state())
+
+
+def test_q_learning_never_plans() -> None:
+    """An override in a bench of both is Dyna-Q's alone; an impossible one is refused all the same."""
+    given = {"table.planning_steps": 7, "table.step_size": 0.5}
+    for own, steps in ((Q_LEARNING, 0), (DYNA_Q, 7)):
+        found = own.resolve("fast", given, "chapter_5").table
+        assert (found.planning_steps, found.step_size) == (steps, 0.5)
+    with pytest.raises(InvalidValueError, match=r"planning_steps is -1"):
+        Q_LEARNING.resolve("fast", {"table.planning_steps": -1}, "chapter_5")
+
+
+def test_each_reading_sees_its_own_state_alone() -> None:
+    shown = Observation(frame=fake_codes.frame((2, 1, 0)), macrostate=np.array([3, 1]))
+    assert read_macrostate(shown) == 3 + 64 * 1
+    assert CODES(shown) == CODES(Observation(frame=shown.frame)) == np.ravel_multi_index((2, 1, 0), (3, 3, 2))
+    for state in (None, np.array([64, 0]), np.array([-1]), np.zeros(11, dtype=np.int64)):
+        with pytest.raises(InvalidValueError, match=r"reads the true state, of at most 10 .* was shown (none|\[)"):
+            read_macrostate(Observation(frame=shown.frame, macrostate=state))
+
+
+@pytest.mark.parametrize("name", ["q_learning", "dyna_q"])
+def test_who_reads_the_true_state_says_so(name: str) -> None:
+    own, twin = registry.agents()[name], registry.agents()[f"{name}_macrostate"]
+    assert twin.privileged and not twin.needs_encoder and not own.privileged and own.needs_encoder
+    assert "true state" in twin.title and "privileged" in twin.description
+    assert "true" not in own.title + own.description
+
+
+@pytest.mark.slow
+def test_planning_is_ahead_on_the_arrow_puzzle(tmp_path: Path) -> None:
+    task = registry.task("arrow_puzzle")
+    solved = {}
+    for name in ("q_learning", "dyna_q"):
+        protocol = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast")
+        encoder = encoders.resolve(task, "clean", kind="codes")
+        spec = RunSpec(protocol=protocol, agent=name, seed=1000, encoder=encoder)
+        solved[name] = run_observed(spec, tmp_path / name, lambda progress: None).checkpoints[-1].success_rate
+    chance = rules.facts(task.rules, task.horizon).chance_level
+    assert solved["dyna_q"] > max(4 * chance, 2 * solved["q_learning"])

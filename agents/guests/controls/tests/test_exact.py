@@ -1,0 +1,175 @@
+"""Imagination that knows: rollouts of the rules alone, a filter that keeps what is right, snapshots, who may."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from agent_states import goes_on
+from fake_latents import ACTIONS, CODES, FakeEncoder, context, frame, transition
+from imagine_bench.agents.imagination.rollouts import Imagined
+from imagine_bench_controls import exact
+from imagine_bench_controls.exact import LOOKS, ExactFilterAgent, ExactImaginationAgent
+from small_runs import small
+
+from imagine_bench import registry, rules
+from imagine_bench.cli.observers import run_observed
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import ExactWorld, Outcome, Transition
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.store import encoders
+
+STATES, GOAL = 6, 5
+HALF = 2
+"""Action 2 moves by two with probability 1/2, and else not at all; others by their number."""
+
+
+def outcomes(state: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+    moves = [(0.5, 2), (0.5, 0)] if action == HALF else [(1.0, action)]
+    return tuple(
+        Outcome(p, ((state[0] + by) % STATES,), 7.0 if (state[0] + by) % STATES == GOAL else -1.0,
+                (state[0] + by) % STATES == GOAL, (state[0] + by) % STATES == GOAL)
+        for p, by in moves
+    )  # fmt: skip
+
+
+WORLD = ExactWorld(
+    rules=SimpleNamespace(outcomes=outcomes),  # type: ignore[arg-type]
+    render=lambda states, rng: np.stack([frame(int(state)) for (state,) in states]),
+)
+
+
+def told(moved: Transition) -> Transition:
+    """The same, shown to a privileged agent."""
+    seen = [replace(o, macrostate=o.frame[0, 0, :1].astype(np.int64))
+            for o in (moved.observation, moved.next_observation)]  # fmt: skip
+    return replace(moved, observation=seen[0], next_observation=seen[1])
+
+
+def knowing(monkeypatch: pytest.MonkeyPatch, **settings: Any) -> ExactImaginationAgent:
+    own = {f"imagination.{name}": value for name, value in settings.items()}
+    agent = exact.make(context(monkeypatch, {"memory.imagined": 2_000, **own}, exact_world=WORLD))
+    assert isinstance(agent, ExactImaginationAgent)
+    return agent
+
+
+def live(agent: Any, steps: int, seed: int = 0) -> None:
+    rng, state = np.random.default_rng(seed), 0
+    for step in range(steps):
+        action = int(rng.integers(ACTIONS))
+        outcome = outcomes((state,), action)[-1]
+        (after,) = outcome.macrostate
+        agent.observe(
+            told(transition(state, action, outcome.reward, after, terminated=outcome.terminated)), episode=step
+        )
+        state = 0 if outcome.terminated else after
+
+
+def test_what_is_imagined_is_of_the_rules_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = knowing(monkeypatch, depth=4, breadth=5, start_states="replayed", exploration=1.0)
+    live(agent, 80)
+    rows = agent.imagined.arrays()
+    before, after = (FakeEncoder().read_macrostate(torch.as_tensor(rows[name]))[:, 0] for name in ("z", "next_z"))
+    assert len(before) > 300 and set(before) == set(range(STATES)) - {GOAL}
+    for state, action, then, reward, ended in zip(
+        before, rows["action"], after, rows["reward"], rows["terminated"], strict=True
+    ):
+        assert (then, reward, bool(ended)) in {
+            (*o.macrostate, o.reward, o.terminated) for o in outcomes((int(state),), int(action))
+        }
+    by_chance = (after == before)[rows["action"] == HALF]
+    assert abs(by_chance.mean() - 0.5) < 4.0 * 0.5 / np.sqrt(len(by_chance)), "outcomes have their probabilities"
+
+
+def test_a_rollout_goes_on_from_what_it_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = knowing(monkeypatch, depth=3, breadth=1, start_states="current", start_episode=0, exploration=1.0)
+    agent.observe(told(transition(3, 0, -1.0, 3)), episode=0)
+    rows = agent.imagined.arrays()
+    assert np.array_equal(rows["z"][1:], rows["next_z"][:-1])
+    assert np.abs(rows["z"][0] - CODES[3].numpy()).max() < 0.5
+    assert len(rows["z"]) == 3 or rows["terminated"][-1] == 1.0
+
+
+def test_imagining_begins_and_ends_when_settings_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent, counts = knowing(monkeypatch, start_episode=3, end_episode=6), []
+    for episode in range(9):
+        agent.observe(told(transition(0, 1, -1.0, 1)), episode=episode)
+        counts.append(agent.imagined.added)
+    assert counts[:3] == [0, 0, 0] and counts[3] < counts[4] < counts[5] == counts[8]
+    assert agent.updates == 9 + 6, "one on real transitions a step, and one more from the third episode on"
+
+
+def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[np.random.Generator] = []
+
+    def noisy(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        drawn.append(rng)
+        return np.stack([frame(int(rng.integers(16))) for _ in states])
+
+    world = replace(WORLD, render=noisy)
+    ahead, back = (exact.make(context(monkeypatch, exact_world=world)) for _ in range(2))
+    assert isinstance(ahead, ExactImaginationAgent) and isinstance(back, ExactImaginationAgent)
+    for agent, order in ((ahead, (1, 2)), (back, (2, 1))):
+        for state in order:
+            agent._gallery.latents([(state,)], torch.Generator().manual_seed(0))
+    same_state, other = (
+        [agent._gallery.latents([(state,)], torch.Generator().manual_seed(3)) for agent in (ahead, back)]
+        for state in (1, 2)
+    )
+    assert torch.equal(*same_state) and torch.equal(*other) and not torch.equal(same_state[0], other[0])
+    assert len(drawn) == 4, f"{LOOKS} looks of each are rendered once"
+
+
+def test_a_restored_agent_goes_on_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent, other = knowing(monkeypatch), knowing(monkeypatch)
+    goes_on(agent, other, live, 20)
+
+
+def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = exact.make_filter(context(monkeypatch, exact_world=WORLD))
+    assert isinstance(agent, ExactFilterAgent)
+    rows = [  # from state 4: action, reached, reward, probability of the end; and whether that is right
+        (1, 5, 7.4, 0.9, True),
+        (1, 5, 9.0, 0.9, False),
+        (1, 5, 7.0, 0.1, False),
+        (1, 4, -1.0, 0.1, False),
+        (0, 4, -1.9, 0.1, True),
+        (HALF, 4, -1.0, 0.1, True),
+        (HALF, 0, -1.0, 0.2, True),
+        (HALF, 5, 7.0, 0.9, False),
+    ]
+    action, reached, reward, ends, right = (list(column) for column in zip(*rows, strict=True))
+    step = Imagined(CODES[reached] + 0.01, torch.tensor(reward), torch.tensor(ends), None, None)  # type: ignore[arg-type]
+    z = CODES[[4] * len(rows)] - 0.01
+    assert agent.imagination.admits(z, torch.tensor(action), step, 0.0).tolist() == right
+
+
+def test_only_who_is_given_the_world_imagines_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InvalidValueError, match="given the exact world"):
+        exact.make(context(monkeypatch))
+    with pytest.raises(InvalidValueError, match="was shown none"):
+        knowing(monkeypatch).observe(transition(0, 1, -1.0, 1), episode=0)
+    hidden, plain = (registry.task(name) for name in ("arrows:gesture=0.5", "arrow_puzzle"))
+    assert ExactWorld.of(hidden, "clean") is None
+    found = ExactWorld.of(plain, "clean")
+    assert found is not None and found.rules is plain.rules
+    for name in ("imagination_exact", "imagination_exact_filter"):
+        assert registry.agents()[name].privileged and "privileged" in registry.agents()[name].description
+
+
+@pytest.mark.slow
+def test_exact_imagination_is_ahead_on_the_arrow_puzzle(tmp_path: Path) -> None:
+    task = registry.task("arrow_puzzle")
+    solved = {}
+    for name in ("imagination", "imagination_exact"):
+        own = (("imagination.start_episode", 0),)
+        protocol = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast", overrides=own)
+        spec = RunSpec(protocol=protocol, agent=name, seed=1000, encoder=encoders.resolve(task, "clean"))
+        solved[name] = run_observed(spec, tmp_path / name, lambda progress: None).checkpoints[-1].success_rate
+    chance = rules.facts(task.rules, task.horizon).chance_level
+    assert solved["imagination_exact"] > max(4 * chance, solved["imagination"])

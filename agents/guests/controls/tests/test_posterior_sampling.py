@@ -1,0 +1,143 @@
+"""Posterior sampling: the posterior by hand, its limits, deep exploration of a chain, episodes, snapshots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import fake_codes
+import numpy as np
+import pytest
+from agent_states import goes_on, same
+from imagine_bench.agents.factored.perception import CodePerception
+from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
+from imagine_bench_controls.tabular.counts import CountTable
+from imagine_bench_controls.tabular.posterior_sampling import PosteriorSamplingAgent
+from imagine_bench_controls.tabular.settings import POSTERIOR_SAMPLING
+
+from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.seeding import SeedTree
+
+CODES = read_codes(CodePerception(fake_codes.FakeCodes(), factored=False))  # type: ignore[arg-type]
+BLANK = np.zeros((64, 64, 3), dtype=np.uint8)
+
+
+def agent(
+    *, read: ReadState = CODES, actions: int = fake_codes.ACTIONS, seed: int = 0, **overrides: Any
+) -> PosteriorSamplingAgent:
+    settings = POSTERIOR_SAMPLING.resolve("fast", overrides, "chapter_5")
+    return PosteriorSamplingAgent(read, actions, settings, SeedTree(seed))
+
+
+def live(learner: PosteriorSamplingAgent, steps: int, seed: int = 1) -> None:
+    """Train on the tiny world of wheels, episodes of at most 6 steps; the last transition of one says so."""
+    rng, code, length = np.random.default_rng(seed), fake_codes.starts()[0], 0
+    for _ in range(steps):
+        action, length = learner.act(Observation(frame=fake_codes.frame(code)), explore=True), length + 1
+        learner.observe(replace(fake_codes.transition(code, action), truncated=length == 6), episode=0)
+        code, _, ended = fake_codes.step(code, action)
+        if ended or length == 6:
+            code, length = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))], 0
+
+
+def at(state: int) -> Observation:
+    return Observation(frame=BLANK, macrostate=np.array([state]))
+
+
+def moved(state: int, action: int, reward: float, then: int, *, truncated: bool = False) -> Transition:
+    return Transition(
+        observation=at(state), action=action, reward=reward, next_observation=at(then), terminated=False,
+        truncated=truncated,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("concentration", [0.5, 2.0])
+def test_the_posterior_is_the_dirichlet_of_the_counts(concentration: float) -> None:
+    """A pair seen to pay 1 thrice and 0 once, where a prior draw pays either: mean and variance by hand."""
+    table = CountTable(1)
+    for reward in (1.0, 1.0, 1.0, 0.0):
+        table.add(0, 0, 0, reward, True)
+    rng = np.random.default_rng(0)
+    drawn = np.array([table.sampled_values(0.9, concentration, rng)[0][0] for _ in range(4_000)])
+    # p + w b with (p, 1 - p - w, w) ~ Dirichlet(3, 1, c), b ~ Bernoulli(1/2): given b, Beta(3 + c b, 1 + c (1 - b))
+    total = 4.0 + concentration
+    first = {b: (3.0 + concentration * b) / total for b in (0, 1)}
+    second = {b: first[b] * (3.0 + concentration * b + 1.0) / (total + 1.0) for b in (0, 1)}
+    mean = (first[0] + first[1]) / 2
+    assert drawn.mean() == pytest.approx(mean, abs=0.015)
+    assert drawn.var() == pytest.approx((second[0] + second[1]) / 2 - mean**2, abs=0.006)
+
+
+def test_many_counts_leave_the_model_of_the_counts() -> None:
+    table, rng = CountTable(2), np.random.default_rng(0)
+    for state in range(4):
+        for action in (0, 1):
+            for _ in range(3_000):
+                table.add(state, action, (state + 1 + action) % 4, float(state == 3), state == 3)
+    exact = table.action_values(0.9, untried=0.0)
+    drawn = table.sampled_values(0.9, 0.1, rng)
+    for state in range(4):
+        np.testing.assert_allclose(drawn[state], exact[state], atol=0.02)
+
+
+def test_what_was_never_tried_may_be_anything_that_was_seen() -> None:
+    table, rng = CountTable(2), np.random.default_rng(0)
+    assert table.sampled_values(0.9, 0.1, rng) == {}
+    table.add(0, 0, 1, 4.0, True)
+    table.add(1, 0, 0, -2.0, True)
+    untried = np.array([table.sampled_values(0.9, 0.1, rng)[0][1] for _ in range(400)])
+    assert set(untried.round(6)) == {4.0, -2.0}
+    assert (untried == pytest.approx(4.0)) is False and abs(np.mean(untried > 0) - 0.5) < 0.1
+
+
+def test_it_follows_one_model_to_the_end_of_an_episode() -> None:
+    learner = agent(read=read_macrostate, actions=2)
+    learner.observe(moved(0, 0, 1.0, 1, truncated=True), episode=0)
+    first = learner.values(at(0), explore=True)
+    learner.observe(moved(0, 1, 5.0, 1), episode=1)
+    assert np.array_equal(learner.values(at(0), explore=True), first), "news wait for the next episode"
+    learner.observe(moved(1, 1, 0.0, 0, truncated=True), episode=1)
+    assert not np.array_equal(learner.values(at(0), explore=True), first)
+
+
+def test_it_explores_deeply() -> None:
+    """A chain that pays at its far end alone; once it is known that something pays, whatever is untried may."""
+    length, episodes = 12, 60
+
+    def reached(seed: int, *, by_chance: bool) -> int:
+        learner, rng, found = agent(read=read_macrostate, actions=2, seed=seed), np.random.default_rng(seed), 0
+        learner.observe(moved(50, 0, 100.0, 51, truncated=True), episode=0)
+        for episode in range(episodes):
+            state = 0
+            for step in range(length):
+                action = int(rng.integers(2)) if by_chance else learner.act(at(state), explore=True)
+                then = state + 1 if action == state % 2 else 0
+                reward = 100.0 if then == length - 1 else -1.0
+                learner.observe(moved(state, action, reward, then, truncated=step == length - 1), episode=episode)
+                found, state = found + (then == length - 1), then
+        return found
+
+    assert np.mean([reached(seed, by_chance=False) for seed in range(4)]) > 10
+    assert np.mean([reached(seed, by_chance=True) for seed in range(4)]) < 1
+
+
+def test_it_learns_the_tiny_world_and_ends_greedy() -> None:
+    learner = agent()
+    live(learner, 300)
+    assert fake_codes.success(learner) == 1.0  # type: ignore[arg-type]
+
+
+def test_a_restored_agent_goes_on_bit_for_bit() -> None:
+    learner, other = agent(), agent(seed=5)
+    other.restore(learner.state())
+    saved = goes_on(learner, other, live, 62)
+    assert saved.values["drawn"], "it was taken in the midst of an episode"
+
+
+def test_tests_change_nothing() -> None:
+    learner = agent()
+    live(learner, 30)
+    before = learner.state()
+    for code in fake_codes.starts():
+        learner.act(Observation(frame=fake_codes.frame(code)), explore=False)
+    assert same(before, learner.state())

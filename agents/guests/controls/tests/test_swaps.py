@@ -1,0 +1,122 @@
+"""Swapped parts: every swap is a transition that the world has, unknown outcomes stay real, snapshots."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import fake_codes
+import numpy as np
+import pytest
+import torch
+from agent_states import goes_on
+from fake_codes import SIZES
+from imagine_bench.agents.encoders.perception import Perception
+from imagine_bench.agents.replay import Batch
+from imagine_bench_controls import swaps
+from imagine_bench_controls.settings import SWAPPING
+from imagine_bench_controls.swaps import SwappingDQN
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, Observation
+from imagine_bench.seeding import SeedTree
+
+CPU = torch.device("cpu")
+
+
+class FakeCodes(fake_codes.FakeCodes):
+    latent_size = sum(SIZES)
+
+
+def agent(seed: int = 0, **overrides: Any) -> SwappingDQN:
+    settings = SWAPPING.resolve("fast", {"controller.hidden": (16,), "controller.batch_size": 32, **overrides},
+                                "chapter_5")  # fmt: skip
+    return SwappingDQN(Perception(FakeCodes()), fake_codes.ACTIONS, settings, SeedTree(seed), CPU)  # type: ignore[arg-type]
+
+
+def live(learner: SwappingDQN, steps: int, seed: int = 1) -> list[tuple[tuple[int, ...], int]]:
+    """Train on the tiny world of wheels by chance; what was tried."""
+    rng, code, tried = np.random.default_rng(seed), fake_codes.starts()[0], []
+    for _ in range(steps):
+        action = int(rng.integers(fake_codes.ACTIONS))
+        learner.observe(fake_codes.transition(code, action), episode=0)
+        tried.append((code, action))
+        code, _, ended = fake_codes.step(code, action)
+        if ended:
+            code = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))]
+    return tried
+
+
+def read(latents: torch.Tensor) -> list[tuple[int, ...]]:
+    return [tuple(row) for row in FakeCodes().read_macrostate(latents).tolist()]
+
+
+def test_every_swap_is_as_the_world_has_it_and_some_are_new() -> None:
+    """The wheels turn alike whatever else there is, and outcomes are decided by the next code."""
+    learner = agent(**{"swaps.share": 1.0})
+    tried = set(live(learner, 60))
+    new = set()
+    for _ in range(20):
+        batch = learner.draw_batch(learner.real)
+        for before, action, after, reward, ended in zip(
+            read(batch.z), batch.action.tolist(), read(batch.next_z), batch.reward.tolist(), batch.terminated.tolist(),
+            strict=True,
+        ):  # fmt: skip
+            assert (after, reward, bool(ended)) == fake_codes.step(before, action)
+            new |= {(before, action)} - tried
+    assert new, "some pairs were never tried"
+    assert 0.0 < learner.diagnostics()["swaps/known"] <= 1.0
+
+
+def hot(*codes: tuple[int, ...]) -> torch.Tensor:
+    return FakeCodes().encode(np.stack([fake_codes.frame(code) for code in codes]))[0]
+
+
+def test_a_swap_by_hand() -> None:
+    """Action 0 turns the first wheel: the other factors come from elsewhere, where the outcome was seen once only."""
+    learner = agent()
+    learner.touched[0] = torch.tensor([True, False, False])
+    learner.outcomes = {(1, 0, 1): (10.0, 1.0), (1, 1, 0): swaps._UNSURE}
+    batch = Batch(hot(*[(0, 2, 0)] * 4), torch.zeros(4, dtype=torch.int64), torch.full((4,), -1.0),
+                  hot(*[(1, 2, 0)] * 4), torch.zeros(4))  # fmt: skip
+    found = learner.swapped(batch, hot((2, 0, 1), (2, 1, 0), (0, 0, 0)))
+    assert read(found.z) == [(0, 0, 1), (0, 2, 0), (0, 2, 0), (0, 2, 0)]
+    assert read(found.next_z) == [(1, 0, 1), (1, 2, 0), (1, 2, 0), (1, 2, 0)]
+    assert found.reward.tolist() == [10.0, -1.0, -1.0, -1.0] and found.terminated.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert read(batch.z) == [(0, 2, 0)] * 4, "the real batch is as it was"
+
+
+def test_an_outcome_that_differs_is_unknown_for_good() -> None:
+    learner, moved = agent(), fake_codes.transition((0, 1, 0), 0)
+    code = fake_codes.step((0, 1, 0), 0)[0]
+    learner.observe(moved, episode=0)
+    assert learner.outcomes[code] == (moved.reward, float(moved.terminated))
+    for reward in (moved.reward + 1.0, moved.reward):
+        learner.observe(type(moved)(observation=moved.observation, action=0, reward=reward,
+                                    next_observation=moved.next_observation, terminated=moved.terminated,
+                                    truncated=False), episode=0)  # fmt: skip
+        assert learner.outcomes[code] == swaps._UNSURE
+
+
+def test_no_share_is_the_dqn() -> None:
+    learner = agent(**{"swaps.share": 0.0})
+    live(learner, 30)
+    codes = {(row, action) for row, action in live(learner, 30, seed=1)}
+    batch = learner.draw_batch(learner.real)
+    assert set(zip(read(batch.z), batch.action.tolist(), strict=True)) <= codes
+
+
+def test_a_restored_agent_goes_on_bit_for_bit() -> None:
+    learner, other = agent(), agent(seed=5)
+    goes_on(learner, other, live, 40)
+    assert other.outcomes == learner.outcomes
+    seen = Observation(frame=fake_codes.frame((0, 1, 0)))
+    assert learner.q_values(seen).tobytes() == other.q_values(seen).tobytes()
+
+
+def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = SimpleNamespace(encoder=SimpleNamespace(card=SimpleNamespace(code_sizes=())))
+    monkeypatch.setattr(swaps, "load_perception", lambda context: plain)
+    asked = AgentContext(n_actions=4, preprocessing="gray_strips", encoder=None, seeds=SeedTree(0))
+    with pytest.raises(InvalidValueError, match="swaps factors of codes"):
+        swaps.make(asked)

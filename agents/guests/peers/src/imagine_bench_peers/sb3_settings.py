@@ -1,0 +1,87 @@
+"""Settings of the agents from Stable-Baselines3: its own names, the same for every task and set of hyperparameters.
+
+Those that imagine have a world model too, with the settings of the suite's own agents that imagine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS as IMAGINATION
+from imagine_bench.agents.imagination.settings import Settings
+from imagine_bench.agents.settings import (
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    ROWS,
+    ConfigGroup,
+    Hyperparameters,
+    between,
+    setting,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SB3Settings:
+    """Keywords of ``stable_baselines3.DQN`` and ``sb3_contrib.QRDQN`` that differ from the library's own."""
+
+    learning_rate: float = setting(1e-3, POSITIVE)
+    buffer_size: int = setting(50_000, ROWS)  #: transitions of the replay buffer
+    learning_starts: int = setting(100, ROWS)  #: macro-actions before the first update, all of them random
+    batch_size: int = setting(32, COUNT)
+    gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
+    train_freq: int = setting(1, COUNT)  #: macro-actions between updates
+    gradient_steps: int = setting(4, COUNT)  #: updates then
+    target_update_interval: int = setting(250, ROWS)  #: macro-actions between copies of the network to its target
+    #: Macro-actions over which the probability of a random one falls linearly.
+    exploration_steps: int = setting(600, ROWS)
+    exploration_final_eps: float = setting(0.02, PROBABILITY)  #: where it ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOSettings:
+    """Keywords of ``stable_baselines3.PPO`` that differ from the library's own, chosen where the rules were imagined.
+
+    A reward of 50 makes large losses of the value: they weigh less, and gradients are clipped later.
+    """
+
+    learning_rate: float = setting(3e-3, POSITIVE)
+    n_steps: int = setting(128, between(2, 10_000))  #: macro-actions between updates
+    batch_size: int = setting(64, between(2, 10_000))
+    n_epochs: int = setting(10, COUNT)  #: how often each of them is learned from
+    gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
+    ent_coef: float = setting(0.5, NOT_NEGATIVE)  #: weight of the policy's entropy
+    vf_coef: float = setting(0.05, NOT_NEGATIVE)  #: weight of the value's loss
+    max_grad_norm: float = setting(5.0, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LibrarySettings:
+    """All settings of an agent from Stable-Baselines3, of which an algorithm reads its own section."""
+
+    sb3: SB3Settings = field(default_factory=SB3Settings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixSettings:
+    """How real and imagined experience mix."""
+
+    imagined_episodes: int = setting(4, between(0, 1000))  #: after each real episode, once imagination has begun
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginingSettings(LibrarySettings, Settings):
+    """Those with a world model; ``controller``, and how our own agents mix experience, are without effect."""
+
+    mix: MixSettings = field(default_factory=MixSettings)
+
+
+def _joined(group: ConfigGroup[Settings]) -> ConfigGroup[ImaginingSettings]:
+    own = {part.name: getattr(group.published, part.name) for part in fields(group.published)}
+    return ConfigGroup(ImaginingSettings(**own), group.sets)
+
+
+HYPERPARAMETERS = Hyperparameters.everywhere(LibrarySettings())
+IMAGINING = Hyperparameters({name: _joined(group) for name, group in IMAGINATION.groups.items()})

@@ -1,0 +1,146 @@
+"""DreamerV3 of sheeprl, an episode at a time: what it remembers, whose random numbers it takes, what it learns."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_runs import context
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import Observation, Transition
+
+pytest.importorskip("sheeprl")
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import torch
+    from imagine_bench.agents.encoders.encoder import Encoder, bundled_encoder
+    from imagine_bench_peers.dreamer import Dreamer, Sequences, make
+
+
+def learner(seed: int = 0, encoder: Path | None = None, **overrides: Any) -> Dreamer:
+    changes = {"n_actions": 3, "encoder": encoder, "hyperparameters": "minimal", "overrides": overrides}
+    return make(replace(context(seed), **changes))
+
+
+def seen(value: int) -> Observation:
+    return Observation(frame=np.full((64, 64, 3), value, dtype=np.uint8))
+
+
+def episode(agent: Dreamer, number: int, length: int = 3) -> list[int]:
+    """Rewards and frames count on; every second episode is terminated, the others are truncated."""
+    actions = []
+    agent.begin_episode()
+    for step in range(length):
+        last = step == length - 1
+        at = 10 * number + step
+        actions.append(agent.act(seen(at), explore=True))
+        transition = Transition(
+            observation=seen(at), action=actions[-1], reward=float(at + 1), next_observation=seen(at + 1),
+            terminated=last and number % 2 == 0, truncated=last and number % 2 == 1,
+        )  # fmt: skip
+        agent.observe(transition, episode=number)
+    return actions
+
+
+def test_rows_are_what_the_library_expects() -> None:
+    agent = learner(learning_starts=1000)
+    actions = episode(agent, 0) + episode(agent, 1, length=1)
+    rows = agent.state().arrays
+    assert rows["replay/rgb"][:, 0, 0, 0].tolist() == [0, 1, 2, 3, 10, 11], "each frame once, an episode's last too"
+    assert rows["replay/rewards"].ravel().tolist() == [0, 1, 2, 3, 0, 11], "a reward stands where it arrives"
+    assert rows["replay/is_first"].ravel().tolist() == [1, 0, 0, 0, 1, 0]
+    assert rows["replay/terminated"].ravel().tolist() == [0, 0, 0, 1, 0, 0]
+    assert rows["replay/truncated"].ravel().tolist() == [0, 0, 0, 0, 0, 1]
+    taken = [*actions[:3], None, actions[3], None]
+    assert [int(row.argmax()) if row.any() else None for row in rows["replay/actions"]] == taken
+
+
+def test_sequences_are_whole_and_begin_anywhere() -> None:
+    memory = Sequences(capacity=5)
+    for value in range(8):
+        memory.add({"n": np.array([value])})
+    drawn = memory.sample(200, 3, np.random.default_rng(0))["n"][..., 0]
+    assert drawn.shape == (3, 200) and (np.diff(drawn, axis=0) == 1).all()
+    assert set(drawn[0].tolist()) == {3, 4, 5}, "the oldest are forgotten, the newest are reached"
+    assert memory.sample(2, 9, np.random.default_rng(0))["n"].shape == (5, 2, 1), "as many as there are"
+
+
+def test_it_sees_latents_where_there_is_an_encoder() -> None:
+    file = bundled_encoder("arrow_puzzle-clean")
+    agent = learner(encoder=file, learning_starts=2)
+    episode(agent, 0)
+    rows = agent.state().arrays
+    assert "replay/rgb" not in rows and not any("conv" in name for name in rows)
+    wanted = Encoder.load(file).latents(seen(2).frame)
+    assert np.array_equal(rows["replay/latents"][2], wanted) and agent.updates == 1
+    twin = learner(seed=1, encoder=file, learning_starts=2)
+    twin.restore(agent.state())
+    assert episode(agent, 1) == episode(twin, 1)
+
+
+def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
+    agent = learner(learning_starts=2, replay_ratio=1.0)
+    before = torch.get_rng_state()
+    episode(agent, 0)
+    state = agent.state()
+    acted = []
+    for _ in range(2):
+        agent.begin_episode()
+        acted.append([agent.act(seen(value), explore=False) for value in (5, 200, 90)])
+    after = agent.state()
+    assert acted[0] == acted[1]
+    assert all(np.array_equal(state.arrays[name], after.arrays[name]) for name in state.arrays)
+    assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_distributions_of_others_are_validated_as_before(validated: bool) -> None:
+    agent, default = learner(), torch.distributions.Distribution._validate_args
+    torch.distributions.Distribution.set_default_validate_args(validated)
+    try:
+        episode(agent, 0)
+        assert torch.distributions.Distribution._validate_args is validated
+    finally:
+        torch.distributions.Distribution.set_default_validate_args(default)
+
+
+def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
+    agent = learner()
+    agent.begin_episode()
+    agent.act(seen(0), explore=False)
+    fresh = agent._player.recurrent_state.clone()
+    agent.act(seen(0), explore=False)
+    assert not torch.equal(fresh, agent._player.recurrent_state)
+    agent.begin_episode()
+    agent.act(seen(0), explore=False)
+    assert torch.equal(fresh, agent._player.recurrent_state)
+
+
+def test_restored_it_goes_on_to_the_bit() -> None:
+    agent = learner(learning_starts=4, replay_ratio=0.7)
+    for number in range(3):
+        episode(agent, number)
+    state = agent.state()
+    twin = learner(seed=1, learning_starts=4, replay_ratio=0.7)
+    twin.restore(state)
+    assert [episode(agent, n) for n in (3, 4)] == [episode(twin, n) for n in (3, 4)]
+    ours, theirs = agent.state(), twin.state()
+    assert agent.updates == twin.updates == 8
+    assert all(np.array_equal(ours.arrays[name], theirs.arrays[name]) for name in ours.arrays)
+    with pytest.raises(ArtefactError, match="replay_ratio"):
+        learner().restore(state)
+
+
+def test_its_model_learns_what_it_is_shown() -> None:
+    agent = learner(learning_starts=30, model_learning_rate=3e-3, replay_ratio=2.0)
+    losses = []
+    for number in range(30):
+        episode(agent, number % 2)
+        losses.append(agent.diagnostics().get("loss/world_model"))
+    first, *_, last = [loss for loss in losses if loss is not None]
+    assert last < 0.5 * first

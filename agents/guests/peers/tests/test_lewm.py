@@ -1,0 +1,153 @@
+"""LeWM of torch-world: where it plans to, what it remembers, whose random numbers it takes, what it learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_runs import context
+
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import Observation, Transition
+
+pytest.importorskip("torch_world")
+import torch
+from imagine_bench_peers.lewm import LeWMPlanner, make
+
+PLACES = 4  # a white quarter of the frame, at one of four places on a ring
+GOAL = 2
+
+
+def learner(seed: int = 0, **overrides: Any) -> LeWMPlanner:
+    return make(replace(context(seed), n_actions=3, hyperparameters="minimal", overrides=overrides))
+
+
+def seen(place: int) -> Observation:
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    y, x = ((0, 0), (0, 32), (32, 32), (32, 0))[place]
+    frame[y : y + 32, x : x + 32] = 255
+    return Observation(frame=frame)
+
+
+def moved(place: int, action: int) -> int:
+    """One back, stay, one on."""
+    return (place + action - 1) % PLACES
+
+
+def practise(agent: LeWMPlanner, steps: int) -> list[int]:
+    """Episodes of one transition from each place in turn, paid where they end at the goal."""
+    actions = []
+    for step in range(steps):
+        place = step % PLACES
+        actions.append(agent.act(seen(place), explore=True))
+        following = moved(place, actions[-1])
+        agent.observe(
+            Transition(
+                observation=seen(place), action=actions[-1], reward=float(following == GOAL),
+                next_observation=seen(following), terminated=True, truncated=False,
+            ),
+            episode=step,
+        )  # fmt: skip
+    return actions
+
+
+class Exact(torch.nn.Module):
+    """The ring as it is: places are angles."""
+
+    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
+        quarters = pixels[:, 0, 0, ::32, ::32].flatten(1)[:, [0, 1, 3, 2]]
+        return self._angles(quarters.argmax(dim=1)).unsqueeze(1)
+
+    def rollout(self, z: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        places = [(torch.atan2(z[:, 0, 1], z[:, 0, 0]) / (torch.pi / 2)).round()]
+        for taken in actions.argmax(dim=2).unbind(1):
+            places.append(places[-1] + taken - 1)
+        return torch.stack([self._angles(place) for place in places], dim=1)
+
+    def _angles(self, places: torch.Tensor) -> torch.Tensor:
+        angles = places * torch.pi / 2
+        return torch.stack([angles.cos(), angles.sin()], dim=-1)
+
+
+def test_goals_are_the_frames_that_earned_most() -> None:
+    agent = learner(goals=2)
+    for reward, place in ((-1.0, 0), (3.0, 1), (2.0, 0), (3.0, 2), (3.0, 3)):
+        agent.observe(
+            Transition(observation=seen(0), action=0, reward=reward, next_observation=seen(place),
+                       terminated=True, truncated=False),
+            episode=0,
+        )  # fmt: skip
+    goals = agent.state().arrays["replay/goals"]
+    assert np.array_equal(goals, [seen(2).frame, seen(3).frame]), "the latest two of those that earned 3"
+
+
+def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
+    agent = learner(horizon=3, learning_starts=100)
+    agent._model, agent._goals = Exact(), [seen(GOAL).frame]
+    assert agent.act(seen(GOAL - 1), explore=False) == 2
+    assert agent.act(seen(GOAL + 1), explore=False) == 0
+    two_away = agent.act(seen(0), explore=False)
+    assert two_away in {0, 2} and agent.act(seen(moved(0, two_away)), explore=False) == two_away
+    agent._goals, agent._aims = [seen(0).frame, seen(3).frame], None
+    assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
+
+
+def test_it_learns_to_reach_a_goal_from_everywhere() -> None:
+    agent = learner(replay_ratio=4.0, learning_rate=3e-3, batch_size=32)
+    assert [agent.act(seen(place), explore=False) for place in range(PLACES)] == [0] * PLACES, "without a goal, 0"
+    practise(agent, 100)
+    reached = []
+    for start in range(PLACES):
+        place = start
+        for _ in range(2):
+            place = moved(place, agent.act(seen(place), explore=False)) if place != GOAL else place
+        reached.append(place)
+    assert reached == [GOAL] * PLACES, "at random 4 of 9 from the opposite place, 1 of 9 there in two steps"
+    assert agent.updates == 4 * 97
+
+
+def test_restored_it_goes_on_to_the_bit_and_the_global_generator_is_left_alone() -> None:
+    before = torch.get_rng_state()
+    agent = learner(replay_ratio=0.7)
+    practise(agent, 10)
+    state = agent.state()
+    twin = learner(seed=1, replay_ratio=0.7)
+    twin.restore(state)
+    taken_up = twin.state().arrays
+    assert all(np.array_equal(taken_up[name], state.arrays[name]) for name in state.arrays)
+    assert practise(agent, 12) == practise(twin, 12) and agent.updates == twin.updates == 13
+    ours, theirs = agent.state(), twin.state()
+    assert all(np.array_equal(ours.arrays[name], theirs.arrays[name]) for name in ours.arrays)
+    assert not all(np.array_equal(ours.arrays[name], state.arrays[name]) for name in state.arrays)
+    assert torch.equal(before, torch.get_rng_state())
+    with pytest.raises(ArtefactError, match="replay_ratio"):
+        learner().restore(state)
+
+
+def test_tests_change_nothing() -> None:
+    agent = learner()
+    practise(agent, 8)
+    state = agent.state()
+    acted = [[agent.act(seen(place), explore=False) for place in range(PLACES)] for _ in range(2)]
+    after = agent.state()
+    assert acted[0] == acted[1] and after.values == state.values
+    assert all(np.array_equal(state.arrays[name], after.arrays[name]) for name in state.arrays)
+
+
+@pytest.mark.parametrize("wrong", [{"model.patch": 7}, {"model.embedding": 22}])
+def test_sizes_that_do_not_fit_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValueError, match=r"patch is .* must divide 64.* multiple of 4 times .*, 12"):
+        learner(**wrong)
+
+
+@pytest.mark.parametrize("replay_ratio", [0.0, 1.0])
+def test_plans_follow_new_goals_and_a_changed_model(replay_ratio: float) -> None:
+    agent = learner(replay_ratio=replay_ratio)
+    for seen_so_far in (12, 6, 1):
+        practise(agent, seen_so_far)
+        agent.act(seen(0), explore=False)
+        with torch.no_grad():
+            now = agent._model.encode(agent._pixels(agent._goals))[:, 0]
+        assert agent._aims is not None and torch.equal(agent._aims, now)

@@ -1,0 +1,210 @@
+"""Agents from Stable-Baselines3: they learn, the same each time, from the starts that every agent of a seed meets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from small_runs import measured, small
+
+import imagine_bench  # noqa: F401 - registers the environments
+from imagine_bench import registry
+from imagine_bench.cli.observers import run_observed
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces.capabilities import ExternalTrainer
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.running import phases
+from imagine_bench.running.bench import plan
+from imagine_bench.running.evaluation import TrainingStarts
+from imagine_bench.seeding import episode_seed
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.results import RunResult
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+LATENTS = "sb3_dqn_latents"
+FEW: dict[str, Any] = {
+    "sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 8, "ppo.batch_size": 4,
+    "imagination.start_episode": 3, "mix.imagined_episodes": 2,
+}  # fmt: skip
+IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
+
+
+def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> RunResult:
+    own = tuple(sorted(registry.own_settings(agent, FEW).items()))
+    few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": own}
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
+    result = run_observed(spec, folder, lambda progress: None)
+    assert result is not None
+    return result
+
+
+@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])
+def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
+    result = do(tmp_path / "run", agent)
+    first, last = result.checkpoints
+    assert [row.env_steps for row in result.checkpoints] == [
+        result.training_length[:6].sum(),
+        result.training_length.sum(),
+    ]
+    assert result.training_length.shape == (12,) and result.training_length.max() <= 10
+    assert (first.test_episodes, last.test_episodes) == (4, 4)
+    if "ppo" not in agent:
+        assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
+    if agent == "sb3_ppo_latents":  # ten epochs of two batches for each 8 macro-actions
+        assert last.diagnostics["gradient_updates"] == 20 * ((last.env_steps - 1) // 8) > 0
+    if agent in IMAGINING:
+        assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [first.env_steps, last.env_steps]
+        assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
+
+
+def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
+    """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
+    eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
+    short = do(tmp_path / "short", budgets=(6,), overrides=eighty)
+    longer = do(tmp_path / "longer", overrides=eighty)
+    first, same = short.checkpoints[0], longer.checkpoints[0]
+    assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
+
+
+def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    do(tmp_path / "run")
+    assert not list(temporary.iterdir())
+
+
+@pytest.mark.parametrize("agent", [LATENTS, *(pytest.param(name, marks=pytest.mark.slow) for name in IMAGINING)])
+def test_the_same_seed_learns_the_same_even_after_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str
+) -> None:
+    whole = do(tmp_path / "whole", agent)
+
+    def killed(*arguments: Any, **names: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(run_folder, "finish", killed)
+        do(tmp_path / "run", agent)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(phases, "play_test_episode", killed)
+        do(tmp_path / "run", agent)
+    assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
+    again = do(tmp_path / "run", agent)
+    assert measured(whole) == measured(again)
+    assert whole.training_length.tolist() == again.training_length.tolist()
+    assert whole.training_success.tolist() == again.training_success.tolist()
+    other = do(tmp_path / "other", agent, seed=1)
+    assert whole.training_length.tolist() != other.training_length.tolist()
+
+
+def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
+    for name, entry in registry.agents().items():
+        if entry.settings.startswith("imagine_bench_peers.sb3_settings:"):
+            agent = registry.make_agent(name, spec(name).context())
+            assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
+        else:
+            assert not entry.external_training_loop
+
+
+def test_a_world_model_counts_in_steps_and_updates() -> None:
+    agent = registry.make_agent(IMAGINING[0], spec(IMAGINING[0]).context())
+    assert agent._steps_an_episode(10) == 10 + 4 * 3, "four imagined episodes of depth three"  # type: ignore[attr-defined]
+    agent._learner.updates = 7  # type: ignore[attr-defined]
+    assert agent.diagnostics()["gradient_updates"] == 7.0
+
+
+def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
+    entry = registry.task_entry("arrow_puzzle")
+    with_starts = TrainingStarts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
+    plain = gymnasium.make(entry.env_id, execution="kinematic")
+    for episode in range(4):
+        frame, _ = with_starts.reset(seed=99)  # a loop may ask for another
+        expected, _ = plain.reset(seed=episode_seed("training", 3, episode))
+        assert np.array_equal(frame, expected)
+    with_starts.close()
+    plain.close()
+
+
+def test_latents_are_those_of_our_own_agents() -> None:
+    from imagine_bench.agents.encoders.encoder import Encoder
+    from imagine_bench.agents.encoders.latent_observation import LatentObservation
+
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    wrapped = LatentObservation(env, "arrow_puzzle-clean")
+    latents, _ = wrapped.reset(seed=5)
+    frame, _ = env.reset(seed=5)
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    assert np.array_equal(latents, Encoder.load(path).encode(frame[None])[0][0].numpy())
+    assert latents.shape == wrapped.observation_space.shape and latents.dtype == np.float32
+    assert wrapped.observation_space.contains(wrapped.step(0)[0])
+    wrapped.close()
+
+
+def test_latents_of_another_task_or_of_no_name_are_refused() -> None:
+    from imagine_bench.agents.encoders.latent_observation import LatentObservation
+
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
+    with pytest.raises(InvalidValueError, match=r"pick_place reads frames as 'small_rgb', this .* 'gray_strips'"):
+        LatentObservation(env, "pick_place-clean")
+    with pytest.raises(UnknownNameError, match=r"No encoder 'arrow_puzle-clean'\. Did you mean 'arrow_puzzle-clean'"):
+        LatentObservation(env, "arrow_puzle-clean")
+    env.close()
+
+
+def test_it_is_never_taken_up_again_half_way() -> None:
+    agent = registry.make_agent("sb3_dqn", spec("sb3_dqn").context())
+    with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):
+        agent.restore(AgentState(arrays={}, values={}))
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from imagine_bench_peers import sb3
+
+    present = sb3.importlib.import_module
+
+    def missing(name: str) -> Any:
+        if name == "sb3_contrib":
+            raise ImportError(f"No module named {name!r}")
+        return present(name)
+
+    context = spec("sb3_qrdqn").context()
+    monkeypatch.setattr(sb3.importlib, "import_module", missing)
+    sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
+    with pytest.raises(SetupError, match=sentence):
+        sb3.make_qrdqn(context)
+    with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
+        plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "words"),
+    [
+        ({"sb3.gamma": 1.5}, InvalidValueError, r"sb3\.gamma is 1\.5; it must lie in \[0, 1\]"),
+        ({"sb3.learning_rate": 0.0}, InvalidValueError, r"sb3\.learning_rate is 0\.0; it must be above 0"),
+        ({"sb3.batch_size": 0}, InvalidValueError, r"sb3\.batch_size is 0; it must lie in"),
+        ({"sb3.tau": 0.1}, UnknownNameError, "No setting 'sb3.tau'"),
+    ],
+)
+def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        registry.load("imagine_bench_peers.sb3_settings:HYPERPARAMETERS").resolve("fast", overrides, "chapter_5")
+
+
+def spec(agent: str) -> RunSpec:
+    path = encoders.resolve(registry.task("arrow_puzzle"), "clean") if registry.agents()[agent].needs_encoder else None
+    return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=path)
+
+
+@pytest.mark.slow
+def test_it_learns_far_above_chance(tmp_path: Path) -> None:
+    result = do(tmp_path / "run", budgets=(1500,), evaluation_episodes=100, overrides=())
+    chance = registry.task("arrow_puzzle").facts().chance_level
+    assert result.checkpoints[-1].success_rate > 10 * chance

@@ -1,1 +1,0 @@
-"""Agents of Stable-Baselines3, trained by the library's own loop."""

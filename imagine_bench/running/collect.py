@@ -1,0 +1,190 @@
+"""Collecting a dataset: a policy plays episodes of a task, on starts that no run is trained or tested on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from imagine_bench import registry, statistics
+from imagine_bench.appearance import appearance_name
+from imagine_bench.data.folder import Apart, Dataset, read_apart
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.exact.beliefs import optimal_policy_of
+from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, Observation, TaskSpec
+from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.interfaces.episodes import Episodes, joined
+from imagine_bench.registry.machine import describe_environment
+from imagine_bench.rules import states_of
+from imagine_bench.running.trained import load_trained
+from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
+
+POLICIES = {
+    "random": "every macro-action by chance",
+    "uniform": "one random macro-action from a macrostate drawn uniformly, then cut off",
+    "oracle": "optimal macro-actions by the rules",
+    "mixed": "random and oracle, an episode each in turn",
+}
+MOST_EPISODES = 100_000
+"""More would not fit into memory at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """Who plays, and how."""
+
+    name: str  #: One of :data:`POLICIES`, or the agent's
+    players: Sequence[tuple[Agent, bool]]  #: Play an episode each in turn; whether each is shown macrostates
+    facts: Mapping[str, Any]  #: More for the card
+
+
+def policy_of(name: str, spec: TaskSpec, seed: int, encoder: str | None = None) -> Policy:
+    """One of :data:`POLICIES`, or the agent of a run's folder, which acts greedily.
+
+    Raises:
+        UnknownNameError: Neither of them.
+        InvalidValueError: The run is of another task.
+        ArtefactError: It cannot be taken up again.
+    """
+    if name not in POLICIES:
+        if not Path(name).is_dir():
+            raise UnknownNameError("policy", name, (*POLICIES, "or a run's folder such as runs/.../dqn/seed_0"))
+        trained = load_trained(Path(name), encoder=encoder)
+        run = trained.spec
+        if trained.task.id != spec.id:
+            raise InvalidValueError(f"{name} learned {trained.task.id}, not {spec.id}; give a run of {spec.id}.")
+        played = f"greedy after {trained.episodes:,} episodes of seed {run.seed}"
+        players = [(trained.agent, registry.agent_entry(run.agent).privileged)]
+        return Policy(name=run.agent, players=players, facts={"played": played, "protocol_hash": run.protocol.hash})
+    names = {"oracle": (registry.DEMONSTRATOR,), "mixed": ("random", registry.DEMONSTRATOR)}.get(name, ("random",))
+    context = AgentContext(
+        n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=None,
+        seeds=SeedTree(seed).child("dataset", "agent"), optimal_policy=optimal_policy_of(spec),
+    )  # fmt: skip
+    players = [(registry.make_agent(each, context), registry.agent_entry(each).privileged) for each in names]
+    return Policy(name=name, players=players, facts={"played": POLICIES[name]})
+
+
+def collect(
+    spec: TaskSpec, policy: Policy, *, episodes: int, seed: int, execution: str, appearance: str, motion_hz: float = 0.0
+) -> tuple[Episodes, Apart, dict[str, Any]]:
+    """Play episodes of a task.
+
+    Returns:
+        The episodes; apart from them ``privileged`` (``macrostates`` (N + E, M), ``seeds`` (E,)) and, at a rate above
+        0, ``arm`` (the arrays of every macro-action's :class:`.ArmMotion` one behind another, and ``samples`` (N,), how
+        many each has); and the card.
+
+    Raises:
+        InvalidValueError: A number of episodes, a seed or a rate out of range, or no arm whose motion can be read.
+        UnknownNameError: An unknown execution or appearance.
+    """
+    if not 1 <= episodes <= MOST_EPISODES or not 0 <= seed < SEEDS:
+        allowed = f"1 to {MOST_EPISODES:,} episodes and a seed from 0 to {SEEDS - 1}"
+        raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
+    starts = SeedTree(seed).child("dataset", "starts").generator()
+    open_states = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
+    seeds = [episode_seed("dataset", seed, index) for index in range(episodes)]
+    parts, motion = [], list[ArmMotion]()
+    env_id = registry.task_entry(spec.id).env_id
+    with closing(gymnasium.make(env_id, execution=execution, appearance=appearance)) as env:
+        watch = _watching(env, motion_hz, motion)
+        for index in tqdm(range(episodes), desc=f"{spec.id} {policy.name}", unit="episode", disable=None):
+            options = None
+            if policy.name == "uniform":
+                options = {"macrostate": open_states[int(starts.integers(len(open_states)))]}
+            parts.append(_episode(env, policy.players[index % len(policy.players)], seeds[index], options, watch))
+    played = joined(parts)
+    macrostates = np.concatenate([part["macrostates"] for part in parts])
+    apart: dict[str, dict[str, NDArray[Any]]] = {"privileged": {"macrostates": macrostates, "seeds": np.array(seeds)}}
+    if motion:
+        names = [field.name for field in dataclasses.fields(ArmMotion)]
+        apart["arm"] = {name: np.concatenate([getattr(each, name) for each in motion]) for name in names}
+        apart["arm"]["samples"] = np.array([len(each.time_s) for each in motion])
+    made = {"seed": seed, "execution": execution, "appearance": appearance_name(appearance), "motion_hz": motion_hz}
+    return played, apart, {**_card(spec, policy, played), **made, "faults": sum(part["faults"] for part in parts)}
+
+
+def _watching(env: gymnasium.Env[Any, Any], motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
+    """What is to be done after each macro-action: nothing, or to add the arm's motion to what was seen of it."""
+    scene = env.unwrapped
+    if not motion_hz:
+        return lambda: None
+    if not isinstance(scene, ArmReader):
+        raise InvalidValueError(f"{env} has no arm whose motion can be read; leave --motion-hz out.")
+    scene.capture_motion_hz = motion_hz
+    return lambda: motion.append(scene.arm_motion())
+
+
+def _episode(
+    env: gymnasium.Env[Any, Any],
+    player: tuple[Agent, bool],
+    seed: int,
+    options: dict[str, Any] | None,
+    watch: Callable[[], None],
+) -> dict[str, Any]:
+    """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""
+    frame, info = env.reset(seed=seed, options=options)
+    begin_episode(player[0])
+    mask, faults, ended = np.ones(int(env.action_space.n), dtype=np.int8), 0, False  # type: ignore[attr-defined]
+    kept: dict[str, list[Any]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
+    seen: dict[str, list[Any]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
+    while True:
+        for each, value in zip(kept.values(), (frame, info.get("action_mask", mask), info["macrostate"]), strict=True):
+            each.append(np.asarray(value))
+        if ended:
+            return {**seen, **kept, "success": bool(info["is_success"]), "faults": faults}
+        action = player[0].act(Observation.of(frame, info, privileged=player[1]), explore=False)
+        frame, reward, terminated, truncated, info = env.step(action)
+        watch()
+        truncated = truncated or (options is not None and not terminated)
+        for each, value in zip(seen.values(), (action, float(reward), bool(terminated), bool(truncated)), strict=True):
+            each.append(value)
+        faults, ended = faults + bool(info["fault"]), terminated or truncated
+
+
+def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Any]:
+    """What a dataset is: task, policy, counts, success beside chance and optimum, and what made it."""
+    environment = describe_environment()
+    return {
+        "task": spec.id, "description": spec.description, "env_id": spec.env_id,
+        "action_names": list(spec.action_names), "macrostate_names": list(spec.macrostate_names),
+        "policy": policy.name, **policy.facts, "episodes": len(played), "transitions": len(played.actions),
+        "successes": int(played.success.sum()), "mean_return": float(played.rewards.sum()) / len(played),
+        **dataclasses.asdict(spec.facts()), **{name: environment[name] for name in ("commit", "command", "versions")},
+    }  # fmt: skip
+
+
+def describe(dataset: Dataset) -> str:
+    """A dataset in words, for a terminal. Raises ArtefactError: a file apart or the card is damaged."""
+    episodes, card = dataset.episodes, dataset.card
+    low, high = statistics.wilson(int(episodes.success.sum()), len(episodes))
+    lines = {
+        "episodes": f"{len(episodes):,} of {len(episodes.actions):,} transitions, as {dataset.format}",
+        "success": f"{episodes.success.mean():.1%} of episodes [{low:.1%}, {high:.1%}]",
+        "return": f"{episodes.rewards.sum() / len(episodes):.2f} an episode",
+        "card": "none: it is not of this suite, and nothing says whether it is whole",
+    }
+    if card is not None:
+        apart = [f"{name}.npz ({', '.join(arrays)})" for name, arrays in read_apart(dataset).items()]
+        lines = {
+            "task": f"{card['task']}, {card['execution']} execution, appearance {card['appearance']}",
+            "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
+            "episodes": lines["episodes"],
+            "success": f"{lines['success']}; chance {card['chance_level']:.1%}, optimum {card['optimum']:.1%}",
+            "return": f"{lines['return']}; optimum {card['optimal_return']:.2f}",
+            "faults": f"{card['faults']} macro-actions whose physics disagreed with the rules",
+            "apart": f"{', '.join(apart)}: never given to a learner",
+            "commit": str(card["commit"]),
+            "command": str(card["command"]),
+        }
+    lines |= {"content": episodes.hash, "in a protocol": dataset.identity}
+    return "\n".join(f"{name:<14}{value}" for name, value in lines.items())

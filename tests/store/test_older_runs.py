@@ -1,0 +1,48 @@
+"""A bench that commit abcb05c began is read, and finished to the same bits.
+
+``of_abcb05c/whole`` is a finished bench; ``of_abcb05c/killed`` an equal one, killed within its second test.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from small_runs import Inline, final_arrays, same_but_for_time, small
+
+from imagine_bench.running.bench import bench
+from imagine_bench.running.task_types import load_bench, read_protocol
+from imagine_bench.store.bench_folder import bench_folder
+from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.results import BenchResult
+
+OLDER = Path(__file__).parent / "of_abcb05c"
+
+
+def test_a_finished_bench_is_read(tmp_path: Path) -> None:
+    shutil.copytree(OLDER / "whole", tmp_path / "whole")
+    result = load_bench(tmp_path / "whole")
+    assert isinstance(result, BenchResult)
+    (run,) = result.runs
+    assert [row.solved for row in run.checkpoints] == ["00000", "00000"]
+    assert run.checkpoints[1].kept is not None and run.checkpoints[1].beliefs is not None
+    assert run.training_starts is not None and run.training_starts.shape == (9, 4)
+
+
+def test_a_killed_bench_is_read_and_ends_in_the_bits_of_a_whole_one(tmp_path: Path) -> None:
+    protocol = read_protocol(OLDER / "whole")
+    assert protocol == small() and protocol.hash == "c12d19f8f687"
+    folder = bench_folder(tmp_path, protocol)
+    shutil.copytree(OLDER / "killed", folder)
+    assert load_so_far(folder).protocol.budgets == (4,)
+    result = bench(small(), {}, root=tmp_path, launcher=Inline())
+    assert isinstance(result, BenchResult)
+    shutil.copytree(OLDER / "whole", tmp_path / "whole")
+    whole = load_bench(tmp_path / "whole")
+    assert isinstance(whole, BenchResult)
+    assert same_but_for_time(result.runs[0], whole.runs[0])
+    ours = final_arrays(result.runs[0].folder)
+    theirs = final_arrays(whole.runs[0].folder)
+    assert ours.keys() == theirs.keys()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
