@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,15 @@ class OptionRow:
     without: Changes = field(default_factory=dict)  #: What the bench that it is compared with has
     world: str = ""  #: An option of the task's world, ``key=value``, in place of a field
     episodes: int = 2  #: Training episodes of either run
+    #: Whether it acts through what the agent is shown: an agent may learn the same from it, as it should of light.
+    shown: bool = False
+
+
+class _Left(NamedTuple):
+    """What a run left, as digests."""
+
+    shown: str
+    learned: str
 
 
 _TASK = "the task that is checked"
@@ -67,17 +76,18 @@ OPTION_ROWS: Mapping[str, OptionRow] = {
         episodes=6,
     ),
     "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
-    "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}),
+    "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}, shown=True),
     "physics": OptionRow(
         fields=("physics", "execution"),
         without={"execution": "physics"},
         changes={"execution": "physics", "physics": (("plan_error_mm", 10.0),)},
+        shown=True,
     ),
-    "observation": OptionRow(fields=("observation",), changes={"observation": "human"}),
-    "observation size": OptionRow(fields=("observation_size",), changes={"observation_size": 96}),
-    "appearance": OptionRow(fields=("appearance",), changes={"appearance": "mild"}),
-    "gesture": OptionRow(fields=(), changes={}, world="gesture=0.5"),
-    "lag": OptionRow(fields=(), changes={}, world="lag=1"),
+    "observation": OptionRow(fields=("observation",), changes={"observation": "human"}, shown=True),
+    "observation size": OptionRow(fields=("observation_size",), changes={"observation_size": 96}, shown=True),
+    "appearance": OptionRow(fields=("appearance",), changes={"appearance": "mild"}, shown=True),
+    "gesture": OptionRow(fields=(), changes={}, world="gesture=0.5", shown=True),
+    "lag": OptionRow(fields=(), changes={}, world="lag=1", shown=True),
 }
 """The options, by what the contract calls them."""
 
@@ -128,7 +138,8 @@ class CheckedOptions:
             changed = self.run(self._task_of(row), tuple(self._given(row).items()), row.episodes)
         except ImagineBenchError as refusal:
             raise NotOffered(f"it is refused: {refusal}") from refusal
-        require(base != changed, f"{option} changes nothing that {self.agent} does, earns or learns")
+        effect = base != changed if row.shown else base.learned != changed.learned
+        require(effect, f"{option} changes nothing that {self.agent} does, earns or learns")
 
     def _given(self, row: OptionRow) -> Changes:
         if "dataset" in row.changes:
@@ -150,7 +161,7 @@ class CheckedOptions:
             raise NotOffered(f"{base} has no such option")
         return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
 
-    def _run(self, task: str, changes: tuple[tuple[str, Any], ...], episodes: int) -> str:
+    def _run(self, task: str, changes: tuple[tuple[str, Any], ...], episodes: int) -> _Left:
         """What some episodes of training, or of tests for one that learns nothing, left: a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(
@@ -188,13 +199,12 @@ def _silent(progress: Progress) -> None:
     del progress
 
 
-def _carried_out(run: Run) -> str:
+def _carried_out(run: Run) -> _Left:
     """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
-    external = run.entry.external_training_loop
-    watched = _WatchedAgent(run.agent, sees=external or run.entry.privileged or not run.entry.learns)
+    watched = _WatchedAgent(run.agent)
     if isinstance(run.agent, ExternalTrainer):
         phases.train_externally(run, run.agent, lambda budget: None)
-    if external:  # a library may learn nothing from so little: what counts is what it is shown
+    if run.entry.external_training_loop:
         run.agent = watched
         phases.test(run)
     elif run.entry.learns:
@@ -206,15 +216,15 @@ def _carried_out(run: Run) -> str:
     else:
         run.agent = watched
         phases.test(run)
-    return watched.digest(run.counters)
+    return watched.left(run.counters)
 
 
 class _WatchedAgent:
     """An agent, what it did and was rewarded with, and how often it was told that an episode begins."""
 
-    def __init__(self, agent: Agent, *, sees: bool) -> None:
+    def __init__(self, agent: Agent) -> None:
         self._agent = agent
-        self._sees = sees
+        self._shown = hashlib.sha256()
         self._lived = hashlib.sha256()
         self.begun = 0
 
@@ -228,11 +238,10 @@ class _WatchedAgent:
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act as the agent does."""
-        if self._sees:
-            for part in (observation.frame, observation.macrostate):
-                self._lived.update(np.asarray(part).tobytes() if part is not None else b"")
-            for name in sorted(observation.more):
-                self._lived.update(observation.more[name].tobytes())
+        for part in (observation.frame, observation.macrostate):
+            self._shown.update(np.asarray(part).tobytes() if part is not None else b"")
+        for name in sorted(observation.more):
+            self._shown.update(observation.more[name].tobytes())
         action = self._agent.act(observation, explore=explore)
         self._lived.update(str(action).encode())
         return action
@@ -254,14 +263,14 @@ class _WatchedAgent:
         """As the agent."""
         self._agent.restore(state)
 
-    def digest(self, counters: Counters) -> str:
-        """A digest of actions, rewards and learned arrays; times are in none of them."""
+    def left(self, counters: Counters) -> _Left:
+        """Digests of what it was shown, and of actions, rewards and learned arrays; times are in none of them."""
         found = self._lived.copy()
         for arrays in (self._agent.state().arrays, counters.training()):
             for name in sorted(arrays):
                 found.update(f"{name} {arrays[name].shape}".encode())
                 found.update(arrays[name].tobytes())
-        return found.hexdigest()
+        return _Left(self._shown.hexdigest(), found.hexdigest())
 
 
 @functools.cache
