@@ -37,7 +37,7 @@ ARROWS: dict[str, set[str]] = {
     "studies": {*_DATA, "running", "judge", "statistics"},
     "suite": {*_DATA, "running", "statistics"},
     "report": {*_DATA, "exact", "running", "judge", "studies", "suite", "statistics", "reference"},
-    "regression": {*_DATA, "judge", "report", "statistics", "reference"},
+    "regression": {*_DATA, "judge", "recording", "report", "statistics", "reference"},
     "adapters": {"registry", "store"},
     "tools": {"registry", "exact", "store", "statistics", "running", "data"},
     "testing": {*_DATA, "running", "exact", "data", "judge"},
