@@ -322,7 +322,8 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     for other in earlier:
         task_entry(other)
         for fact in ("encoder", "preprocessing", "action_names"):
-            here, there = getattr(task(name), fact), getattr(task(other), fact)
+            here = getattr(task(name), fact)
+            there = getattr(task(other), fact)
             if here != there:
                 raise InvalidValueError(
                     f"{name} cannot come after {other}: what is known of one world is of no use in another ({fact} is "

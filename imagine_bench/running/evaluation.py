@@ -25,7 +25,8 @@ class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
 
     def __init__(self, env: Env, name: str) -> None:
         super().__init__(env)
-        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+        self._name = name
+        self.observation_space = gymnasium.spaces.Dict({name: env.observation_space})
 
     def observation(self, observation: Any) -> dict[str, Any]:
         """See above."""
@@ -49,7 +50,8 @@ def play(
     frame, info = env.reset(seed=seed)
     _require_sound(env, frame, 0.0)
     begin_episode(agent)
-    before, over = Observation.of(frame, info, privileged=privileged), False
+    before = Observation.of(frame, info, privileged=privileged)
+    over = False
     while not over:
         if before_acting is not None:
             before_acting(before, info)
@@ -62,7 +64,8 @@ def play(
             terminated=bool(terminated), truncated=bool(truncated),
         )  # fmt: skip
         yield transition, info
-        before, over = after, terminated or truncated
+        before = after
+        over = terminated or truncated
 
 
 def _require_sound(env: Env, seen: Any, reward: Any) -> None:
@@ -70,7 +73,8 @@ def _require_sound(env: Env, seen: Any, reward: Any) -> None:
     space = env.observation_space
     named = isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, Mapping)
     for name, wanted in space.spaces.items() if named else [("frame", space)]:  # type: ignore[attr-defined]
-        part, more = seen.get(name) if named else seen, "'imagine-bench check --task' finds such faults."
+        part = seen.get(name) if named else seen
+        more = "'imagine-bench check --task' finds such faults."
         if isinstance(wanted, gymnasium.spaces.Box):
             given = (getattr(part, "shape", None), getattr(part, "dtype", type(part)))
             if given != (wanted.shape, wanted.dtype):
@@ -86,7 +90,8 @@ def _require_sound(env: Env, seen: Any, reward: Any) -> None:
 
 def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
     """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-    start_s, begun = time.process_time(), list[Played]()
+    start_s = time.process_time()
+    begun = list[Played]()
 
     def begin(observation: Observation, info: Info) -> None:
         if not begun:
@@ -102,7 +107,8 @@ def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privi
 def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
     """Play the macro-actions of an episode again, as far as it goes, and whether it ends with the last of them."""
     _, info = env.reset(seed=seed)
-    played, over = Played.begun(env, info), False
+    played = Played.begun(env, info)
+    over = False
     for action in actions:
         if over or action not in env.action_space:
             return played, False
@@ -117,7 +123,8 @@ class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: Env, counters: Counters) -> None:
         super().__init__(env)
-        self._counters, self._at = counters, list[int]()
+        self._counters = counters
+        self._at = list[int]()
 
     def reset(self, **options: Any) -> tuple[Any, Info]:
         """As the environment's."""
@@ -154,7 +161,8 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: Env, seed: int) -> None:
         super().__init__(env)
-        self._seed, self._episode = seed, 0
+        self._seed = seed
+        self._episode = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
         """Start the next training episode; ``seed`` changes nothing."""

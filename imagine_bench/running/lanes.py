@@ -54,10 +54,13 @@ def episodes_in_lanes(run: Run, seeds: Sequence[int]) -> Iterator[Played]:
 
 
 def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -> Iterator[Played]:
-    waiting, everyone = list(enumerate(seeds))[::-1], range(lanes.num_envs)
+    waiting = list(enumerate(seeds))[::-1]
+    everyone = range(lanes.num_envs)
     playing: dict[int, tuple[int, Played]] = {}  # by lane: the number of its episode, and what is kept of it
     over: dict[int, Played] = {}  # by number, until those before it are over
-    free, following, actions = list(everyone), 0, dict[int, int]()
+    free = list(everyone)
+    following = 0
+    actions = dict[int, int]()
 
     def act(lane: int, frame: Any, info: dict[str, Any]) -> None:
         actions[lane] = int(agent.act(Observation.of(frame, info, privileged=privileged), explore=False))
@@ -75,7 +78,8 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
         frames, rewards, terminated, truncated, infos = lanes.recv(max(1, len(playing) // 2))
         free = []
         for row, lane in enumerate(infos["env_id"].tolist()):
-            info, (number, played) = _row(infos, row), playing[lane]
+            info = _row(infos, row)
+            number, played = playing[lane]
             if truncated[row] and not lanes.envs[lane].begun:
                 raise DivergedError(info["fault_reason"])
             played.add(actions[lane], float(rewards[row]), info)

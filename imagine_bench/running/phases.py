@@ -21,7 +21,8 @@ def transfer(run: Run) -> None:
     """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next."""
     if not isinstance(run.agent, TransferLearner):
         return
-    protocol, counters = run.protocol, run.counters
+    protocol = run.protocol
+    counters = run.counters
     for index, task in enumerate(protocol.after):
         end = (index + 1) * protocol.after_episodes
         if counters.before >= end:
@@ -55,14 +56,17 @@ def train(run: Run, budget: int) -> None:
 
 
 def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
-    counters, episode = run.counters, run.counters.episode
+    counters = run.counters
+    episode = run.counters.episode
     for transition in dataset.transitions(episode):
         run.agent.observe(transition, episode=episode)
     counters.add_episode(bool(dataset.success[episode]), int(dataset.lengths[episode]))
 
 
 def _training_episode(run: Run, *, demonstrated: bool) -> None:
-    counters, length, success = run.counters, 0, False
+    counters = run.counters
+    length = 0
+    success = False
     seed = episode_seed("training", run.spec.seed, counters.episode)
     queries = None if demonstrated else _queries(run)
     teacher = None if demonstrated else _teacher(run)
@@ -83,7 +87,8 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
     for lived, info in episode:
         transition = lived if teacher is None else teacher.told(lived)
         run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=counters.episode)
-        length, success = length + 1, bool(info["is_success"])
+        length = length + 1
+        success = bool(info["is_success"])
     counters.add_episode(success, length, queries=0 if queries is None else queries.asked)
 
 
@@ -103,7 +108,8 @@ def _teacher(run: Run) -> Teacher | None:
 
 def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], None]) -> None:
     """Let the agent train in its own loop through all budgets, and test it, in an environment apart, at each."""
-    budgets, start_s = run.protocol.budgets, time.process_time()
+    budgets = run.protocol.budgets
+    start_s = time.process_time()
 
     def on_episode(success: bool, length: int) -> bool:
         nonlocal start_s
@@ -135,7 +141,8 @@ def test(run: Run) -> EvaluationCounts:
     if counters.test is None:
         train_in_model(run)
         counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
-    purpose, privileged = evaluation_split(run.spec.seed), run.entry.privileged
+    purpose = evaluation_split(run.spec.seed)
+    privileged = run.entry.privileged
     seeds = [episode_seed(purpose, 0, each) for each in range(counters.test.episodes, run.protocol.evaluation_episodes)]
     if lanes_pay(run, len(seeds)):
         start_s = time.process_time()

@@ -66,9 +66,13 @@ class Run:
     """
 
     def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:
-        self.spec, self.protocol, self.folder = spec, spec.protocol, folder
-        self.env, self.test_env = env, test_env
-        self.task, self.entry = registry.task(spec.protocol.task), registry.agent_entry(spec.agent)
+        self.spec = spec
+        self.protocol = spec.protocol
+        self.folder = folder
+        self.env = env
+        self.test_env = test_env
+        self.task = registry.task(spec.protocol.task)
+        self.entry = registry.agent_entry(spec.agent)
         self._require_its_encoder()
         self.dataset = self._its_dataset() if self.entry.learns else None
         self.agent: Agent = registry.make_agent(spec.agent, spec.context())
@@ -159,7 +163,8 @@ class Run:
         if not at_once and now_s - self._reported_s < _REPORT_EVERY_S:
             return
         self._reported_s = now_s
-        counters, test = self.counters, self.counters.test
+        counters = self.counters
+        test = self.counters.test
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
         played = counters.before + counters.episode + tested * self.protocol.evaluation_episodes
         recent = counters.success[-_RECENT:]
@@ -167,7 +172,9 @@ class Run:
             success: float | None = test.successes / test.episodes
         else:
             success = sum(recent) / len(recent) if recent else None
-        spec, done, episode = self.spec, played + (test.episodes if test else 0), counters.episode
+        spec = self.spec
+        done = played + (test.episodes if test else 0)
+        episode = counters.episode
         where = Progress(
             agent=spec.agent, seed=spec.seed, bench=self.protocol.hash, phase=phase, done=done, work=spec.work,
             episode=episode, success=success,
