@@ -9,11 +9,17 @@ from contextlib import closing
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import ExternalTrainer, ModelOnlyTrainer, QueryingAgent, TransferLearner
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.running.counters import EvaluationCounts
-from imagine_bench.running.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
+from imagine_bench.running.evaluation import (
+    Env,
+    EvaluationCounts,
+    Info,
+    TrainingStarts,
+    play,
+    play_test_episode,
+)
 from imagine_bench.running.lanes import episodes_in_lanes, lanes_pay
 from imagine_bench.running.queries import LabelOracle, QueryBudget, Teacher, as_seen
-from imagine_bench.running.run_state import Run, make_env
+from imagine_bench.running.run_state import CountVisits, Run, make_env
 from imagine_bench.seeding import episode_seed, evaluation_split
 
 
@@ -77,7 +83,7 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
             watcher(observation, info)
 
     episode = play(
-        Watched(run.env, counters),
+        CountVisits(run.env, counters),
         run.demonstrator if demonstrated else run.agent,
         seed=seed,
         explore=True,
@@ -122,7 +128,7 @@ def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], Non
         return run.counters.episode < budgets[-1]
 
     with closing(make_env(run.protocol, run.task.id)) as own:
-        starts = TrainingStarts(Watched(own, run.counters), run.spec.seed)
+        starts = TrainingStarts(CountVisits(own, run.counters), run.spec.seed)
         agent.train(starts, episodes=budgets[-1], horizon=run.task.horizon, on_episode=on_episode)
 
 

@@ -31,9 +31,8 @@ from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.counters import Counters
 from imagine_bench.running.evaluation import play
-from imagine_bench.running.run_state import Run, environments
+from imagine_bench.running.run_state import Counters, Run, environments
 from imagine_bench.testing.common import NotOffered, make_env, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
 

@@ -25,7 +25,7 @@ from imagine_bench.appearance import appearance_name
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import APPEARANCES, PerformanceTargets, SceneReader, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.running.counters import Played
+from imagine_bench.running.evaluation import EpisodeRecord
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import require_writable, write_json
 from imagine_bench.tools.fidelity import Fidelity, measure_fidelity
@@ -231,7 +231,7 @@ def _kinematic(spec: TaskSpec, targets: PerformanceTargets) -> Iterator[Figure]:
                 env.reset()
 
     def kept() -> None:
-        played = Played.begun(env, env.reset(seed=0)[1])
+        played = EpisodeRecord.begun(env, env.reset(seed=0)[1])
         info = env.step(0)[-1]
         for action in actions:
             played.add(action, 0.0, info)
