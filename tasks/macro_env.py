@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +20,7 @@ from imagine_bench.rules import states_of
 from .dials.gesture import hides
 from .dials.lag import Lag
 from .frames import frames_of
-from .motion.executor import MacroResult, finish
-from .motion.executor import Motion as Acting
+from .motion.executor import MacroResult
 from .observations import Observer
 from .rendering import Renderer, image_size
 from .scene_reader import FilmedScene
@@ -174,12 +172,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
             InvalidValueError: No such action, or no episode was begun.
             DivergedError: The simulation blew up; the episode is over.
         """
-        reward, terminated, info = finish(self.acting(action))
+        reward, terminated, info = self.act(action)
         self._show()
         return self.observe([self])[0], reward, terminated, False, info
 
-    def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
-        """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
+    def act(self, action: np.int64 | int) -> tuple[float, bool, dict[str, Any]]:
+        """As :meth:`step`, without an observation. Nothing is drawn, so any thread may call it.
 
         Returns:
             Reward, whether the episode has terminated, and info.
@@ -197,7 +195,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()
-            self._latest = yield from self.world.acting(chosen, intended.macrostate, self.capture_motion_hz)
+            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
@@ -226,10 +224,6 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
         now = self._observer.observe([(env._observer, env.world.shown(env._macrostate)) for env in envs])
         return [env._lag.deliver(observation) for env, observation in zip(envs, now, strict=True)]
-
-    def share(self, envs: Sequence[MacroEnv]) -> Callable[[mujoco.MjData], None]:
-        """Have a second process draw for :meth:`observe`, as :meth:`.Observer.share` says."""
-        return self._observer.share([env._observer for env in envs])
 
     def diverged(self, error: DivergedError) -> dict[str, Any]:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""

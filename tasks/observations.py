@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,6 @@ from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
 from .rendering import Renderer
 from .scene_reader import arm_columns, tcp_in_world
 from .scenes.arm import TCP_SITE
-from .second_process import SharedRenderer
 from .world import World
 
 _Camera = Callable[[str, int], Renderer]
@@ -59,9 +57,7 @@ class Observer:
         self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras: dict[str, Renderer | SharedRenderer] = {
-            name: camera(name, int(size)) for name in ("frame", "human") if name in names
-        }
+        self._cameras = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
@@ -77,18 +73,6 @@ class Observer:
         if len(columns) == 1:
             return columns[self._names[0]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-    def share(self, observers: Sequence[Observer]) -> Callable[[mujoco.MjData], None]:
-        """Have a second process draw frames of these, this one included; what is returned tells it what will be asked.
-
-        It takes the data of a world that stands as :meth:`observe` will find it.
-        """
-        camera = self._cameras.get("frame")
-        if not isinstance(camera, Renderer):
-            return lambda data: None
-        scenes = [(observer._world.model, observer._world.data) for observer in observers]
-        self._cameras["frame"] = shared = SharedRenderer(camera, scenes)
-        return shared.begin
 
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""

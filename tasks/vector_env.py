@@ -1,9 +1,8 @@
-"""Many environments at once: their macro-actions are planned one after another and simulated on all cores.
+"""Many environments at once: each lane's macro-action runs on a thread, and contact physics uses all cores.
 
-While one lane is planned, the contact physics of those before it runs on other threads, each lane's on its own data and
-for as long as its own motion takes. So the lanes are equal to single environments, bit for bit. One
-``mujoco.batch.Batch`` called for each distinct end gives the same bits as fast, but needs every lane's data twice.
-Kinematic lanes have nothing to simulate: a second process draws some of them.
+MuJoCo simulates without holding Python's lock, each lane on its own data, so the lanes are equal to single environments
+bit for bit. Kinematic lanes have nothing to simulate: they act one after another.
+One camera draws all lanes, in the thread that calls.
 """
 
 from __future__ import annotations
@@ -24,34 +23,25 @@ from numpy.typing import NDArray
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 
 from .macro_env import MacroEnv
-from .motion.executor import Motion
 
-_WORTH_A_PROCESS = 4
-"""Kinematic lanes from which on a second process draws beside this one."""
 _MODES = {mode.value: mode for mode in AutoresetMode}
 _Step = tuple[float, bool, dict[str, Any]]
 Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Acting:
     """A lane in the middle of a macro-action, or of the reset that takes its place."""
 
-    motion: Motion[_Step] | None  #: None for a reset
-    simulated: Future[None] | None = None  #: what the motion waits for
-    due_s: float = 0.0  #: when it ends, on the clock that all lanes share
-    step: _Step | None = None  #: what became of it
+    begun_s: float  #: when it began, on the clock that all lanes share
+    step: Future[_Step] | None  #: what becomes of it; None for a reset
 
-    def go_on(self, threads: ThreadPoolExecutor, timestep_s: float) -> None:
-        """Up to where the motion needs its next simulation, or to its end."""
-        assert self.motion is not None
-        try:
-            simulation = next(self.motion)
-        except StopIteration as end:
-            self.simulated, self.step = None, end.value
-        else:
-            self.due_s += timestep_s * len(simulation.control)
-            self.simulated = threads.submit(simulation.run)
+    def due_s(self) -> float:
+        """When it ends on that clock; waits until it has been simulated."""
+        if self.step is None or self.step.exception() is not None:
+            return self.begun_s
+        *_, info = self.step.result()
+        return self.begun_s + float(info["sim_time_s"])
 
 
 class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
@@ -67,8 +57,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
             ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
             resets, by ``reset(options={"reset_mask": ...})``), or Gymnasium's enum.
-        threads: Simulations at once; one a core if None. From 2 on, a second process draws for four and more kinematic
-            lanes, as :mod:`.second_process` says.
+        threads: Macro-actions simulated at once; one a core if None.
 
     Raises:
         UnknownNameError: Another mode.
@@ -101,9 +90,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
-        self._clock_s, self._timestep_s = 0.0, float(lanes[0].model.opt.timestep)
-        helped = lanes[0].execution == "kinematic" and threads > 1 and len(lanes) >= _WORTH_A_PROCESS
-        self._begin_to_draw = lanes[0].share(lanes) if helped else None
+        self._clock_s = 0.0
+        self._simulates = lanes[0].execution == "physics"
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -125,8 +113,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         seeds = self._seeds(seed)
         for lane in chosen:
             acting = self._acting.pop(lane, None)
-            if acting is not None and acting.simulated is not None:
-                acting.simulated.exception()  # its data is in use until then
+            if acting is not None and acting.step is not None:
+                acting.step.exception()  # its data is in use until then
         infos = self._restart(chosen, seeds, options)
         return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
 
@@ -174,12 +162,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         given = actions.tolist() if isinstance(actions, np.ndarray) else actions
         chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, given, strict=True)]
         for lane, action in zip(lanes, chosen, strict=True):
-            motion = None if self._over[lane] else self.envs[lane].acting(action)
-            self._acting[lane] = acting = _Acting(motion=motion, due_s=self._clock_s)
-            if motion is not None:
-                acting.go_on(self._threads, self._timestep_s)
-                if self._begin_to_draw is not None:
-                    self._begin_to_draw(self.envs[lane].data)
+            step = None if self._over[lane] else self._begin(self.envs[lane], action)
+            self._acting[lane] = _Acting(self._clock_s, step)
 
     def recv(self, n: int | None = None) -> Batch:
         """What became of the ``n`` lanes, or all, that end first.
@@ -193,8 +177,9 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         n = len(self._acting) if n is None else n
         if not 1 <= n <= len(self._acting):
             raise InvalidValueError(f"{brief(n)} lanes cannot be received: {len(self._acting)} are acting.")
-        first = sorted(self._acting, key=lambda lane: self._acting[lane].due_s)[:n]
-        self._clock_s = max(self._acting[lane].due_s for lane in first)
+        due_s = {lane: acting.due_s() for lane, acting in self._acting.items()}
+        first = sorted(due_s, key=due_s.__getitem__)[:n]
+        self._clock_s = max(due_s[lane] for lane in first)
         batch = self._received(first)
         infos = _rows(batch[-1], first)
         infos["env_id"] = np.array(first)
@@ -208,8 +193,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         infos: dict[int, dict[str, Any]] = {}
         for row, lane in enumerate(lanes):
             acting = self._acting.pop(lane)
-            if acting.motion is not None:
-                rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting)
+            if acting.step is not None:
+                rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting.step)
         self._over[lanes] = ends.any(axis=0)
         acted = [lane for lane in infos if self.envs[lane].begun]  # not those that diverged
         collected: dict[str, Any] = {}
@@ -224,17 +209,22 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         collected.update(_columns(infos, self.num_envs))
         return self._stacked(lanes), rewards, ends[0], ends[1], collected
 
-    def _conclude(self, lane: int, acting: _Acting) -> tuple[float, bool, bool, dict[str, Any]]:
+    def _begin(self, env: MacroEnv, action: int) -> Future[_Step]:
+        """Begin a macro-action on another thread; a kinematic one is done here and now."""
+        if self._simulates:
+            env.world.prepare()  # compiles, which only one thread may do at a time
+            return self._threads.submit(env.act, action)
+        done = Future[_Step]()
+        done.set_result(env.act(action))
+        return done
+
+    def _conclude(self, lane: int, step: Future[_Step]) -> tuple[float, bool, bool, dict[str, Any]]:
         """Reward, terminated, truncated and info, when all has been simulated."""
         self._elapsed[lane] += 1
         try:
-            while acting.simulated is not None:
-                acting.simulated.result()
-                acting.go_on(self._threads, self._timestep_s)
+            reward, terminated, info = step.result()
         except DivergedError as error:
             return 0.0, False, True, self.envs[lane].diverged(error)
-        assert acting.step is not None
-        reward, terminated, info = acting.step
         return reward, terminated, self._horizon is not None and self._elapsed[lane] >= self._horizon, info
 
     def _restart(
@@ -244,8 +234,6 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         infos = {}
         for lane in lanes:
             infos[lane] = self.envs[lane].restart(seed=seeds[lane], options=options)
-            if self._begin_to_draw is not None:
-                self._begin_to_draw(self.envs[lane].data)
         self._elapsed[list(lanes)] = 0
         self._over[list(lanes)] = False
         self._look([*also, *lanes])

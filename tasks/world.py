@@ -16,7 +16,7 @@ from imagine_bench.interfaces import Frame, PhysicsSettings
 from .dials.distractors import Distraction
 from .dials.gesture import HIDDEN
 from .motion import orientation
-from .motion.executor import MacroResult, Motion, at_rest, finish
+from .motion.executor import MacroResult, at_rest
 from .motion.sensing import Sensing
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
@@ -186,16 +186,18 @@ class World(abc.ABC):
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
 
     @abc.abstractmethod
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
-        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves."""
+    def prepare(self) -> None:
+        """Make what :meth:`execute` needs, which otherwise the first execution makes."""
 
+    @abc.abstractmethod
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
-        """Physical execution, here and now.
+        """Physical execution: plan, simulate, and let people react.
+
+        ``intended`` says what people in the scene do, never what the robot achieves.
 
         Raises:
             DivergedError: The simulation blew up.
         """
-        return finish(self.acting(action, intended, capture_motion_hz))
 
     def read(self) -> Reading:
         """Read the macrostate back from where objects, gripper and hands are."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..motion import orientation
-from ..motion.executor import MacroResult, Motion
+from ..motion.executor import MacroResult
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.layout import layout
@@ -50,19 +50,29 @@ class ArrowWorld(World):
         self._gesture(intended[-1])
         self.update()
 
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
+    def prepare(self) -> None:
+        """Make the executor now."""
+        _ = self.executor
+
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 
         A cube that is due and shall stay as it is slips out of the fingers.
         """
-        turns, before = self._turns[action], self.object_poses()
+        turns = self._turns[action]
+        before = self.object_poses()
         slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
-        results = []
-        for turn in turns:
-            results.append((yield from self.executor.turn(
-                self.data, cube=turn.cube, clockwise=turn.clockwise, slips=turn.cube in slipping,
-                off=self._off(self._aims[turn.cube]), capture_motion_hz=capture_motion_hz,
-            )))  # fmt: skip
+        results = [
+            self.executor.turn(
+                self.data,
+                cube=turn.cube,
+                clockwise=turn.clockwise,
+                slips=turn.cube in slipping,
+                off=self._off(self._aims[turn.cube]),
+                capture_motion_hz=capture_motion_hz,
+            )
+            for turn in turns
+        ]
         self.executor.executor.rest(self.data)
         self._gesture(intended[-1])
         self.update()

@@ -15,7 +15,7 @@ from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
 from .arm_model import ArmModel
-from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, Motion, back_to_rest
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .sensing import Sensing
@@ -49,7 +49,7 @@ class CarryExecutor:
         self._tcp_site = model.site(TCP_SITE).id
         self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(OBJECTS))]
 
-    def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> Motion[MacroResult]:
+    def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Lift object ``index`` from where it stands and bring it to the observation pose."""
         spec, pose = OBJECTS[index], self._measure(data, index, np.array(standing_m(index)))
         if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
@@ -60,28 +60,28 @@ class CarryExecutor:
         except UnreachableTargetError as error:
             return self._refuse(data, None, f"the {spec.name} is out of reach: {error}")
         waypoints = _waypoints(reach, REST_OPENING_M, spec.squeeze_m)
-        result, qpos = yield from self._run(data, waypoints, reach, None, capture_motion_hz)
+        result, qpos = self._run(data, waypoints, reach, None, capture_motion_hz)
         return self._unless_missed(spec, result, qpos)
 
     def place(
         self, data: mujoco.MjData, *, index: int, off: tuple[float, float, float] = (0.0, 0.0, 0.0),
         capture_motion_hz: float = 0.0,
-    ) -> Motion[MacroResult]:  # fmt: skip
+    ) -> MacroResult:  # fmt: skip
         """Put the held object ``index`` back on its place, ``off`` it by metres in x and y, and turned by radians."""
         right_m, up_m, turned_rad = off
         target_m = np.array(standing_m(index)) + np.array([right_m, up_m, _PLACE_DROP_M])
-        return (yield from self._put(data, index, target_m, turned_rad, capture_motion_hz))
+        return self._put(data, index, target_m, turned_rad, capture_motion_hz)
 
     def hand_over(
         self, data: mujoco.MjData, *, index: int, palm_m: Floats, capture_motion_hz: float = 0.0
-    ) -> Motion[MacroResult]:
+    ) -> MacroResult:
         """Lay the held object ``index`` into the palm whose middle is at ``palm_m``. Shape (3,)."""
         target_m = palm_m + _up(OBJECTS[index].grip_height_m + _PALM_DROP_M)
-        return (yield from self._put(data, index, target_m, None, capture_motion_hz))
+        return self._put(data, index, target_m, None, capture_motion_hz)
 
     def visit(
         self, data: mujoco.MjData, *, place_m: Floats, held: int | None, capture_motion_hz: float = 0.0
-    ) -> Motion[MacroResult]:
+    ) -> MacroResult:
         """Reach out to above ``place_m`` (3,) and come back, holding object ``held`` or nothing."""
         try:
             reach = self._solve(place_m, 0.0, self._slots[1])
@@ -90,7 +90,7 @@ class CarryExecutor:
         opening_m = REST_OPENING_M if held is None else OBJECTS[held].squeeze_m
         out = Waypoint(name="reach", qpos_rad=reach.above_qpos_rad, opening_m=opening_m)
         waypoints = [out, *back_to_rest(opening_m, _SETTLE_S)]
-        result, qpos = yield from self._run(data, waypoints, reach, held, capture_motion_hz)
+        result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
         return result if held is None else self._unless_missed(OBJECTS[held], result, qpos)
 
     def rest(self, data: mujoco.MjData, held: int | None) -> None:
@@ -114,7 +114,7 @@ class CarryExecutor:
 
     def _put(
         self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
-    ) -> Motion[MacroResult]:
+    ) -> MacroResult:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
         spec, pose = OBJECTS[index], self._measure(data, index, self._rest_tcp_m)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
@@ -127,7 +127,7 @@ class CarryExecutor:
         except UnreachableTargetError as error:
             return self._refuse(data, index, f"the {spec.name} cannot be put there: {error}")
         waypoints = _waypoints(reach, spec.squeeze_m, REST_OPENING_M)
-        return (yield from self._run(data, waypoints, reach, index, capture_motion_hz))[0]
+        return self._run(data, waypoints, reach, index, capture_motion_hz)[0]
 
     def _measure(self, data: mujoco.MjData, index: int, nominal_m: Floats) -> ObjectPose:
         row = self._qpos[index]
@@ -140,10 +140,10 @@ class CarryExecutor:
 
     def _run(
         self, data: mujoco.MjData, waypoints: Sequence[Waypoint], reach: Reach, held: int | None, motion_hz: float
-    ) -> Motion[tuple[MacroResult, Floats]]:
+    ) -> tuple[MacroResult, Floats]:
         """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
         squeeze_m = None if held is None else OBJECTS[held].squeeze_m
-        result, qpos, _ = yield from self.executor.perform(
+        result, qpos, _ = self.executor.perform(
             data, self._arm, waypoints, ik_error_m=reach.error_m, squeeze_m=squeeze_m, capture_motion_hz=motion_hz
         )
         return result, qpos

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import mujoco
 import mujoco.rollout
@@ -52,55 +51,6 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
         qpos[model.joint(name).qposadr[0]] = value
         ctrl[model.actuator(name.replace("_slide", "") + "_servo").id] = value
     return qpos, ctrl
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Simulation:
-    """A planned motion that waits to be simulated; neither the thread nor the moment changes a bit of it."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData  #: at the canonical start, and at the end once it has run
-    states: Floats  #: row 0 is the start, :meth:`run` fills in what follows each step. Shape (N + 1, FULLPHYSICS).
-    control: Floats  #: controls, then mocap poses, of each step. Shape (N, C).
-
-    def run(self) -> None:
-        """Simulate; other threads go on meanwhile.
-
-        Raises:
-            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
-        """
-        states, control = self.states, self.control
-        mujoco.rollout.rollout(self.model, self.data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
-        warnings = (self.data.warning[int(kind)].number for kind in _BAD_STATE)
-        if not any(warnings) and np.isfinite(states[-1]).all() and np.abs(self.data.qvel).max() < _RUNAWAY_RAD_S:
-            return
-        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=states[0], control=control[:, : self.model.nu])
-        raise DivergedError(
-            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
-            f"its start state and controls were saved in {path}."
-        )
-
-
-_Value = TypeVar("_Value")
-Motion = Generator[Simulation, None, _Value]
-"""What carries a macro-action out: it yields each simulation that it needs, and goes on when that has run."""
-
-
-def finish(motion: Motion[_Value]) -> _Value:
-    """Carry a motion out here and now.
-
-    Raises:
-        DivergedError: As :meth:`Simulation.run`.
-    """
-    while True:
-        try:
-            simulation = next(motion)
-        except StopIteration as end:
-            value: _Value = end.value
-            return value
-        simulation.run()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +122,7 @@ class MacroExecutor:
         ik_error_m: float,
         squeeze_m: float | None = None,
         capture_motion_hz: float = 0.0,
-    ) -> Motion[tuple[MacroResult, Floats, Trajectory]]:
+    ) -> tuple[MacroResult, Floats, Trajectory]:
         """Plan a motion through ``waypoints``, the last of which is the observation pose, and execute it.
 
         ``squeeze_m`` is as in :meth:`rest`, ``capture_motion_hz`` as in :meth:`capture`.
@@ -185,7 +135,7 @@ class MacroExecutor:
         trajectory = plan(
             arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
-        qpos = yield from self.run(data, trajectory, squeeze_m=squeeze_m)
+        qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
         time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)
         off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
@@ -201,7 +151,7 @@ class MacroExecutor:
         time_s, qpos, qvel, ctrl = self.capture(0, 0.0)
         return MacroResult(sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=time_s, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
-    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Motion[Floats]:
+    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
 
         The derived quantities of ``data`` (such as ``xpos``) are then those of the last step.
@@ -209,6 +159,9 @@ class MacroExecutor:
         Returns:
             Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
             Shape (N + 1, nq).
+
+        Raises:
+            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data, squeeze_m=squeeze_m)
         steps = len(trajectory.opening_m)
@@ -221,8 +174,20 @@ class MacroExecutor:
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        yield Simulation(model=self.model, data=data, states=states, control=control)
+        mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
+        if _diverged(data, states[-1]):
+            raise self._divergence(states[0], control)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
+
+    def _divergence(self, start: Floats, control: Floats) -> DivergedError:
+        """Save a start and its controls (N, C) to be looked into."""
+        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, start_state=start, control=control[:, : self.model.nu])
+        return DivergedError(
+            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
+            f"its start state and controls were saved in {path}."
+        )
 
     def arm_qpos_rad(self, qpos: Floats) -> Floats:
         """The arm's joints in positions of the scene: (..., nq) to (..., 7)."""
@@ -255,3 +220,10 @@ class MacroExecutor:
         for row in np.flatnonzero(share % 1.0):
             mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
         return at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, :nu]
+
+
+def _diverged(data: mujoco.MjData, state: Floats) -> bool:
+    """Whether the simulation that ends in ``state`` has exploded."""
+    if any(data.warning[int(kind)].number for kind in _BAD_STATE):
+        return True
+    return not (np.isfinite(state).all() and np.abs(data.qvel).max() < _RUNAWAY_RAD_S)

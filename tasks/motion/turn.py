@@ -14,7 +14,7 @@ from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
 from .arm_model import ArmModel
-from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, Motion, back_to_rest
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .sensing import Sensing
@@ -59,7 +59,7 @@ class TurnExecutor:
     def turn(
         self, data: mujoco.MjData, *, cube: int, clockwise: bool, slips: bool = False,
         off: tuple[float, float, float] = (0.0, 0.0, 0.0), capture_motion_hz: float = 0.0,
-    ) -> Motion[MacroResult]:  # fmt: skip
+    ) -> MacroResult:  # fmt: skip
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
         ``off`` has it come down so far off both: metres in x and y, and radians. One that ``slips`` stays: the fingers
@@ -99,7 +99,7 @@ class TurnExecutor:
         skews_rad, openings_m = (_skew_rad(pose), turned_rad), (opening_m, leaves_m)
         waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
-        result, qpos, trajectory = yield from self.executor.perform(
+        result, qpos, trajectory = self.executor.perform(
             data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]

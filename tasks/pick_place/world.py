@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..motion import orientation
-from ..motion.executor import REST_OPENING_M, MacroResult, Motion
+from ..motion.executor import REST_OPENING_M, MacroResult
 from ..scenes.appearance import Appearance
 from ..scenes.arm import FINGER_JOINTS, TCP_SITE
 from ..scenes.constants import TABLE_HEIGHT_M
@@ -109,7 +109,11 @@ class PickWorld(World):
         self._gesture(intended[N_OBJECTS])
         self.update()
 
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
+    def prepare(self) -> None:
+        """Make the executor now."""
+        _ = self.executor
+
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
@@ -117,7 +121,7 @@ class PickWorld(World):
         """
         before, poses = self._objects()[0], self.object_poses()
         stays = before == intended[:N_OBJECTS]
-        result = yield from self._act(action, before, stays, capture_motion_hz)
+        result = self._act(action, before, stays, capture_motion_hz)
         self.update()
         self.executor.rest(self.data, held_object(self._objects()[0]))
         self.update()
@@ -129,7 +133,7 @@ class PickWorld(World):
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
-    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> Motion[MacroResult]:
+    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> MacroResult:
         """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
         held, executor = held_object(objects), self.executor
         if action == HAND_OVER:

@@ -16,7 +16,6 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
 from imagine_bench.tasks import rendering
-from imagine_bench.tasks.motion.executor import Simulation
 from worlds import WORLDS
 
 from imagine_bench import registry
@@ -300,18 +299,19 @@ def test_what_cannot_be_done_moves_nothing():
 
 def test_a_reset_forgets_what_a_lane_was_doing(monkeypatch):
     """But waits for it: the lane's data is in use until then."""
-    run, ended = Simulation.run, []
+    ended = []
 
-    def late(simulation):
+    def late(act, action):
         time.sleep(0.05)
-        run(simulation)
-        ended.append(simulation)
+        ended.append(act(action))
+        return ended[-1]
 
     vector = make(n=2)
     first, _ = vector.reset(seed=4)
     expected = vector.step(np.array([0, 2]))[0]
     vector.reset(seed=4)
-    monkeypatch.setattr(Simulation, "run", late)
+    for lane in vector.envs:
+        monkeypatch.setattr(lane, "act", functools.partial(late, lane.act))
     vector.send([0, 2])
     again, _ = vector.reset(seed=4)
     assert len(ended) == 2 and np.array_equal(first, again)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import REST_OPENING_M, MacroExecutor, finish
+from imagine_bench.tasks.motion.executor import REST_OPENING_M, MacroExecutor
 from imagine_bench.tasks.motion.ik import ArmIK
 from imagine_bench.tasks.motion.trajectory import Waypoint, plan
 from imagine_bench.tasks.motion.turn import TurnExecutor
@@ -81,7 +81,7 @@ def test_planning_and_scene_have_the_same_servos(arm, turner):
 def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     place(model, data, (0.05, -0.05, QUARTER_RAD))
-    result = finish(turner.turn(data, cube=cube, clockwise=clockwise, capture_motion_hz=1 / TIMESTEP_S))
+    result = turner.turn(data, cube=cube, clockwise=clockwise, capture_motion_hz=1 / TIMESTEP_S)
     assert result.fault is None
     np.testing.assert_allclose(result.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
     arm_qpos = turner.executor.arm_qpos_rad(result.qpos)
@@ -109,7 +109,7 @@ def test_servo_forces_stay_below_their_limits(turner):
 
     turner.executor.run = keep
     try:
-        finish(turner.turn(data, cube=0, clockwise=True))
+        turner.turn(data, cube=0, clockwise=True)
     finally:
         del turner.executor.run
     stepped = mujoco.MjData(model)
@@ -143,7 +143,7 @@ def run_turns(turner, number, per_start, seed):
             place(model, data, yaws, rng.uniform(-0.01, 0.01, (3, 2)))
         cube, clockwise = int(rng.integers(3)), bool(rng.integers(2))
         before = poses(model, data)
-        result = finish(turner.turn(data, cube=cube, clockwise=clockwise))
+        result = turner.turn(data, cube=cube, clockwise=clockwise)
         after = poses(model, data)
         target = round(before[cube, 3] / QUARTER_RAD) * QUARTER_RAD + (-QUARTER_RAD if clockwise else QUARTER_RAD)
         yaw_deg.append(abs(math.degrees(wrap(after[cube, 3] - target))))
@@ -175,7 +175,7 @@ def test_a_finger_does_not_push_a_cube_that_stands_close(turner):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     place(model, data, (0, 0, 0), [(0, -0.01), (0, 0.01), (0, 0.01)])
     before = poses(model, data)
-    assert finish(turner.turn(data, cube=0, clockwise=False)).fault is None
+    assert turner.turn(data, cube=0, clockwise=False).fault is None
     after = poses(model, data)
     assert np.abs(after[1:, :3] - before[1:, :3]).max() < 2e-4
     assert math.degrees(after[0, 3]) == pytest.approx(90.0, abs=1.0)
@@ -187,7 +187,7 @@ def test_very_skew_cubes_are_squared(turner, clockwise):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     for skew_rad in (-math.radians(25), math.radians(25)):
         place(model, data, (skew_rad, 0, 0))
-        assert finish(turner.turn(data, cube=0, clockwise=clockwise)).fault is None
+        assert turner.turn(data, cube=0, clockwise=clockwise).fault is None
         target = -QUARTER_RAD if clockwise else QUARTER_RAD
         assert abs(math.degrees(wrap(poses(model, data)[0, 3] - target))) < 1
 
@@ -197,22 +197,22 @@ def test_a_turn_is_a_pure_function_of_positions_and_action(turner):
     model = turner.executor.model
     data, used = mujoco.MjData(model), mujoco.MjData(model)
     place(model, data, (0.1, QUARTER_RAD, -0.1), ((0.003, -0.002), (0, 0.004), (0.001, 0)))
-    finish(turner.turn(data, cube=0, clockwise=True))
+    turner.turn(data, cube=0, clockwise=True)
     start = data.qpos.copy()
-    finish(turner.turn(data, cube=1, clockwise=False))
+    turner.turn(data, cube=1, clockwise=False)
     first = data.qpos.copy()
     assert np.abs(first - start).max() > 0.5
     for _ in range(2):
-        finish(turner.turn(used, cube=2, clockwise=True))
+        turner.turn(used, cube=2, clockwise=True)
         used.qpos[:] = start
         used.qvel[:] = 3.0  # whatever was left over does not matter
         used.qacc_warmstart[:] = 5.0
-        finish(turner.turn(used, cube=1, clockwise=False))
+        turner.turn(used, cube=1, clockwise=False)
         np.testing.assert_array_equal(used.qpos, first)
     other = pickle.loads(pickle.dumps(turner))
     fresh = mujoco.MjData(other.executor.model)
     fresh.qpos[:] = start
-    finish(other.turn(fresh, cube=1, clockwise=False))
+    other.turn(fresh, cube=1, clockwise=False)
     np.testing.assert_array_equal(fresh.qpos, first)
 
 
@@ -221,7 +221,7 @@ def test_turns_leave_mocap_bodies_where_they_are(turner):
     place(model, data, (0, 0, 0))
     assert model.nmocap > 0
     data.mocap_pos[0] = (0.9, 0.1, 0.2)
-    finish(turner.turn(data, cube=0, clockwise=True))
+    turner.turn(data, cube=0, clockwise=True)
     np.testing.assert_array_equal(data.mocap_pos[0], (0.9, 0.1, 0.2))
 
 
@@ -236,7 +236,7 @@ def turned_deg(turner, model, change=None):
     executor = TurnExecutor(model, SLOTS_XY_M)
     data = mujoco.MjData(model)
     place(model, data, (0, 0, 0))
-    result = finish(executor.turn(data, cube=1, clockwise=True))
+    result = executor.turn(data, cube=1, clockwise=True)
     return -math.degrees(poses(model, data)[1, 3]), result.fault
 
 
@@ -284,7 +284,7 @@ def lifted_m(model):
         waypoints=waypoints,
         timestep_s=model.opt.timestep,
     )
-    finish(executor.run(data, trajectory))
+    executor.run(data, trajectory)
     return data.qpos[cube_slice(model, 1)][2] - CUBE_Z_M
 
 
@@ -310,7 +310,7 @@ def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
     place(model, data, (0, 0, 0))
     data.qpos[cube_slice(model, 1)] = [*position, *quat]
     before = poses(model, data)
-    result = finish(turner.turn(data, cube=1, clockwise=True, capture_motion_hz=10))
+    result = turner.turn(data, cube=1, clockwise=True, capture_motion_hz=10)
     assert message in result.fault
     assert result.sim_time_s == 0.0
     assert result.qpos.shape == (0, model.nq)
@@ -319,7 +319,7 @@ def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
 
 def test_unknown_cube_is_named(turner):
     with pytest.raises(InvalidValueError, match="No cube 3; there are 0 to 2"):
-        finish(turner.turn(mujoco.MjData(turner.executor.model), cube=3, clockwise=True))
+        turner.turn(mujoco.MjData(turner.executor.model), cube=3, clockwise=True)
 
 
 def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypatch):
@@ -329,7 +329,7 @@ def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypat
     place(model, data, (0, 0, 0))
     data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
     with pytest.raises(DivergedError, match="its start state and controls were saved in"):
-        finish(turner.turn(data, cube=0, clockwise=True))
+        turner.turn(data, cube=0, clockwise=True)
     (saved,) = tmp_path.glob("imagine_bench_diverged_*.npz")
     with np.load(saved) as contents:
         assert contents["start_state"].max() == 1e11
@@ -340,7 +340,7 @@ def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypat
 def test_captured_motion_is_even_and_complete(turner, motion_hz, rows):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     place(model, data, (0, 0, 0))
-    result = finish(turner.turn(data, cube=0, clockwise=True, capture_motion_hz=motion_hz))
+    result = turner.turn(data, cube=0, clockwise=True, capture_motion_hz=motion_hz)
     expected = rows if rows is not None else 1 + math.ceil(result.sim_time_s * motion_hz - 1e-6)
     assert result.qpos.shape == (expected, model.nq)
     assert result.time_s.shape == (expected,)

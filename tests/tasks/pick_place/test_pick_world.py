@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import finish
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
 from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
@@ -136,7 +135,7 @@ def test_what_leans_too_far_is_not_picked(world, index):
     world.place((0, 0, 0, 0), rng())
     half_rad = math.radians(14) / 2
     world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, math.sin(half_rad), 0]
-    result = finish(world.executor.pick(world.data, index=index))
+    result = world.executor.pick(world.data, index=index)
     assert result.fault == f"the {OBJECTS[index].name} is tipped by 14 degrees" and result.sim_time_s == 0.0
 
 
