@@ -17,18 +17,18 @@ from imagine_bench.errors import DivergedError, InvalidValueError, brief, requir
 from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, TaskSpec
 from imagine_bench.rules import states_of
 
-from .dials.gesture import hides
-from .dials.lag import Lag
 from .frames import frames_of
 from .motion.executor import MacroResult
 from .observations import Observer
-from .rendering import Renderer, image_size
+from .parameters.gesture import hides
+from .parameters.lag import Lag
+from .rendering.cameras import FRAME_PX, agent_camera, human_camera_view
+from .rendering.renderer import Renderer, image_size
+from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.cameras import FRAME_PX, agent_camera, human_camera_view
 from .scenes.constants import HUMAN_CAMERA
-from .window import HAS_PYGAME, Window
 from .world import World, WorldState
 
 _WINDOW_HZ = 25.0  # images a second of a window

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
 
-from .rendering import Renderer
+from .rendering.renderer import Renderer
 from .scene_reader import arm_columns, tcp_in_world
 from .scenes.arm import TCP_SITE
 from .world import World

@@ -12,9 +12,9 @@ from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import ArmMotion, Floats, Frame, Motion, Shape3D
 
 from .motion.executor import MacroResult
-from .rendering import Renderer, image_size
+from .rendering.cameras import DRAWN_GROUPS, agent_camera, human_camera_view
+from .rendering.renderer import Renderer, image_size
 from .scenes.arm import ARM_JOINTS, FINGER_JOINTS, TCP_SITE
-from .scenes.cameras import DRAWN_GROUPS, agent_camera, human_camera_view
 from .scenes.constants import HUMAN_CAMERA
 from .world import World
 

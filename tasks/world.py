@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
-from .dials.distractors import Distraction
-from .dials.gesture import HIDDEN
 from .motion import orientation
 from .motion.executor import MacroResult, at_rest
 from .motion.sensing import Sensing
+from .parameters.distractors import Distraction
+from .parameters.gesture import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA

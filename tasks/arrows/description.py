@@ -15,7 +15,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 
-from ..dials.dials import Dials
+from ..parameters.parameters import Dials
 
 MAX_CUBES = 6
 N_DIRECTIONS = 4

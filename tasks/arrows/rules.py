@@ -17,8 +17,8 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-from ..dials.fickle import fickle
-from ..dials.slip import slipping
+from ..parameters.goal_change import fickle
+from ..parameters.slip import slipping
 from .description import N_DIRECTIONS, Arrows
 
 TOWARD_HUMAN, RIGHT, TOWARD_AGENT, LEFT = range(N_DIRECTIONS)

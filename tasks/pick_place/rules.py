@@ -15,9 +15,9 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-from ..dials.dials import Dials
-from ..dials.fickle import fickle
-from ..dials.slip import slipping
+from ..parameters.goal_change import fickle
+from ..parameters.parameters import Dials
+from ..parameters.slip import slipping
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)

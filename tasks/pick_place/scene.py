@@ -8,7 +8,7 @@ import math
 
 import mujoco
 
-from ..dials.distractors import add_distractors
+from ..parameters.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.hand import add_pointing_hand

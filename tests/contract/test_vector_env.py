@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
-from imagine_bench.tasks import rendering
+from imagine_bench.tasks.rendering import renderer as rendering
 from worlds import WORLDS
 
 from imagine_bench import registry

@@ -15,13 +15,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks import rendering
 from imagine_bench.tasks.arrows.spec import spec_of
 from imagine_bench.tasks.arrows.world import ArrowWorld
-from imagine_bench.tasks.graphics import choose_platform
-from imagine_bench.tasks.rendering import Renderer, View
+from imagine_bench.tasks.rendering import renderer as rendering
+from imagine_bench.tasks.rendering.cameras import agent_camera, human_camera_view
+from imagine_bench.tasks.rendering.graphics import choose_platform
+from imagine_bench.tasks.rendering.renderer import Renderer, View
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.cameras import agent_camera, human_camera_view
 
 from imagine_bench.errors import SetupError, UnknownNameError
 
@@ -253,7 +253,7 @@ def test_scenes_of_several_threads_end_in_silence():
         from concurrent.futures import ThreadPoolExecutor
         import numpy as np
         from imagine_bench.tasks.arrows.spec import spec_of
-        from imagine_bench.tasks.scenes.cameras import agent_camera
+        from imagine_bench.tasks.rendering.cameras import agent_camera
         from imagine_bench.tasks.arrows.world import ArrowWorld
         from imagine_bench.tasks.scenes.appearance import appearance
         states, world = np.array([[0, 1, 2, 1]]), ArrowWorld(appearance("clean"))

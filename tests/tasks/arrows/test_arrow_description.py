@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
-from imagine_bench.tasks.dials.dials import GESTURES
+from imagine_bench.tasks.parameters.parameters import GESTURES
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError

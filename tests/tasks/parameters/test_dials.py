@@ -5,8 +5,8 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.dials.fickle import fickle
-from imagine_bench.tasks.dials.slip import slipping
+from imagine_bench.tasks.parameters.goal_change import fickle
+from imagine_bench.tasks.parameters.slip import slipping
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Outcome

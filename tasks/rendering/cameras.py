@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
-from ..rendering import Renderer, View
-from .constants import AGENT_CAMERA, ARM_GROUP, SCENE_GROUP, SETTING_GROUP
+from ..scenes.constants import AGENT_CAMERA, ARM_GROUP, SCENE_GROUP, SETTING_GROUP
+from .renderer import Renderer, View
 
 FRAME_PX = 64
 DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)

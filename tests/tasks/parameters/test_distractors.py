@@ -8,7 +8,7 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.dials import distractors
+from imagine_bench.tasks.parameters import distractors
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS
 from imagine_bench.tasks.scenes.layout import layout

@@ -1,0 +1,1 @@
+"""Drawing: OpenGL's platform, images of a scene from its cameras, and windows that show images."""
