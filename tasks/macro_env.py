@@ -94,9 +94,17 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     # Gymnasium's own declaration, whose checker opens a window for "human".
     metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": 1}  # noqa: RUF012
     KEYWORDS = (
-        "execution", "appearance", "render_mode", "width", "height", "camera", "physics", "motion_hz", "observation",
+        "execution",
+        "appearance",
+        "render_mode",
+        "width",
+        "height",
+        "camera",
+        "physics",
+        "motion_hz",
+        "observation",
         "size",
-    )  # fmt: skip
+    )
     """The keyword arguments of its constructor."""
 
     def __init__(
@@ -118,9 +126,13 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         modes = ("rgb_array", "human")
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self._execution = require_known("execution", execution, EXECUTIONS)
-        self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
-        self._starts, self.horizon = spec.rules.start_states, spec.horizon
-        self._sight, self._steps = spec.sight, 0
+        self._id = spec.id
+        self._rules = spec.rules
+        self.preprocessing = spec.preprocessing
+        self._starts = spec.rules.start_states
+        self.horizon = spec.horizon
+        self._sight = spec.sight
+        self._steps = 0
         self._lag, self._shown_lag = self._lags = [Lag(spec.sight.lag if spec.sight else 0) for _ in range(2)]
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
@@ -128,7 +140,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._window = Window(spec.title) if self.render_mode == "human" else None
         FilmedScene.__init__(self, make_world(level), motion_hz or (_WINDOW_HZ if self._window else 0.0))
         self.world.set_physics(settings)
-        self._make_world, self._begun = make_world, False
+        self._make_world = make_world
+        self._begun = False
         self._kind = (spec.id, self._execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
@@ -158,7 +171,11 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun, self._latest, self._steps, self._lag.kept, self._shown_lag.kept = True, None, 0, (), ()
+        self._begun = True
+        self._latest = None
+        self._steps = 0
+        self._lag.kept = ()
+        self._shown_lag.kept = ()
         self.world.place(start, self.np_random)
         self._vary()
         reading = self.world.read()
@@ -252,10 +269,16 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     def get_state(self) -> EnvState:
         """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
         return EnvState(
-            kind=self._kind, world=self.world.get_state(), generator=copy.deepcopy(self.np_random.bit_generator.state),
-            macrostate=self._macrostate, begun=self._begun, latest=self._latest, people=self._people,
-            steps=self._steps, under_way=tuple(lag.kept for lag in self._lags),
-        )  # fmt: skip
+            kind=self._kind,
+            world=self.world.get_state(),
+            generator=copy.deepcopy(self.np_random.bit_generator.state),
+            macrostate=self._macrostate,
+            begun=self._begun,
+            latest=self._latest,
+            people=self._people,
+            steps=self._steps,
+            under_way=tuple(lag.kept for lag in self._lags),
+        )
 
     def set_state(self, state: EnvState) -> None:
         """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
@@ -269,10 +292,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
             raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
-        self._macrostate, self._begun, self._latest, self._people = (
-            state.macrostate, state.begun, state.latest, state.people,
-        )  # fmt: skip
-        self._steps, (self._lag.kept, self._shown_lag.kept) = state.steps, state.under_way
+        self._macrostate = state.macrostate
+        self._begun = state.begun
+        self._latest = state.latest
+        self._people = state.people
+        self._steps = state.steps
+        self._lag.kept, self._shown_lag.kept = state.under_way
 
     def frame_of(self, macrostate: Sequence[int], rng: np.random.Generator | None = None) -> Frame:
         """The frame (64, 64, 3) that a macrostate would show, without going there: nothing changes here.

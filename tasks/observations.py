@@ -54,7 +54,8 @@ class Observer:
         low, high = OBSERVATION_SIZES_PX
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
-        self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)
+        self._world = world
+        self._arm_qpos, _, _ = arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
         self._cameras = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}

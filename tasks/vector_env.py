@@ -78,11 +78,14 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         for what, value in (("num_envs", len(lanes)), ("threads", threads)):
             if not isinstance(value, int) or value < 1:
                 raise InvalidValueError(f"{what} is {brief(value)}; give an integer from 1 on.")
-        self.envs, self.num_envs, self._horizon = tuple(lanes), len(lanes), max_episode_steps
+        self.envs = tuple(lanes)
+        self.num_envs = len(lanes)
+        self._horizon = max_episode_steps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
         self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
-        self.single_observation_space, self.single_action_space = lanes[0].observation_space, lanes[0].action_space
+        self.single_observation_space = lanes[0].observation_space
+        self.single_action_space = lanes[0].action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._threads = ThreadPoolExecutor(threads, "simulation")
@@ -189,7 +192,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
     def _received(self, lanes: list[int]) -> Batch:
         """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
-        rewards, ends = np.zeros(len(lanes)), np.zeros((2, len(lanes)), dtype=np.bool_)
+        rewards = np.zeros(len(lanes))
+        ends = np.zeros((2, len(lanes)), dtype=np.bool_)
         infos: dict[int, dict[str, Any]] = {}
         for row, lane in enumerate(lanes):
             acting = self._acting.pop(lane)
@@ -281,7 +285,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
 
 def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
     """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
-    lanes, columns = np.array(list(infos), dtype=np.int64), dict[str, Any]()
+    lanes = np.array(list(infos), dtype=np.int64)
+    columns = dict[str, Any]()
     mask = np.zeros(n, dtype=np.bool_)
     mask[lanes] = True
     for key, example in next(iter(infos.values()), {}).items():

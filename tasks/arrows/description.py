@@ -56,8 +56,11 @@ class Arrows(Dials):
 
     FAMILY: ClassVar[str] = "arrows"
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "cubes": (1, MAX_CUBES), "shuffle": (0, 2**32 - 1), "horizon": (1, 1000), **Dials.RANGES,
-    }  # fmt: skip
+        "cubes": (1, MAX_CUBES),
+        "shuffle": (0, 2**32 - 1),
+        "horizon": (1, 1000),
+        **Dials.RANGES,
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()

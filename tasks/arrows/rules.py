@@ -134,7 +134,8 @@ class ArrowRules:
 
     def is_legal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether no two arrows are alike that may not be."""
-        directions, forbidden = macrostate[:-1], self.world.forbidden
+        directions = macrostate[:-1]
+        forbidden = self.world.forbidden
         if "equal" in forbidden and len(set(directions)) < len(directions):
             return False
         return "neighbours" not in forbidden or all(left != right for left, right in pairwise(directions))

@@ -42,11 +42,13 @@ _NAMED = {
     Arrows(horizon=10): ("arrow_puzzle", "Arrow puzzle", "ArrowPuzzle"),
     Arrows(forbid="equal+agent", horizon=10): ("arrow_puzzle_hard", "Arrow puzzle, hard", "ArrowPuzzleHard"),
     Arrows(goal="toward_agent", horizon=10): (
-        "arrow_puzzle_toward", "Arrow puzzle, toward the agent", "ArrowPuzzleToward",
+        "arrow_puzzle_toward",
+        "Arrow puzzle, toward the agent",
+        "ArrowPuzzleToward",
     ),
     Arrows(goal="clockwise", horizon=10): ("arrow_puzzle_clockwise", "Arrow puzzle, clockwise", "ArrowPuzzleClockwise"),
     Arrows(cubes=1, horizon=2): ("arrow_puzzle_easy", "Arrow puzzle, easy", "ArrowPuzzleEasy"),
-}  # fmt: skip
+}
 """Registered points of the family: name, title, and Gymnasium's name of the task."""
 _IN_THESIS = ("arrow_puzzle", "arrow_puzzle_hard")
 _TARGETS = PerformanceTargets(

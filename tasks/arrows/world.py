@@ -28,7 +28,8 @@ class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
     def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
-        self._turns, self._layout = arrows.turns, layout(arrows.cubes)
+        self._turns = arrows.turns
+        self._layout = layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         model = compile_arrow_scene(arrows.cubes, arrows.distractors)
@@ -86,11 +87,14 @@ class ArrowWorld(World):
         return self._objects()[0][cube] == intended[cube]
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        (x_m, y_m), (right_m, up_m, turned_rad) = self._layout.slots_xy_m[index], self._off(offset)
+        x_m, y_m = self._layout.slots_xy_m[index]
+        right_m, up_m, turned_rad = self._off(offset)
         self.data.qpos[self.object_qpos[index]] = (
-            x_m + right_m, y_m + up_m, c.CUBE_REST_Z_M,
+            x_m + right_m,
+            y_m + up_m,
+            c.CUBE_REST_Z_M,
             *orientation.about_vertical(-(_QUARTER_RAD * value - turned_rad)),
-        )  # fmt: skip
+        )
 
     def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
         return {self._hand: self._layout.fingertips_m[gesture]}
@@ -99,7 +103,8 @@ class ArrowWorld(World):
         """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
-        skew_rad, off_m = abs(turned_rad - quarters * _QUARTER_RAD), math.dist(pose[:2], self._layout.slots_xy_m[index])
+        skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)
+        off_m = math.dist(pose[:2], self._layout.slots_xy_m[index])
         problem = self._tipped(index, pose)
         if problem is None and off_m > MAX_OFF_SLOT_M:
             problem = f"{self._names[index]} stands {1e3 * off_m:.0f} mm off its slot"

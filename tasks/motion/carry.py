@@ -23,8 +23,11 @@ from .trajectory import Waypoint
 
 _LIFT_M = 0.075
 """The gripper comes from and goes to so far above where it grips or lets go."""
-_CLOSE_S, _OPEN_S, _SETTLE_S = 0.12, 0.08, 0.05
-_PLACE_DROP_M, _PALM_DROP_M = 0.0005, 0.003
+_CLOSE_S = 0.12
+_OPEN_S = 0.08
+_SETTLE_S = 0.05
+_PLACE_DROP_M = 0.0005
+_PALM_DROP_M = 0.003
 """An object is let go so far above the table, or the palm."""
 _LOST_M = 0.003
 """Fingers that close so much further than the object is wide have lost it."""
@@ -51,7 +54,8 @@ class CarryExecutor:
 
     def pick(self, data: mujoco.MjData, *, index: int, capture_motion_hz: float = 0.0) -> MacroResult:
         """Lift object ``index`` from where it stands and bring it to the observation pose."""
-        spec, pose = OBJECTS[index], self._measure(data, index, np.array(standing_m(index)))
+        spec = OBJECTS[index]
+        pose = self._measure(data, index, np.array(standing_m(index)))
         if spec.upright and pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, None, f"the {spec.name} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         yaw_rad = pose.yaw_rad if spec.upright else 0.0
@@ -64,9 +68,13 @@ class CarryExecutor:
         return self._unless_missed(spec, result, qpos)
 
     def place(
-        self, data: mujoco.MjData, *, index: int, off: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        self,
+        data: mujoco.MjData,
+        *,
+        index: int,
+        off: tuple[float, float, float] = (0.0, 0.0, 0.0),
         capture_motion_hz: float = 0.0,
-    ) -> MacroResult:  # fmt: skip
+    ) -> MacroResult:
         """Put the held object ``index`` back on its place, ``off`` it by metres in x and y, and turned by radians."""
         right_m, up_m, turned_rad = off
         target_m = np.array(standing_m(index)) + np.array([right_m, up_m, _PLACE_DROP_M])
@@ -102,13 +110,16 @@ class CarryExecutor:
         self.executor.rest(data, squeeze_m=OBJECTS[held].squeeze_m)
         after_m, after_quat = self._tcp(data)
         row = self._qpos[held]
-        turn, inverse = np.empty(4), np.empty(4)
+        turn = np.empty(4)
+        inverse = np.empty(4)
         mujoco.mju_negQuat(inverse, before_quat)
         mujoco.mju_mulQuat(turn, after_quat, inverse)
-        offset_m, quat = np.empty(3), np.empty(4)
+        offset_m = np.empty(3)
+        quat = np.empty(4)
         mujoco.mju_rotVecQuat(offset_m, data.qpos[row : row + 3] - before_m, turn)
         mujoco.mju_mulQuat(quat, turn, data.qpos[row + 3 : row + 7])
-        data.qpos[row : row + 3], data.qpos[row + 3 : row + 7] = after_m + offset_m, quat / np.linalg.norm(quat)
+        data.qpos[row : row + 3] = after_m + offset_m
+        data.qpos[row + 3 : row + 7] = quat / np.linalg.norm(quat)
 
     # --- details -------------------------------------------------------------------------------------------------
 
@@ -116,10 +127,12 @@ class CarryExecutor:
         self, data: mujoco.MjData, index: int, target_m: Floats, yaw_rad: float | None, capture_motion_hz: float
     ) -> MacroResult:
         """Let the held object go with its origin at ``target_m`` and its x axis at ``yaw_rad``, or as it comes."""
-        spec, pose = OBJECTS[index], self._measure(data, index, self._rest_tcp_m)
+        spec = OBJECTS[index]
+        pose = self._measure(data, index, self._rest_tcp_m)
         # At the observation pose the tool's yaw is 0, so the object's own yaw is its yaw in the gripper.
         turn_rad = 0.0 if yaw_rad is None or not spec.upright else yaw_rad - pose.yaw_rad
-        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+        cos = math.cos(turn_rad)
+        sin = math.sin(turn_rad)
         held_m = pose.position_m - self._rest_tcp_m
         turned_m = np.array([cos * held_m[0] - sin * held_m[1], sin * held_m[0] + cos * held_m[1], held_m[2]])
         try:

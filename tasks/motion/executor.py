@@ -45,7 +45,8 @@ def back_to_rest(opening_m: float, settle_s: float) -> list[Waypoint]:
 
 def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
     """Positions (nq,) and controls (nu,) of a whole scene, its arm at the observation pose with open fingers."""
-    qpos, ctrl = model.qpos0.copy(), np.zeros(model.nu)
+    qpos = model.qpos0.copy()
+    ctrl = np.zeros(model.nu)
     targets = [*zip(ARM_JOINTS, OBSERVATION_QPOS_RAD, strict=True), *((name, REST_OPENING_M) for name in FINGER_JOINTS)]
     for name, value in targets:
         qpos[model.joint(name).qposadr[0]] = value
@@ -104,9 +105,13 @@ class MacroExecutor:
         positions and on ``squeeze_m`` alone: the command to each finger that keeps an object held, or None, which opens
         the fingers to where they rest. Derived quantities are not updated.
         """
-        qpos, mocap_pos, mocap_quat = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
+        qpos = data.qpos.copy()
+        mocap_pos = data.mocap_pos.copy()
+        mocap_quat = data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
+        data.qpos[:] = qpos
+        data.mocap_pos[:] = mocap_pos
+        data.mocap_quat[:] = mocap_quat
         data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
         if squeeze_m is None:
             data.qpos[self._finger_qpos] = REST_OPENING_M
@@ -130,7 +135,8 @@ class MacroExecutor:
         Returns:
             The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
         """
-        timestep_s, start_rad = self.model.opt.timestep, np.array(OBSERVATION_QPOS_RAD)
+        timestep_s = self.model.opt.timestep
+        start_rad = np.array(OBSERVATION_QPOS_RAD)
         start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
             arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
@@ -141,9 +147,14 @@ class MacroExecutor:
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
         sim_time_s = (len(qpos) - 1) * timestep_s
         result = MacroResult(
-            sim_time_s=sim_time_s, ik_error_m=ik_error_m, fault=astray,
-            time_s=time_s, qpos=samples, qvel=qvel, ctrl=ctrl,
-        )  # fmt: skip
+            sim_time_s=sim_time_s,
+            ik_error_m=ik_error_m,
+            fault=astray,
+            time_s=time_s,
+            qpos=samples,
+            qvel=qvel,
+            ctrl=ctrl,
+        )
         return result, qpos, trajectory
 
     def refused(self, reason: str) -> MacroResult:
@@ -168,7 +179,8 @@ class MacroExecutor:
         if len(self._control) < steps:
             self._states = np.empty((steps + 1, self._states.shape[1]))
             self._control = np.empty((steps, self._control.shape[1]))
-        states, control = self._states[: steps + 1], self._control[:steps]
+        states = self._states[: steps + 1]
+        control = self._control[:steps]
         mujoco.mj_getState(self.model, data, states[0], _STATE.mjSTATE_FULLPHYSICS.value)
         mujoco.mj_getState(self.model, data, control[0], _INPUTS)
         control[1:] = control[0]
@@ -207,7 +219,10 @@ class MacroExecutor:
             Times in s (K,), positions (K, nq), velocities (K, nv) and commands (K, nu), with the first and the last
             step whenever ``motion_hz > 0``.
         """
-        timestep_s, (nq, nv, nu) = self.model.opt.timestep, (self.model.nq, self.model.nv, self.model.nu)
+        timestep_s = self.model.opt.timestep
+        nq = self.model.nq
+        nv = self.model.nv
+        nu = self.model.nu
         if motion_hz <= 0:
             return np.empty(0), np.empty((0, nq)), np.empty((0, nv)), np.empty((0, nu))
         stride = 1.0 / (motion_hz * timestep_s)

@@ -12,7 +12,8 @@ from ..scenes import constants as c
 
 _TILES = (4, 8)
 """Of the screen, away from the robot and across."""
-_LOW_M, _HIGH_M = (0.695, -0.12), (0.795, 0.12)
+_LOW_M = (0.695, -0.12)
+_HIGH_M = (0.795, 0.12)
 """Corners of the screen in the plane of the table, behind whatever stands there and in every frame."""
 _THICKNESS_M = 0.002
 _RADIUS_M = 0.012
@@ -35,11 +36,16 @@ def add_distractors(spec: mujoco.MjSpec, count: int) -> None:
         name = f"screen_{index}"
         spec.add_material(name=name, rgba=(0.5, 0.5, 0.5, 1.0), specular=0.0, emission=0.1)
         spec.worldbody.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(*sizes_m / 2, _THICKNESS_M / 2), material=name,
-            pos=(x_m, y_m, c.TABLE_HEIGHT_M + _THICKNESS_M / 2), **_DRAWN_ONLY,
-        )  # fmt: skip
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(*sizes_m / 2, _THICKNESS_M / 2),
+            material=name,
+            pos=(x_m, y_m, c.TABLE_HEIGHT_M + _THICKNESS_M / 2),
+            **_DRAWN_ONLY,
+        )
     for ball in range(1, count):
-        name, middle_m = f"distractor_{ball}", np.mean([_LOW_M, _HIGH_M], axis=0)
+        name = f"distractor_{ball}"
+        middle_m = np.mean([_LOW_M, _HIGH_M], axis=0)
         spec.add_material(name=name, rgba=_RGBA[ball - 1], specular=0.2, shininess=0.3)
         body = spec.worldbody.add_body(
             name=name, mocap=True, pos=(*middle_m, c.TABLE_HEIGHT_M + _THICKNESS_M + _RADIUS_M)

@@ -14,7 +14,8 @@ class Lag:
     """
 
     def __init__(self, macro_actions: int) -> None:
-        self.macro_actions, self.kept = macro_actions, tuple[Any, ...]()
+        self.macro_actions = macro_actions
+        self.kept = tuple[Any, ...]()
 
     def deliver(self, observation: Any) -> Any:
         """Take in the observation of this moment, once each, and return the one that is due, the caller's own."""

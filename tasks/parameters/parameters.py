@@ -31,8 +31,12 @@ class Dials:
 
     FAMILY: ClassVar[str]
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "slip": (0.0, 0.99), "fickle": (0.0, 1.0), "gesture": (0.0, 1.0), "lag": (0, 10), "distractors": (0, 4),
-    }  # fmt: skip
+        "slip": (0.0, 0.99),
+        "fickle": (0.0, 1.0),
+        "gesture": (0.0, 1.0),
+        "lag": (0, 10),
+        "distractors": (0, 4),
+    }
     """Lowest and highest value of each number; integers where these are."""
 
     def __post_init__(self) -> None:
@@ -45,7 +49,8 @@ class Dials:
         return isinstance(self.gesture, str) and self.gesture in GESTURES
 
     def _in_range(self, name: str, low: float, high: float) -> float:
-        value, kind = getattr(self, name), type(low)
+        value = getattr(self, name)
+        kind = type(low)
         right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
         if not right or not low <= value <= high:
             words = f"an integer from {low} to {high}" if kind is int else f"a number from {low:g} to {high:g}"

@@ -23,11 +23,15 @@ N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)
 POINTING = tuple(range(N_OBJECTS))
 """Gesture ``i`` points at object i."""
-OPEN_PALM, WITHDRAWN = N_OBJECTS, N_OBJECTS + 1
+OPEN_PALM = N_OBJECTS
+WITHDRAWN = N_OBJECTS + 1
 HAND_OVER = N_OBJECTS
 """The action after the three that pick or place an object."""
 
-PICK_REWARD, PLACE_REWARD, HANDOVER_REWARD, WRONG_REWARD = 1.0, 0.0, 5.0, -5.0
+PICK_REWARD = 1.0
+PLACE_REWARD = 0.0
+HANDOVER_REWARD = 5.0
+WRONG_REWARD = -5.0
 
 _ALL_PLACED = (PLACED,) * N_OBJECTS
 
@@ -94,7 +98,8 @@ class PickPlaceRules:
         """Whether ``action`` is what the human wants now, or the step toward it."""
         if self.is_terminal(macrostate):
             return False
-        held, gesture = held_object(macrostate), macrostate[N_OBJECTS]
+        held = held_object(macrostate)
+        gesture = macrostate[N_OBJECTS]
         if held is None:
             return action == gesture
         return action == (HAND_OVER if gesture == OPEN_PALM else held)
@@ -107,7 +112,8 @@ class PickPlaceRules:
         """
         if not 0 <= action < self.n_actions:
             raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
-        objects, held = macrostate[:N_OBJECTS], held_object(macrostate)
+        objects = macrostate[:N_OBJECTS]
+        held = held_object(macrostate)
         if HANDED_OVER in objects:
             return objects
         if action == HAND_OVER:
@@ -128,7 +134,8 @@ class PickPlaceRules:
         return fickle(found, self._asked_otherwise, self.world.fickle) if self.world.fickle else found
 
     def _asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
-        objects, gesture = outcome.macrostate[:N_OBJECTS], outcome.macrostate[N_OBJECTS]
+        objects = outcome.macrostate[:N_OBJECTS]
+        gesture = outcome.macrostate[N_OBJECTS]
         held = held_object(outcome.macrostate)
         wishes = POINTING if held is None else self._wishes(held)
         return [replace(outcome, macrostate=(*objects, wish)) for wish in wishes if wish != gesture]

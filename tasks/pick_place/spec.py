@@ -108,14 +108,20 @@ def spec_of(**world: Any) -> TaskSpec:
 def _spec(world: PickPlace) -> TaskSpec:
     if world == PickPlace():
         return SPEC
-    rules, dials = PickPlaceRules(world), str(world).partition(":")[2].replace(",", ", ")
+    rules = PickPlaceRules(world)
+    dials = str(world).partition(":")[2].replace(",", ", ")
     return replace(
-        SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
+        SPEC,
+        id=str(world),
+        title=f"{SPEC.title} ({dials})",
+        env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
         encoder=SPEC.encoder + world.looks,
         sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
-        rules=rules, facts=functools.partial(facts, rules, HORIZON),
-        render_macrostates=functools.partial(_rendered, rules), reference=None,
-    )  # fmt: skip
+        rules=rules,
+        facts=functools.partial(facts, rules, HORIZON),
+        render_macrostates=functools.partial(_rendered, rules),
+        reference=None,
+    )
 
 
 def make_env(**options: Any) -> MacroEnv:

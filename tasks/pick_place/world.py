@@ -45,13 +45,15 @@ class PickWorld(World):
 
     def __init__(self, level: Appearance, distractors: int = 0) -> None:
         objects = {spec.name: f"the {spec.name}" for spec in OBJECTS}
-        model, materials = compile_pick_scene(distractors), ("table_top", "skin", *MATERIALS)
+        model = compile_pick_scene(distractors)
+        materials = ("table_top", "skin", *MATERIALS)
         super().__init__(model, level, objects=objects, materials=materials, distractors=distractors)
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
-        self._tcp_m, self._palm_m = self.data.site_xpos[self._tcp], self.data.mocap_pos[self._palm]
+        self._tcp_m = self.data.site_xpos[self._tcp]
+        self._palm_m = self.data.mocap_pos[self._palm]
         self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
 
     @functools.cached_property
@@ -65,14 +67,21 @@ class PickWorld(World):
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object on its place, into the gripper or into the palm."""
-        spec, (right_m, up_m, turned_rad) = OBJECTS[index], self._off(offset)
+        spec = OBJECTS[index]
+        right_m, up_m, turned_rad = self._off(offset)
         if value == PLACED:
-            base_m, share_x, share_y = standing_m(index), 1.0, 1.0
+            base_m = standing_m(index)
+            share_x = 1.0
+            share_y = 1.0
         elif value == PICKED:
-            base_m, share_x, share_y = self._tcp_at_rest_m, _GRIP_SHARE, 0.0
+            base_m = self._tcp_at_rest_m
+            share_x = _GRIP_SHARE
+            share_y = 0.0
             self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
-            base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
+            base_m = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m)
+            share_x = 1.0
+            share_y = 1.0
         self.data.qpos[self.object_qpos[index]] = (
             base_m[0] + share_x * right_m,
             base_m[1] + share_y * up_m,
@@ -119,7 +128,8 @@ class PickWorld(World):
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
         else happened is not what they asked for, so they withdraw.
         """
-        before, poses = self._objects()[0], self.object_poses()
+        before = self._objects()[0]
+        poses = self.object_poses()
         stays = before == intended[:N_OBJECTS]
         result = self._act(action, before, stays, capture_motion_hz)
         self.update()
@@ -135,7 +145,8 @@ class PickWorld(World):
 
     def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> MacroResult:
         """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
-        held, executor = held_object(objects), self.executor
+        held = held_object(objects)
+        executor = self.executor
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
             if held is not None and self._read_gesture() == OPEN_PALM and not stays:
@@ -154,7 +165,10 @@ class PickWorld(World):
     # --- reading -------------------------------------------------------------------------------------------------
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        spec, name, position_m, palm_m = OBJECTS[index], self._names[index], pose[:3], self._palm_m.tolist()
+        spec = OBJECTS[index]
+        name = self._names[index]
+        position_m = pose[:3]
+        palm_m = self._palm_m.tolist()
         in_the_air = position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M
         if in_the_air and math.dist(position_m, self._tcp_m.tolist()) < MAX_OFF_GRIP_M:
             return PICKED, None

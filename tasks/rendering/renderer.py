@@ -150,7 +150,10 @@ class _Canvas:
 
     def close(self) -> None:
         """Free everything; nothing if that was done before or belongs to a parent process or another thread."""
-        gl, mjr, self.gl, self.mjr = self.gl, self.mjr, None, None
+        gl = self.gl
+        mjr = self.mjr
+        self.gl = None
+        self.mjr = None
         if gl is None:
             return
         if not self.usable:
@@ -165,15 +168,21 @@ class _Canvas:
 @contextlib.contextmanager
 def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
     """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
-    quality, size = model.vis.quality, model.vis.global_
-    before, size_before = copy.copy(quality), copy.copy(size)
-    quality.shadowsize, quality.offsamples = view.shadow_px, view.samples
-    quality.numslices, quality.numstacks = view.slices, max(view.slices // 2, 3)
-    size.offwidth, size.offheight = view.width, view.height
+    quality = model.vis.quality
+    size = model.vis.global_
+    before = copy.copy(quality)
+    size_before = copy.copy(size)
+    quality.shadowsize = view.shadow_px
+    quality.offsamples = view.samples
+    quality.numslices = view.slices
+    quality.numstacks = max(view.slices // 2, 3)
+    size.offwidth = view.width
+    size.offheight = view.height
     try:
         yield
     finally:
-        model.vis.quality, model.vis.global_ = before, size_before
+        model.vis.quality = before
+        model.vis.global_ = size_before
 
 
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
@@ -204,20 +213,26 @@ class Renderer:
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self._canvas: _Canvas | None = None
-        self._takeovers, self._lock, self._pid = 0, threading.RLock(), os.getpid()
+        self._takeovers = 0
+        self._lock = threading.RLock()
+        self._pid = os.getpid()
         require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
-        self.view, self._model = view, model
+        self.view = view
+        self._model = model
         self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
         self._bottom_up = np.empty((view.height, view.width, 3), dtype=np.uint8)
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
-        flags, drawn = mujoco.mjtRndFlag, self._scene.flags
-        drawn[flags.mjRND_SHADOW.value], drawn[flags.mjRND_SKYBOX.value] = view.shadow_px > 0, view.sky
+        flags = mujoco.mjtRndFlag
+        drawn = self._scene.flags
+        drawn[flags.mjRND_SHADOW.value] = view.shadow_px > 0
+        drawn[flags.mjRND_SKYBOX.value] = view.sky
         drawn[flags.mjRND_REFLECTION.value] = drawn[flags.mjRND_HAZE.value] = False
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
         self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(view.camera).id
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.camera(view.camera).id
 
     def frame(self, data: mujoco.MjData, model: mujoco.MjModel | None = None) -> NDArray[np.uint8]:
         """Draw ``data``, whose derived positions are up to date: a new upright RGB array. Shape (height, width, 3).
@@ -251,7 +266,8 @@ class Renderer:
     def _one_at_a_time(self) -> AbstractContextManager[Any]:
         """The lock of this process: a thread of the parent's that held it when this was forked lives there alone."""
         if self._pid != os.getpid():
-            self._lock, self._pid = threading.RLock(), os.getpid()
+            self._lock = threading.RLock()
+            self._pid = os.getpid()
         return self._lock
 
     def _ready_canvas(self) -> _Canvas:
@@ -271,7 +287,8 @@ class Renderer:
     def close(self) -> None:
         """Free the OpenGL context, if this process has one. Safe to call again; a later frame makes a new one."""
         with self._one_at_a_time():
-            canvas, self._canvas = self._canvas, None
+            canvas = self._canvas
+            self._canvas = None
             _open.discard(self)
             if canvas is not None:
                 self._finalizer.detach()

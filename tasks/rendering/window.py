@@ -28,7 +28,8 @@ def open_display(*, seen: bool) -> ModuleType:
         import pygame  # noqa: PLC0415  (an extra)
     except ImportError as error:
         raise SetupError("Windows need pygame: pip install 'imagine-bench[play]'.") from error
-    chosen, linux = os.environ.get("SDL_VIDEODRIVER"), sys.platform == "linux"
+    chosen = os.environ.get("SDL_VIDEODRIVER")
+    linux = sys.platform == "linux"
     for driver in () if chosen or not linux else ("x11", "wayland", "dummy"):
         os.environ["SDL_VIDEODRIVER"] = driver
         with contextlib.suppress(pygame.error):
@@ -47,14 +48,17 @@ class Window:
     """One window with a title, opened by its first image, of whose size it is."""
 
     def __init__(self, title: str) -> None:
-        self._title, self._pygame, self._clock = title, cast(Any, None), cast(Any, None)
+        self._title = title
+        self._pygame = cast(Any, None)
+        self._clock = cast(Any, None)
 
     def show(self, image: Frame, per_s: float) -> None:
         """Show an image (H, W, 3) and wait until the next one is due, so many a second; SetupError without pygame."""
         if self._pygame is None:
             self._pygame = open_display(seen=False)
             self._clock = self._pygame.time.Clock()
-        pygame, (height, width, _) = self._pygame, image.shape
+        pygame = self._pygame
+        height, width, _ = image.shape
         screen = pygame.display.get_surface()
         if screen is None or screen.get_size() != (width, height):
             screen = pygame.display.set_mode((width, height))
