@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 
 from .frames import frames_of
 from .motion.executor import MacroResult
-from .observations import Observer
+from .observations import Observed, Observer
 from .parameters.gesture import hides
 from .parameters.lag import Lag
 from .rendering.cameras import FRAME_PX, agent_camera, human_camera_view
@@ -32,6 +32,8 @@ from .scenes.constants import HUMAN_CAMERA
 from .world import World, WorldState
 
 _WINDOW_HZ = 25.0  # images a second of a window
+Info = dict[str, Any]
+"""What Gymnasium calls info: numpy scalars and arrays, and sentences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +49,10 @@ class EnvState:
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
     steps: int = 0
     #: what lag keeps back: observations, and what they show
-    under_way: tuple[tuple[Any, ...], ...] = field(default=((), ()), repr=False)
+    under_way: tuple[tuple[Observed, ...], tuple[State, ...]] = field(default=((), ()), repr=False)
 
 
-class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
+class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
     Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
@@ -118,7 +120,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
-        physics: PhysicsSettings | Mapping[str, Any] = PhysicsSettings(),  # noqa: B008 - frozen
+        physics: PhysicsSettings | Mapping[str, float | str] = PhysicsSettings(),  # noqa: B008 - frozen
         motion_hz: float = 0.0,
         observation: str = "frame",
         size: int = FRAME_PX,
@@ -133,7 +135,9 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self.horizon = spec.horizon
         self._sight = spec.sight
         self._steps = 0
-        self._lag, self._shown_lag = self._lags = [Lag(spec.sight.lag if spec.sight else 0) for _ in range(2)]
+        lag = spec.sight.lag if spec.sight else 0
+        self._lag = Lag[Observed](lag)
+        self._shown_lag = Lag[State](lag)
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         level = appearance_level(appearance)
@@ -152,7 +156,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
         """Start an episode.
 
         Args:
@@ -167,7 +171,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._show()
         return self.observe([self])[0], info
 
-    def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
@@ -182,7 +186,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._reach(reading.macrostate)
         return self._info(success=False, legal=self._rules.is_legal(reading.macrostate), fault=reading.problem)
 
-    def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
 
         Raises:
@@ -193,7 +197,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._show()
         return self.observe([self])[0], reward, terminated, False, info
 
-    def act(self, action: np.int64 | int) -> tuple[float, bool, dict[str, Any]]:
+    def act(self, action: np.int64 | int) -> tuple[float, bool, Info]:
         """As :meth:`step`, without an observation. Nothing is drawn, so any thread may call it.
 
         Returns:
@@ -237,12 +241,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         """Whether there is an episode to go on with."""
         return self._begun
 
-    def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
+    def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
         now = self._observer.observe([(env._observer, env.world.shown(env._macrostate)) for env in envs])
         return [env._lag.deliver(observation) for env, observation in zip(envs, now, strict=True)]
 
-    def diverged(self, error: DivergedError) -> dict[str, Any]:
+    def diverged(self, error: DivergedError) -> Info:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
         self._latest = None
         return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
@@ -258,9 +262,9 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
         renderers = self._agent_camera, self._render_camera, self._human_camera
-        open_ones: list[Any] = [each for each in (self._window, self._observer, *renderers) if each is not None]
-        for each in open_ones:
-            each.close()
+        for each in (self._window, self._observer, *renderers):
+            if each is not None:
+                each.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
@@ -277,7 +281,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
             latest=self._latest,
             people=self._people,
             steps=self._steps,
-            under_way=tuple(lag.kept for lag in self._lags),
+            under_way=(self._lag.kept, self._shown_lag.kept),
         )
 
     def set_state(self, state: EnvState) -> None:
@@ -338,7 +342,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._macrostate = macrostate
         self._shown = self._shown_lag.deliver(self.world.shown(macrostate))
 
-    def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
+    def _start(self, options: Info) -> tuple[int, ...]:
         if not isinstance(options, Mapping):
             raise InvalidValueError(
                 f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
@@ -387,7 +391,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         chances = np.array([outcome.probability for outcome in outcomes])
         return outcomes[int(self.np_random.choice(len(outcomes), p=chances / chances.sum()))]
 
-    def _info(self, *, success: bool, legal: bool, fault: str | None) -> dict[str, Any]:
+    def _info(self, *, success: bool, legal: bool, fault: str | None) -> Info:
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),

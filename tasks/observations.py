@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,6 +17,10 @@ from .scene_reader import arm_columns, tcp_in_world
 from .scenes.arm import TCP_SITE
 from .world import World
 
+Part = NDArray[np.uint8] | NDArray[np.float32]
+"""An image, or a vector."""
+Observed = Part | dict[str, Part]
+"""What is observed of one moment: one part, or several by name."""
 _Camera = Callable[[str, int], Renderer]
 _Moment = tuple["Observer", tuple[int, ...]]
 _LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
@@ -58,15 +61,15 @@ class Observer:
         self._arm_qpos, _, _ = arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
+        self._cameras: dict[str, Renderer] = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
-        spaces: dict[str, gymnasium.Space[Any]] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
+        spaces = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
         chosen = {name: spaces[name] for name in self._names}
-        self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
+        self.space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
 
-    def observe(self, moments: Sequence[_Moment]) -> list[Any]:
+    def observe(self, moments: Sequence[_Moment]) -> Sequence[Observed]:
         """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""
         scenes = [(observer._world.model, observer._world.data) for observer, _ in moments]
         images = {name: camera.frames(scenes) for name, camera in self._cameras.items()}
@@ -80,7 +83,7 @@ class Observer:
         for camera in self._cameras.values():
             camera.close()
 
-    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> list[NDArray[Any]]:
+    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> Sequence[Part]:
         """One part of each moment."""
         if images is None:
             return [each._one_hot(state) if name == "state" else each._proprio() for each, state in moments]

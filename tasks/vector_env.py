@@ -21,12 +21,23 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
+from imagine_bench.interfaces import Frame
 
-from .macro_env import MacroEnv
+from .macro_env import Info, MacroEnv
+from .observations import Observed
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
-_Step = tuple[float, bool, dict[str, Any]]
-Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+Batch = tuple[Observed, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What became of a lane's macro-action."""
+
+    reward: float
+    terminated: bool
+    info: Info
+    diverged: bool = False
 
 
 @dataclass(frozen=True)
@@ -38,13 +49,19 @@ class _Acting:
 
     def due_s(self) -> float:
         """When it ends on that clock; waits until it has been simulated."""
-        if self.step is None or self.step.exception() is not None:
+        if self.step is None:
             return self.begun_s
-        *_, info = self.step.result()
-        return self.begun_s + float(info["sim_time_s"])
+        return self.begun_s + float(self.step.result().info["sim_time_s"])
 
 
-class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
+def _act(env: MacroEnv, action: int) -> _Step:
+    try:
+        return _Step(*env.act(action))
+    except DivergedError as error:
+        return _Step(0.0, False, env.diverged(error), diverged=True)
+
+
+class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.int64]]):
     """Several environments of one task in step, or each at its own pace by :meth:`send` and :meth:`recv`.
 
     Spaces, info and seeds are those of ``gymnasium.vector.SyncVectorEnv``: lane i is seeded ``seed + i``, info holds
@@ -89,7 +106,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._threads = ThreadPoolExecutor(threads, "simulation")
-        self._seen: list[Any] = [None] * self.num_envs
+        self._seen: list[Observed | None] = [None] * self.num_envs
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
@@ -99,8 +116,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[Observed, Info]:
         """Start an episode in every lane, whatever it was doing, or in those of ``options["reset_mask"]``.
 
         Args:
@@ -117,7 +134,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         for lane in chosen:
             acting = self._acting.pop(lane, None)
             if acting is not None and acting.step is not None:
-                acting.step.exception()  # its data is in use until then
+                acting.step.result()  # its data is in use until then
         infos = self._restart(chosen, seeds, options)
         return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
 
@@ -130,11 +147,11 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self.send(actions)
         return self._received(list(range(self.num_envs)))
 
-    def render(self) -> tuple[Any, ...] | None:
+    def render(self) -> tuple[Frame, ...] | None:
         """An image of each lane, or None without a render mode."""
         return None if self.render_mode is None else tuple(self.envs[0].rendered(self.envs))
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Free threads and OpenGL contexts."""
         del kwargs
         self._threads.shutdown()
@@ -191,17 +208,24 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
     # --- details -------------------------------------------------------------------------------------------------
 
     def _received(self, lanes: list[int]) -> Batch:
-        """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
+        """Observeds, rewards and ends of these lanes in this order; infos of all, masked."""
         rewards = np.zeros(len(lanes))
-        ends = np.zeros((2, len(lanes)), dtype=np.bool_)
-        infos: dict[int, dict[str, Any]] = {}
+        terminated = np.zeros(len(lanes), dtype=np.bool_)
+        truncated = np.zeros(len(lanes), dtype=np.bool_)
+        infos: dict[int, Info] = {}
         for row, lane in enumerate(lanes):
             acting = self._acting.pop(lane)
             if acting.step is not None:
-                rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting.step)
-        self._over[lanes] = ends.any(axis=0)
+                step = acting.step.result()
+                self._elapsed[lane] += 1
+                rewards[row] = step.reward
+                terminated[row] = step.terminated
+                out_of_time = self._horizon is not None and self._elapsed[lane] >= self._horizon
+                truncated[row] = step.diverged or out_of_time
+                infos[lane] = step.info
+        self._over[lanes] = terminated | truncated
         acted = [lane for lane in infos if self.envs[lane].begun]  # not those that diverged
-        collected: dict[str, Any] = {}
+        collected: Info = {}
         again = [lane for lane in lanes if lane not in infos]
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             again = [lane for lane in lanes if self._over[lane]]
@@ -211,29 +235,20 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         acted = [lane for lane in acted if lane not in again]
         infos.update(self._restart(again, [None] * self.num_envs, {}, also=acted))
         collected.update(_columns(infos, self.num_envs))
-        return self._stacked(lanes), rewards, ends[0], ends[1], collected
+        return self._stacked(lanes), rewards, terminated, truncated, collected
 
     def _begin(self, env: MacroEnv, action: int) -> Future[_Step]:
         """Begin a macro-action on another thread; a kinematic one is done here and now."""
         if self._simulates:
             env.world.prepare()  # compiles, which only one thread may do at a time
-            return self._threads.submit(env.act, action)
+            return self._threads.submit(_act, env, action)
         done = Future[_Step]()
-        done.set_result(env.act(action))
+        done.set_result(_act(env, action))
         return done
 
-    def _conclude(self, lane: int, step: Future[_Step]) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Reward, terminated, truncated and info, when all has been simulated."""
-        self._elapsed[lane] += 1
-        try:
-            reward, terminated, info = step.result()
-        except DivergedError as error:
-            return 0.0, False, True, self.envs[lane].diverged(error)
-        return reward, terminated, self._horizon is not None and self._elapsed[lane] >= self._horizon, info
-
     def _restart(
-        self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any], also: Sequence[int] = ()
-    ) -> dict[int, dict[str, Any]]:
+        self, lanes: Sequence[int], seeds: Sequence[int | None], options: Info, also: Sequence[int] = ()
+    ) -> dict[int, Info]:
         """Their infos; they and the lanes ``also`` are observed together, so that both processes draw until the end."""
         infos = {}
         for lane in lanes:
@@ -250,7 +265,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             for lane, observation in zip(lanes, seen, strict=True):
                 self._seen[lane] = observation
 
-    def _stacked(self, lanes: Sequence[int]) -> Any:
+    def _stacked(self, lanes: Sequence[int]) -> Observed:
         """The latest observations of these lanes, copied."""
         out: Any = create_empty_array(self.single_observation_space, n=len(lanes))
         return concatenate(self.single_observation_space, [self._seen[lane] for lane in lanes], out)
@@ -263,7 +278,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             raise InvalidValueError(f"Lanes {brief(ids)}: give different integers from 0 to {self.num_envs - 1}.")
         return lanes
 
-    def _masked(self, mask: Any) -> list[int]:
+    def _masked(self, mask: NDArray[np.bool_] | None) -> list[int]:
         if mask is None:
             return list(range(self.num_envs))
         mask = np.asarray(mask)
@@ -275,7 +290,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             raise InvalidValueError("reset_mask leaves out lanes that were never reset; reset all lanes first.")
         return lanes
 
-    def _seeds(self, seed: Any) -> list[int | None]:
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None or isinstance(seed, (int, np.integer)):
             return [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
@@ -283,10 +298,10 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         return list(seed)
 
 
-def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
+def _columns(infos: dict[int, Info], n: int) -> Info:
     """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
     lanes = np.array(list(infos), dtype=np.int64)
-    columns = dict[str, Any]()
+    columns = Info()
     mask = np.zeros(n, dtype=np.bool_)
     mask[lanes] = True
     for key, example in next(iter(infos.values()), {}).items():
@@ -304,7 +319,7 @@ def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
     return columns
 
 
-def _rows(infos: dict[str, Any], lanes: list[int]) -> dict[str, Any]:
+def _rows(infos: Info, lanes: list[int]) -> Info:
     """Those lanes of arrays over all lanes."""
     return {key: _rows(value, lanes) if isinstance(value, dict) else value[lanes] for key, value in infos.items()}
 

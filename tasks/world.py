@@ -6,6 +6,7 @@ import abc
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -22,6 +23,10 @@ from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
 from .scenes.fragments import Photographer, Shot
+
+if TYPE_CHECKING:
+    from .motion.carry import CarryExecutor
+    from .motion.turn import TurnExecutor
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -196,9 +201,14 @@ class World(abc.ABC):
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
 
+    @property
     @abc.abstractmethod
+    def executor(self) -> CarryExecutor | TurnExecutor:
+        """What carries macro-actions out in contact physics, made when it is first needed."""
+
     def prepare(self) -> None:
-        """Make what :meth:`execute` needs, which otherwise the first execution makes."""
+        """Make the executor, which otherwise the first execution makes."""
+        _ = self.executor
 
     @abc.abstractmethod
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:

@@ -51,10 +51,6 @@ class ArrowWorld(World):
         self._gesture(intended[-1])
         self.update()
 
-    def prepare(self) -> None:
-        """Make the executor now."""
-        _ = self.executor
-
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 

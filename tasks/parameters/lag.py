@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Generic, TypeVar
+
+_Observed = TypeVar("_Observed")
 
 
-class Lag:
+class Lag(Generic[_Observed]):
     """The observations that are still under way; ``kept`` is all its state.
 
     Args:
@@ -15,9 +17,9 @@ class Lag:
 
     def __init__(self, macro_actions: int) -> None:
         self.macro_actions = macro_actions
-        self.kept = tuple[Any, ...]()
+        self.kept: tuple[_Observed, ...] = ()
 
-    def deliver(self, observation: Any) -> Any:
+    def deliver(self, observation: _Observed) -> _Observed:
         """Take in the observation of this moment, once each, and return the one that is due, the caller's own."""
         if not self.macro_actions:
             return observation

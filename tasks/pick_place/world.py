@@ -118,10 +118,6 @@ class PickWorld(World):
         self._gesture(intended[N_OBJECTS])
         self.update()
 
-    def prepare(self) -> None:
-        """Make the executor now."""
-        _ = self.executor
-
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
