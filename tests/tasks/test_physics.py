@@ -84,12 +84,9 @@ def test_wrong_settings_name_what_is_allowed(given, error, message):
     [
         ("arrow_puzzle", "pad_friction", 0.01, 11, 12),  # flat jaws turn a box by its shape
         ("arrow_puzzle", "finger_force_n", 0.9, 12, 12),
-        ("arrow_puzzle", "finger_force_n", 0.1, 0, 0),
-        ("arrow_puzzle", "plan_error_mm", 40.0, 0, 1),
         ("arrow_puzzle", "plan_error_deg", 45.0, 0, 0),
         ("pick_place", "pad_friction", 0.01, 0, 0),  # where something is lifted, friction decides
         ("pick_place", "finger_force_n", 0.3, 0, 0),
-        ("pick_place", "object_mass", 60.0, 0, 0),
         ("pick_place", "plan_error_mm", 8.0, 12, 12),
         ("pick_place", "plan_error_mm", 40.0, 0, 0),
     ],

@@ -88,20 +88,11 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatc
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
     camera = agent_camera(world.model)
-    twin = pickle.loads(pickle.dumps(camera))
+    twin = pickle.loads(pickle.dumps(camera))  # as a pickled environment's
     with pytest.raises(pytest.fail.Exception, match="made a context"):
         twin.frame(world.data)
     twin.close()
     camera.close()
-
-
-def test_a_pickled_renderer_draws_the_same(world):
-    camera = agent_camera(world.model)
-    before = camera.frame(world.data)
-    twin = pickle.loads(pickle.dumps(camera))
-    assert np.array_equal(twin.frame(world.data), before)
-    camera.close()
-    twin.close()
 
 
 def _draw_in_child(connection, camera, data):
@@ -199,8 +190,8 @@ _FRAME = """
     ids=["collected", "mujoco_first_and_closed", "left_open"],
 )
 def test_a_headless_script_draws_and_exits_in_silence(before, after):
-    """MUJOCO_GL is empty and there is no display; nothing is said on stderr, however the script ends."""
-    done = run_script(_FRAME.format(before=before, after=after), MUJOCO_GL="")
+    """MUJOCO_GL is empty and the display is a stale one; nothing is said on stderr, however the script ends."""
+    done = run_script(_FRAME.format(before=before, after=after), MUJOCO_GL="", DISPLAY=":99")
     assert done.returncode == 0
     assert done.stdout.strip() == "True"
     assert done.stderr == ""
@@ -219,16 +210,11 @@ def test_the_llvm_of_triton_is_loaded_before_mesa_s(tmp_path):
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
-def test_a_stale_display_is_not_drawn_with():
-    done = run_script(_FRAME.format(before="", after="env.close()"), DISPLAY=":99")
-    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other platforms")
-def test_a_platform_that_does_not_exist_is_named():
-    done = run_script(_FRAME.format(before="", after=""), MUJOCO_GL="elg")
-    assert "SetupError: MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa." in done.stderr
+def test_a_platform_that_does_not_exist_is_named(monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("MUJOCO_GL", "elg")
+    with pytest.raises(SetupError, match="MUJOCO_GL is 'elg'; unset it, or give one of egl, glfw, osmesa"):
+        choose_platform()
 
 
 @pytest.mark.parametrize("installed", [None, "libOSMesa.so.8"])

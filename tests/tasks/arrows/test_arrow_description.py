@@ -86,8 +86,8 @@ def drawn(rng):
 
 def test_a_canonical_name_says_its_world_and_only_it():
     rng = np.random.default_rng(0)
-    worlds = [world for world in (drawn(rng) for _ in range(2000)) if world is not None]
-    assert len(worlds) > 1000
+    worlds = [world for world in (drawn(rng) for _ in range(600)) if world is not None]
+    assert len(worlds) > 300
     for world in worlds:
         _, _, said = str(world).partition(":")
         again = Arrows(**parse_options(said, KINDS, "")) if said else Arrows()
@@ -187,9 +187,7 @@ def test_turns_are_coupled_to_the_right_and_shuffled():
     assert set(spec.action_names) == set(named) and spec.action_names != named
 
 
-@pytest.mark.parametrize(
-    "world", [{"cubes": 5, "slip": 0.1}, {"cubes": 1}, {"horizon": 3}, {"cubes": 6, "goal": "pointed"}]
-)
+@pytest.mark.parametrize("world", [{"cubes": 5, "slip": 0.1}, {"horizon": 3}])
 def test_gymnasium_makes_worlds_that_end_at_their_horizon(world):
     spec = registry.task("arrows:" + ",".join(f"{name}={value}" for name, value in world.items()))
     one = gymnasium.make("imagine_bench/Arrows-v0", **world, execution="kinematic")

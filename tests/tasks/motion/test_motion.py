@@ -1,6 +1,5 @@
 """Macro-actions in contact: turns do what the rules say, by contact, within the robot's limits, bit for bit."""
 
-import itertools
 import math
 import pickle
 import re
@@ -11,9 +10,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import REST_OPENING_M, MacroExecutor
-from imagine_bench.tasks.motion.ik import ArmIK
-from imagine_bench.tasks.motion.trajectory import Waypoint, plan
+from imagine_bench.tasks.motion.executor import REST_OPENING_M
 from imagine_bench.tasks.motion.turn import TurnExecutor
 from imagine_bench.tasks.scenes.constants import (
     CUBE_EDGE_M,
@@ -77,7 +74,7 @@ def test_planning_and_scene_have_the_same_servos(arm, turner):
     np.testing.assert_allclose(damping, arm.damping_nms_rad, rtol=1e-3)  # frozen fingers change the inertia a little
 
 
-@pytest.mark.parametrize(("cube", "clockwise"), list(itertools.product(range(3), (True, False))))
+@pytest.mark.parametrize(("cube", "clockwise"), [(0, True), (1, False), (2, True)])
 def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
     model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
     place(model, data, (0.05, -0.05, QUARTER_RAD))
@@ -216,15 +213,6 @@ def test_a_turn_is_a_pure_function_of_positions_and_action(turner):
     np.testing.assert_array_equal(fresh.qpos, first)
 
 
-def test_turns_leave_mocap_bodies_where_they_are(turner):
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
-    place(model, data, (0, 0, 0))
-    assert model.nmocap > 0
-    data.mocap_pos[0] = (0.9, 0.1, 0.2)
-    turner.turn(data, cube=0, clockwise=True)
-    np.testing.assert_array_equal(data.mocap_pos[0], (0.9, 0.1, 0.2))
-
-
 def tips(model):
     return [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
 
@@ -261,39 +249,6 @@ def test_an_arm_that_does_not_come_back_is_a_fault(turner):
 
     fault = turned_deg(turner, compile_arrow_scene(), pulled_wrist)[1]
     assert re.fullmatch(r"the arm ended 0\.\d{3} rad off its observation pose", fault)
-
-
-def lifted_m(model):
-    """How high cube 1 is after the fingers close on it as for a turn and go up by 60 mm."""
-    arm, executor, data = ArmModel(), MacroExecutor(model), mujoco.MjData(model)
-    place(model, data, (0, 0, 0))
-    ik, at = ArmIK(arm), np.array([*SLOTS_XY_M[1], CUBE_Z_M])
-    down, up = (ik.solve(position_in_base_m=at + np.array((0, 0, z)), yaw_rad=0.0).qpos_rad for z in (0, 0.06))
-    squeezed_m = CUBE_EDGE_M / 2 - 0.004
-    waypoints = [
-        Waypoint(name="above", qpos_rad=up, opening_m=REST_OPENING_M),
-        Waypoint(name="down", qpos_rad=down, opening_m=REST_OPENING_M),
-        Waypoint(name="close", qpos_rad=down, opening_m=squeezed_m, min_duration_s=0.1),
-        Waypoint(name="up", qpos_rad=up, opening_m=squeezed_m, min_duration_s=0.4),
-    ]
-    start = np.array(OBSERVATION_QPOS_RAD)
-    trajectory = plan(
-        arm,
-        start_qpos_rad=start,
-        start_opening_m=REST_OPENING_M,
-        waypoints=waypoints,
-        timestep_s=model.opt.timestep,
-    )
-    executor.run(data, trajectory)
-    return data.qpos[cube_slice(model, 1)][2] - CUBE_Z_M
-
-
-def test_the_grip_is_friction():
-    """The same motion lifts the cube with rubber tips and leaves it standing with slippery ones."""
-    model = compile_arrow_scene()
-    assert lifted_m(model) > 0.055
-    model.geom_friction[tips(model)] = (0.02, 0.001, 0.0001)
-    assert lifted_m(model) < 0.001
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def test_a_dial_at_0_changes_nothing(task):
 def walk(name, execution, steps):
     """Probability that the rules gave to what came, and to slips and to a human elsewhere, and how often these came."""
     spec = registry.task(name)
-    env = gymnasium.make(spec.env_id, execution=execution, disable_env_checker=True)
+    env = gymnasium.make(spec.env_id, execution=execution, observation="state", disable_env_checker=True)
     rng, found = np.random.default_rng(0), []
     _, info = env.reset(seed=5)
     for _ in range(steps):

@@ -63,7 +63,7 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
     n_gestures = len(registry.task(NAMES[id_]).macrostate_values[-1])
     for gesture in ("always", "first", 0.3):
         env = make(id_, gesture=gesture, observation="state")
-        walks = [walk(env, 8, seed) for seed in range(60)]
+        walks = [walk(env, 8, seed) for seed in range(60 if gesture == 0.3 else 20)]
         seen = np.array([[state[-n_gestures:].any() for state, _ in each] for each in walks])
         assert all(len(truth) - 1 + state[-n_gestures:].any() == state.sum() for each in walks for state, truth in each)
         carried = np.array([[id_ == IDS[1] and 2 in state[:-1] for _, state in each] for each in walks])
@@ -76,7 +76,7 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
 
 
 @pytest.mark.parametrize("execution", ["kinematic", "physics"])
-@pytest.mark.parametrize(("id_", "dials"), [(IDS[0], {"gesture": 0.5}), (IDS[0], {"lag": 1}), (IDS[1], {"lag": 1})])
+@pytest.mark.parametrize(("id_", "dials"), [(IDS[0], {"gesture": 0.5}), (IDS[1], {"lag": 1})])
 def test_what_was_moved_stands_as_if_it_never_was(id_, dials, execution):
     """Its pose is spread as after a reset, else frames would tell what memory should; a turn's yaw is off by 1 degree.
 
@@ -84,9 +84,9 @@ def test_what_was_moved_stands_as_if_it_never_was(id_, dials, execution):
     """
     index, start, actions = (0, (0, 1, 2, 0), (0,)) if id_ == IDS[0] else (1, (0, 0, 0, 1), (1, 1))
     spread = []
-    for env in (make(id_, execution=execution, **dials), make(id_, execution=execution)):
+    for env, seeds in ((make(id_, execution=execution, **dials), 60), (make(id_, execution=execution), 6)):
         found = []
-        for seed in range(60):
+        for seed in range(seeds):
             env.reset(seed=seed, options={"macrostate": start})
             before = offsets(env)[index]
             for action in actions:
@@ -123,42 +123,6 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
     for step, (frame, macrostate) in enumerate(late):
         np.testing.assert_array_equal(frame, now[max(0, step - 3)][0])
         np.testing.assert_array_equal(macrostate, now[step][1])
-
-
-@pytest.mark.parametrize("id_", IDS)
-@pytest.mark.parametrize(
-    ("dials", "execution", "steps"),
-    [
-        ({"gesture": "first", "distractors": 2}, "kinematic", 25),
-        ({"gesture": 0.5, "lag": 2, "slip": 0.2, "fickle": 0.3}, "kinematic", 25),
-        ({"gesture": 0.5, "lag": 1, "slip": 0.5, "fickle": 0.5, "distractors": 3, "appearance": "mild"}, "physics", 6),
-    ],
-)
-def test_lanes_and_singles_are_equal(id_, dials, execution, steps):
-    """What is seen, told and paid, and in physics where all stands and how it moves, to the bit."""
-    options = {"num_envs": 4 if execution == "kinematic" else 2, "execution": execution, **dials}
-    vector = gymnasium.make_vec(f"{id_}-vector-v0", threads=2, **options)
-    sync = gymnasium.make_vec(
-        f"{id_}-v0", vectorization_mode="sync", **options,
-        vector_kwargs={"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP},
-    )  # fmt: skip
-    draw = np.random.default_rng(1)
-    pairs = [(vector.reset(seed=5)[0], sync.reset(seed=5)[0])]
-    for _ in range(steps):
-        actions = draw.integers(vector.single_action_space.n, size=options["num_envs"])
-        mine, theirs = vector.step(actions), sync.step(actions)
-        pairs += [(mine[index], theirs[index]) for index in range(4)]
-        pairs += [(mine[4][name], theirs[4][name]) for name in ("macrostate", "shown", "fault", "sim_time_s")]
-        assert not mine[4]["fault"].any()
-        pairs += [
-            (getattr(one.data, name).copy(), getattr(other.unwrapped.data, name).copy())
-            for one, other in zip(vector.unwrapped.envs, sync.unwrapped.envs, strict=True)
-            for name in ("qpos", "qvel", "mocap_pos")
-        ]
-    for one, other in pairs:
-        np.testing.assert_array_equal(one, other)
-    vector.close()
-    sync.close()
 
 
 def test_a_state_holds_old_frames_and_what_is_hidden():

@@ -15,10 +15,9 @@ from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering.renderer import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
-from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.tools.fidelity import measure_fidelity
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
@@ -79,17 +78,6 @@ def test_tips_hand_table_objects_and_palm_touch(world):
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_every_macrostate_is_read_back_at_every_level(level):
-    world, generator = PickWorld(appearance(level)), rng()
-    for state in RULES.states:
-        for _ in range(3):
-            world.place(state, generator)
-            world.vary(generator)
-            reading = world.read()
-            assert (reading.macrostate, reading.problem) == (state, None)
 
 
 @pytest.mark.parametrize(
@@ -199,25 +187,15 @@ def test_only_friction_lifts(spoil, index):
     assert world.read().macrostate[3] == WITHDRAWN
 
 
-def test_what_is_dropped_is_a_fault_and_ends_the_episode():
-    env = gymnasium.make(SPEC.env_id).unwrapped
-    env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
-    slippery_tips(env.world.model)
-    _, reward, terminated, _, info = env.step(HAND_OVER)
-    env.close()
-    assert info["fault"]
-    assert "car" in info["fault_reason"] or "the scene reads" in info["fault_reason"]
-    assert (reward, terminated, info["success"]) == (-5.0, True, False)
-    assert info["macrostate"][3] == WITHDRAWN
-
-
-@pytest.mark.parametrize("index", range(3))
-def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
+@pytest.mark.parametrize(
+    ("macrostate", "action"), [((0, 1, 0, OPEN_PALM), HAND_OVER), ((1, 0, 0, 1), 0), ((0, 0, 1, 0), 2)]
+)
+def test_what_is_dropped_is_a_fault_and_ends_the_episode(macrostate, action):
     """Wherever it lies then, the human does not take it for what they asked for."""
     env = gymnasium.make(SPEC.env_id).unwrapped
-    env.reset(seed=0, options={"macrostate": (*(int(each == index) for each in range(3)), (index + 1) % 3)})
+    env.reset(seed=0, options={"macrostate": macrostate})
     slippery_tips(env.world.model)
-    _, reward, terminated, _, info = env.step(index)
+    _, reward, terminated, _, info = env.step(action)
     env.close()
     assert info["fault"]
     assert (reward, terminated, info["success"]) == (-5.0, True, False)
@@ -230,7 +208,7 @@ def test_pushing_another_object_is_a_fault(world, monkeypatch):
     place = world.executor.place
 
     def clumsy(data, **arguments):
-        result = yield from place(data, **arguments)
+        result = place(data, **arguments)
         data.joint("cup_joint").qpos[0] += 0.007
         return result
 
@@ -274,7 +252,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     assert world.data.qpos[joint] == c.OBSERVATION_QPOS_RAD[1]
 
 
-@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:8:2])
+@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:6:2])
 def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
     """In another world, after other actions and with velocities left over: the same bits, an object held included."""
     one, other = PickWorld(FIXED), PickWorld(FIXED)
@@ -320,13 +298,6 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     *_, info = env.step(0)
     assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
     env.close()
-
-
-def test_unasked_render_arguments_are_refused():
-    with pytest.raises(
-        InvalidValueError, match=r"No macrostate \(1, 1, 0, 0\); give one of 19, such as \(0, 0, 0, 0\)"
-    ):
-        SPEC.render_macrostates(np.array([(1, 1, 0, 0)]), "clean", rng())
 
 
 def check_fidelity(actions):
