@@ -61,7 +61,9 @@ class Observer:
         self._arm_qpos, _, _ = arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras: dict[str, Renderer] = {name: camera(name, int(size)) for name in ("frame", "human") if name in names}
+        self._cameras: dict[str, Renderer] = {
+            name: camera(name, int(size)) for name in ("frame", "human") if name in names
+        }
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)

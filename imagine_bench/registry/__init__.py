@@ -215,7 +215,9 @@ def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Any]:
     """What is said after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
     if not entry.world:
         raise InvalidValueError(f"Task {base} takes no options; leave out {brief(':' + said)}.")
-    kinds = {each.name: str(each.type) for each in dataclasses.fields(load(entry.world))}
+    world = load(entry.world)
+    kinds = {each.name: str(each.type) for each in dataclasses.fields(world)}
+    kinds |= {old: kinds[new] for new, old in getattr(world, "NAMED", {}).items()}
     given = read_mapping(Path(said[1:])) if said.startswith("@") else parse_options(said, kinds, f"task {base}:")
     for key in given:
         if key not in kinds:

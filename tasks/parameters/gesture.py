@@ -13,7 +13,7 @@ HIDDEN = -1
 
 
 @dataclass(frozen=True, kw_only=True)
-class GestureSight:
+class GestureObservation:
     """Frames of macrostates whose last coordinate, the gesture, may be hidden.
 
     Args:

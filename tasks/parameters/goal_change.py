@@ -1,4 +1,4 @@
-"""Fickle: after a macro-action that ends nothing, the human may want something else."""
+"""Goal change: after a macro-action that ends nothing, the human may want something else."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 from imagine_bench.interfaces import Outcome
 
 
-def fickle(
+def changing_goal(
     outcomes: Sequence[Outcome], elsewhere: Callable[[Outcome], Sequence[Outcome]], probability: float
 ) -> tuple[Outcome, ...]:
     """Outcomes after each of which the human, with some probability, says something else; equal ones are one.

@@ -1,4 +1,4 @@
-"""The dials of a task, and what says a world in one line: ``pick_place:slip=0.1``."""
+"""The parameters of a world, and its name in one line: ``pick_place:slip=0.1``."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any, ClassVar, Self
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
 from imagine_bench.interfaces import State
 
-from .gesture import GestureSight
+from .gesture import GestureObservation
 
 GESTURES = ("always", "first")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dials:
-    """A world by its dials; ``str`` gives its canonical name, which says what differs from the defaults.
+class WorldParameters:
+    """A world by its parameters; ``str`` gives its canonical name, which tells every value but the defaults.
 
     Raises:
         InvalidValueError: A value of the wrong type or out of its range in ``RANGES``.
     """
 
     slip: float = 0.0  #: probability, up to 0.99, that a macro-action leaves all as it is
-    fickle: float = 0.0  #: probability that the human wants something else after a macro-action that ends nothing
+    goal_change: float = 0.0  #: probability that the human wants something else after a macro-action that ends nothing
     gesture: str | float = "always"  #: which frames show it: all, only the ``"first"``, or each with a probability
     lag: int = 0  #: macro-actions that a frame is old, 0 to 10
     distractors: int = 0  #: of no consequence, in view, 0 to 4: a screen of noise, the others balls that roll about
@@ -32,12 +32,14 @@ class Dials:
     FAMILY: ClassVar[str]
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
         "slip": (0.0, 0.99),
-        "fickle": (0.0, 1.0),
+        "goal_change": (0.0, 1.0),
         "gesture": (0.0, 1.0),
         "lag": (0, 10),
         "distractors": (0, 4),
     }
     """Lowest and highest value of each number; integers where these are."""
+    NAMED: ClassVar[Mapping[str, str]] = {"goal_change": "fickle"}
+    """Parameters that canonical names spell as before, so that kept results keep their worlds; both are read."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.RANGES.items():
@@ -63,9 +65,12 @@ class Dials:
         return getattr(type(self), name)
 
     def __str__(self) -> str:
-        own_first = sorted((each.name for each in fields(self)), key=lambda name: name in Dials.__annotations__)
-        said = [f"{name}={value}" for name in own_first if (value := getattr(self, name)) != self._usual(name)]
-        return f"{self.FAMILY}:{','.join(said)}" if said else self.FAMILY
+        own_first = sorted(
+            (each.name for each in fields(self)), key=lambda name: name in WorldParameters.__annotations__
+        )
+        unusual = [name for name in own_first if getattr(self, name) != self._usual(name)]
+        values = [f"{self.NAMED.get(name, name)}={getattr(self, name)}" for name in unusual]
+        return f"{self.FAMILY}:{','.join(values)}" if values else self.FAMILY
 
     @property
     def hash(self) -> str:
@@ -73,22 +78,42 @@ class Dials:
         return hashlib.sha256(str(self).encode()).hexdigest()[:8]
 
     @classmethod
-    def taken_from(cls, options: dict[str, Any], others: Iterable[str]) -> Self:
-        """The world that keyword arguments say, taken out of them. Raises UnknownNameError: one not of the others."""
-        names = [each.name for each in fields(cls)]
-        for name in options:
-            if name not in (*names, *others):
-                raise UnknownNameError("keyword argument", name, (*names, *others))
-        return cls(**{name: options.pop(name) for name in names if name in options})
+    def spellings(cls) -> dict[str, str]:
+        """Every name that a parameter may be given by, and the field that it means."""
+        return {
+            spelled: each.name for each in fields(cls) for spelled in (each.name, cls.NAMED.get(each.name, each.name))
+        }
+
+    @classmethod
+    def taken_from(cls, options: dict[str, Any], others: Iterable[str] = ()) -> Self:
+        """The world that keyword arguments say, taken out of them.
+
+        Raises:
+            UnknownNameError: An argument that is neither a parameter nor one of the others.
+            InvalidValueError: A parameter given twice, by both of its names.
+        """
+        spellings = cls.spellings()
+        given: dict[str, Any] = {}
+        for name in list(options):
+            if name not in (*spellings, *others):
+                raise UnknownNameError("keyword argument", name, (*spellings, *others))
+            if name not in spellings:
+                continue
+            if spellings[name] in given:
+                raise InvalidValueError(f"{name} and {spellings[name]} are one parameter; give it once.")
+            given[spellings[name]] = options.pop(name)
+        return cls(**given)
 
     @property
-    def looks(self) -> str:
-        """What the name of encoders says of dials that change frames."""
+    def encoder_suffix(self) -> str:
+        """The end of an encoder's name: what parameters change in frames."""
         hidden = "" if self.gesture in ("always", 1.0) else "_hidden"
         return hidden + (f"_distractors{self.distractors}" if self.distractors else "")
 
-    def sight(self, always_shown: Callable[[State], bool] = lambda macrostate: False) -> GestureSight | None:
+    def observation_model(
+        self, always_shown: Callable[[State], bool] = lambda macrostate: False
+    ) -> GestureObservation | None:
         """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""
         if self.gesture in ("always", 1.0) and not self.lag:
             return None
-        return GestureSight(gesture=self.gesture, lag=self.lag, always_shown=always_shown)
+        return GestureObservation(gesture=self.gesture, lag=self.lag, always_shown=always_shown)

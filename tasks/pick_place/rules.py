@@ -15,8 +15,8 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-from ..parameters.goal_change import fickle
-from ..parameters.parameters import Dials
+from ..parameters.goal_change import changing_goal
+from ..parameters.parameters import WorldParameters
 from ..parameters.slip import slipping
 
 N_OBJECTS = 3
@@ -46,8 +46,8 @@ def _with(objects: tuple[int, ...], index: int, value: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PickPlace(Dials):
-    """A world: dials only."""
+class PickPlace(WorldParameters):
+    """A world: the parameters of all tasks, and no others."""
 
     FAMILY: ClassVar[str] = "pick_place"
 
@@ -57,7 +57,7 @@ class PickPlaceRules:
     """The macrostate machine: action i picks object i, or places it if it is held; action 3 hands over.
 
     The human's next gesture is drawn: after a pick that was asked for, the two other objects and the open palm are
-    equally likely. Everything else is certain but for the dials.
+    equally likely. Everything else is certain but for the world's parameters.
     """
 
     world: PickPlace = PickPlace()
@@ -131,7 +131,7 @@ class PickPlaceRules:
         if self.world.slip:
             unmoved = Outcome(1.0, macrostate, PLACE_REWARD, terminated=False, success=False)
             found = slipping(found, unmoved, self.world.slip)
-        return fickle(found, self._asked_otherwise, self.world.fickle) if self.world.fickle else found
+        return changing_goal(found, self._asked_otherwise, self.world.goal_change) if self.world.goal_change else found
 
     def _asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
         objects = outcome.macrostate[:N_OBJECTS]

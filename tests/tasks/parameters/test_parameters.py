@@ -1,11 +1,11 @@
-"""Dials: what the rules say of them by hand, and that environments do as often as they say."""
+"""World parameters: what the rules say of them by hand, and that environments do as often as they say."""
 
 from __future__ import annotations
 
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.parameters.goal_change import fickle
+from imagine_bench.tasks.parameters.goal_change import changing_goal
 from imagine_bench.tasks.parameters.slip import slipping
 
 from imagine_bench import registry
@@ -22,18 +22,20 @@ def chances(outcomes):
     return {each.macrostate: each.probability for each in outcomes}
 
 
-def test_outcomes_of_the_dials_by_hand():
+def test_outcomes_of_parameters_by_hand():
     assert chances(slipping((MOVE,), STAY, 0.25)) == {(2,): 0.75, (0,): 0.25}
-    turned = fickle((MOVE,), lambda outcome: [STAY, WIN], 0.5)
+    turned = changing_goal((MOVE,), lambda outcome: [STAY, WIN], 0.5)
     assert chances(turned) == {(2,): 0.5, (0,): 0.25, (1,): 0.25} and turned[2].success
-    assert fickle((WIN,), lambda outcome: [STAY], 0.5) == (WIN,)  # what is over is over
-    assert fickle((MOVE,), lambda outcome: [], 0.5) == (MOVE,)
-    assert chances(fickle((MOVE,), lambda outcome: [STAY], 1.0)) == {(0,): 1.0}
-    both = fickle(slipping((MOVE,), STAY, 0.5), lambda outcome: [STAY if outcome.macrostate == (2,) else MOVE], 0.2)
+    assert changing_goal((WIN,), lambda outcome: [STAY], 0.5) == (WIN,)  # what is over is over
+    assert changing_goal((MOVE,), lambda outcome: [], 0.5) == (MOVE,)
+    assert chances(changing_goal((MOVE,), lambda outcome: [STAY], 1.0)) == {(0,): 1.0}
+    both = changing_goal(
+        slipping((MOVE,), STAY, 0.5), lambda outcome: [STAY if outcome.macrostate == (2,) else MOVE], 0.2
+    )
     assert chances(both) == pytest.approx({(2,): 0.5, (0,): 0.5})
 
 
-def test_dials_of_pick_and_place_by_hand():
+def test_parameters_of_pick_and_place_by_hand():
     rules = registry.task("pick_place:slip=0.2,fickle=0.4").rules
     table, held, wrong = (0, 0, 0, 1), (0, 1, 0, 3), (1, 0, 0, 4)
     assert chances(rules.outcomes(table, 0)) == pytest.approx(
@@ -55,7 +57,7 @@ def test_dials_of_pick_and_place_by_hand():
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_a_dial_at_0_changes_nothing(task):
+def test_a_parameter_at_0_changes_nothing(task):
     plain, dialled = registry.task(task).rules, registry.task(f"{task}:slip=0,fickle=0.0").rules
     assert dialled is plain
     nearly = registry.task(f"{task}:slip=1e-12").rules

@@ -1,4 +1,4 @@
-"""What the dials gesture and lag leave to be seen: of every world, alone, in lanes, and as macrostates."""
+"""What the world parameters gesture and lag leave to be seen: of every world, alone, in lanes, and as macrostates."""
 
 from __future__ import annotations
 
@@ -76,15 +76,15 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
 
 
 @pytest.mark.parametrize("execution", ["kinematic", "physics"])
-@pytest.mark.parametrize(("id_", "dials"), [(IDS[0], {"gesture": 0.5}), (IDS[1], {"lag": 1})])
-def test_what_was_moved_stands_as_if_it_never_was(id_, dials, execution):
+@pytest.mark.parametrize(("id_", "parameters"), [(IDS[0], {"gesture": 0.5}), (IDS[1], {"lag": 1})])
+def test_what_was_moved_stands_as_if_it_never_was(id_, parameters, execution):
     """Its pose is spread as after a reset, else frames would tell what memory should; a turn's yaw is off by 1 degree.
 
     Where nothing is hidden it stands on its place.
     """
     index, start, actions = (0, (0, 1, 2, 0), (0,)) if id_ == IDS[0] else (1, (0, 0, 0, 1), (1, 1))
     spread = []
-    for env, seeds in ((make(id_, execution=execution, **dials), 60), (make(id_, execution=execution), 6)):
+    for env, seeds in ((make(id_, execution=execution, **parameters), 60), (make(id_, execution=execution), 6)):
         found = []
         for seed in range(seeds):
             env.reset(seed=seed, options={"macrostate": start})
@@ -136,7 +136,7 @@ def test_a_state_holds_old_frames_and_what_is_hidden():
     assert first.get_state().steps == second.get_state().steps == 10
 
 
-def test_dials_at_rest_change_and_draw_nothing():
+def test_parameters_at_rest_change_and_draw_nothing():
     for id_ in IDS:
         plain, at_rest = make(id_), make(id_, gesture=1.0, lag=0)
         for (frame, _), (other, _) in zip(walk(plain, 5), walk(at_rest, 5), strict=True):
