@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,6 +22,7 @@ Part = NDArray[np.uint8] | NDArray[np.float32]
 """An image, or a vector."""
 Observed = Part | dict[str, Part]
 """What is observed of one moment: one part, or several by name."""
+_Space = gymnasium.Space[Any]  # of one part, or of several
 _Camera = Callable[[str, int], Renderer]
 _Moment = tuple["Observer", tuple[int, ...]]
 _LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
@@ -61,15 +63,16 @@ class Observer:
         self._arm_qpos, _, _ = arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras: dict[str, Renderer] = {
-            name: camera(name, int(size)) for name in ("frame", "human") if name in names
-        }
+        self._cameras: dict[str, Renderer] = {}
+        for name in ("frame", "human"):
+            if name in names:
+                self._cameras[name] = camera(name, int(size))
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
-        spaces = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
+        spaces: dict[str, _Space] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
         chosen = {name: spaces[name] for name in self._names}
-        self.space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
+        self.space: _Space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
 
     def observe(self, moments: Sequence[_Moment]) -> Sequence[Observed]:
         """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""

@@ -61,7 +61,7 @@ def _act(env: MacroEnv, action: int) -> _Step:
         return _Step(0.0, False, env.diverged(error), diverged=True)
 
 
-class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.int64]]):
+class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]):
     """Several environments of one task in step, or each at its own pace by :meth:`send` and :meth:`recv`.
 
     Spaces, info and seeds are those of ``gymnasium.vector.SyncVectorEnv``: lane i is seeded ``seed + i``, info holds
@@ -267,8 +267,10 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.int64]]):
 
     def _stacked(self, lanes: Sequence[int]) -> Observed:
         """The latest observations of these lanes, copied."""
-        out: Any = create_empty_array(self.single_observation_space, n=len(lanes))
-        return concatenate(self.single_observation_space, [self._seen[lane] for lane in lanes], out)
+        space = self.single_observation_space
+        empty: Any = create_empty_array(space, n=len(lanes))
+        stacked: Any = concatenate(space, [self._seen[lane] for lane in lanes], empty)
+        return stacked
 
     def _named(self, ids: Sequence[int] | None) -> list[int]:
         given = np.arange(self.num_envs) if ids is None else np.asarray(ids)

@@ -108,7 +108,7 @@ class ArrowRules:
 
     @cached_property
     def plan_lengths(self) -> NDArray[np.int64]:
-        """Fewest turns from each macrostate to a goal, if nothing slips or changes; 0 at goals, -1 where no turns do. Shape (S,)."""
+        """Fewest turns from each macrostate to a goal without slips; 0 at goals, -1 where no turns do. Shape (S,)."""
         states = np.array(self.states)
         legal, goal = (np.array([what(state) for state in self.states]) for what in (self.is_legal, self.is_goal))
         after = []

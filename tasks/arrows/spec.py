@@ -1,7 +1,7 @@
 """Arrow puzzles (thesis, chapter 5): what the bench needs to know of each world, and the environments.
 
-Worlds of as many cubes share scene and encoders, whatever their goals and other parameters: what has been learned of how one of
-them moves is true in every other whose turns are the same.
+Worlds of as many cubes share scene and encoders, whatever their goals and other parameters. What an agent has learned
+of how one of them moves is true in every other one with the same turns.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """

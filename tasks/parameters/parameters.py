@@ -65,9 +65,8 @@ class WorldParameters:
         return getattr(type(self), name)
 
     def __str__(self) -> str:
-        own_first = sorted(
-            (each.name for each in fields(self)), key=lambda name: name in WorldParameters.__annotations__
-        )
+        common = WorldParameters.__annotations__
+        own_first = sorted((each.name for each in fields(self)), key=lambda name: name in common)
         unusual = [name for name in own_first if getattr(self, name) != self._usual(name)]
         values = [f"{self.NAMED.get(name, name)}={getattr(self, name)}" for name in unusual]
         return f"{self.FAMILY}:{','.join(values)}" if values else self.FAMILY
@@ -80,9 +79,8 @@ class WorldParameters:
     @classmethod
     def spellings(cls) -> dict[str, str]:
         """Every name that a parameter may be given by, and the field that it means."""
-        return {
-            spelled: each.name for each in fields(cls) for spelled in (each.name, cls.NAMED.get(each.name, each.name))
-        }
+        names = {each.name: each.name for each in fields(cls)}
+        return names | {old: new for new, old in cls.NAMED.items()}
 
     @classmethod
     def taken_from(cls, options: dict[str, Any], others: Iterable[str] = ()) -> Self:

@@ -1,4 +1,4 @@
-"""The world parameter distractors: where they are seen, that they hide nothing that matters, and that nothing else notices."""
+"""Distractors: where they are seen, that they hide nothing that matters, and that nothing else notices."""
 
 from __future__ import annotations
 
