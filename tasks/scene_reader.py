@@ -189,11 +189,10 @@ class FilmedScene:
 
         People stand still meanwhile; what they do when it is over is one sample more.
         """
-        latest = self._latest
         model = self.world.model
-        data = self.world.data
-        standing = poses_of(model, data.qpos[None], *self._mocap())
-        if latest is None or not len(latest.time_s):
+        standing = poses_of(model, self.world.data.qpos[None], *self._mocap())
+        latest = self._captured()
+        if latest is None:
             return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
         time_s = latest.time_s
         poses = poses_of(model, latest.qpos, *self._people)
@@ -204,10 +203,10 @@ class FilmedScene:
 
     def arm_motion(self) -> ArmMotion:
         """The arm during the latest macro-action as captured, else one sample of the standing scene."""
-        latest = self._latest
         model = self.world.model
         data = self.world.data
-        if latest is None or not len(latest.time_s):
+        latest = self._captured()
+        if latest is None:
             return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
         return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
 
@@ -239,8 +238,8 @@ class FilmedScene:
             Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
         """
         world = self.world
-        latest = self._latest
-        if latest is None or not len(latest.time_s):
+        latest = self._captured()
+        if latest is None:
             yield 0.0
             return
         standing = world.data.qpos.copy()
@@ -255,6 +254,11 @@ class FilmedScene:
             world.data.qpos[:] = standing
             world.data.mocap_pos[:], world.data.mocap_quat[:] = people
             world.update()
+
+    def _captured(self) -> MacroResult | None:
+        """The latest macro-action, if its motion was captured."""
+        latest = self._latest
+        return latest if latest is not None and len(latest.time_s) else None
 
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""

@@ -6,7 +6,6 @@ import abc
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
 from .motion import orientation
-from .motion.executor import MacroResult, at_rest
+from .motion.executor import MacroExecutor, MacroResult, at_rest
 from .motion.sensing import Sensing
 from .parameters.distractors import Distraction
 from .parameters.gesture import HIDDEN
@@ -23,10 +22,6 @@ from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
 from .scenes.fragments import Photographer, Shot
-
-if TYPE_CHECKING:
-    from .motion.carry import CarryExecutor
-    from .motion.turn import TurnExecutor
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -203,7 +198,7 @@ class World(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def executor(self) -> CarryExecutor | TurnExecutor:
+    def executor(self) -> MacroExecutor:
         """What carries macro-actions out in contact physics, made when it is first needed."""
 
     def prepare(self) -> None:

@@ -70,7 +70,7 @@ class ArrowWorld(World):
             )
             for turn in turns
         ]
-        self.executor.executor.rest(self.data)
+        self.executor.rest(self.data)
         self._gesture(intended[-1])
         self.update()
         result = functools.reduce(MacroResult.then, results)

@@ -14,7 +14,6 @@ from imagine_bench.interfaces import Floats
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from ..scenes.objects import OBJECTS, ObjectSpec, standing_m
-from .arm_model import ArmModel
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
@@ -34,7 +33,7 @@ _LOST_M = 0.003
 _MAX_TILT_RAD = math.radians(12)
 
 
-class CarryExecutor:
+class CarryExecutor(MacroExecutor):
     """Carries objects, which friction alone holds: mink plans, the servos move the arm, contact moves the object.
 
     The planner knows the objects' true poses, unless ``sensing`` says otherwise.
@@ -43,12 +42,10 @@ class CarryExecutor:
     """
 
     def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
-        self._sensing = sensing or Sensing()
-        self.executor = MacroExecutor(model)
-        self._arm = ArmModel()
-        self._ik = ArmIK(self._arm)
+        super().__init__(model, sensing)
+        self._ik = ArmIK(self.arm)
         self._qpos = [int(model.joint(f"{spec.name}_joint").qposadr[0]) for spec in OBJECTS]
-        self._rest_tcp_m, _ = self._arm.tcp_in_base(np.array(OBSERVATION_QPOS_RAD))
+        self._rest_tcp_m, _ = self.arm.tcp_in_base(np.array(OBSERVATION_QPOS_RAD))
         self._tcp_site = model.site(TCP_SITE).id
         self._slots = [self._solve(np.array(standing_m(each)), 0.0, None) for each in range(len(OBJECTS))]
 
@@ -101,13 +98,13 @@ class CarryExecutor:
         result, qpos = self._run(data, waypoints, reach, held, capture_motion_hz)
         return result if held is None else self._unless_missed(OBJECTS[held], result, qpos)
 
-    def rest(self, data: mujoco.MjData, held: int | None) -> None:
+    def rest_holding(self, data: mujoco.MjData, held: int | None) -> None:
         """Bring ``data`` to the canonical start; object ``held`` goes with the gripper where the arm is corrected."""
         if held is None:
-            self.executor.rest(data)
+            self.rest(data)
             return
         before_m, before_quat = self._tcp(data)
-        self.executor.rest(data, squeeze_m=OBJECTS[held].squeeze_m)
+        self.rest(data, squeeze_m=OBJECTS[held].squeeze_m)
         after_m, after_quat = self._tcp(data)
         row = self._qpos[held]
         turn = np.empty(4)
@@ -144,7 +141,7 @@ class CarryExecutor:
 
     def _measure(self, data: mujoco.MjData, index: int, nominal_m: Floats) -> ObjectPose:
         row = self._qpos[index]
-        return self._sensing.erring(self._sensing.pose(data.qpos[row : row + 7], nominal_m))
+        return self.sensing.erring(self.sensing.pose(data.qpos[row : row + 7], nominal_m))
 
     def _solve(self, place_m: Floats, yaw_rad: float, start: Reach | None) -> Reach:
         """Configurations with the tool centre point at ``place_m`` (3,), and above it."""
@@ -156,24 +153,24 @@ class CarryExecutor:
     ) -> tuple[MacroResult, Floats]:
         """Plan and execute; also the positions of the whole run (N + 1, nq), valid until the next one."""
         squeeze_m = None if held is None else OBJECTS[held].squeeze_m
-        result, qpos, _ = self.executor.perform(
-            data, self._arm, waypoints, ik_error_m=reach.error_m, squeeze_m=squeeze_m, capture_motion_hz=motion_hz
+        result, qpos, _ = self.perform(
+            data, waypoints, ik_error_m=reach.error_m, squeeze_m=squeeze_m, capture_motion_hz=motion_hz
         )
         return result, qpos
 
     def _unless_missed(self, spec: ObjectSpec, result: MacroResult, qpos: Floats) -> MacroResult:
         """The result of a run (N + 1, nq), with a fault if the fingers closed past what they should hold."""
-        if self.executor.opening_m(qpos[-1]).max() < spec.grip_opening_m - _LOST_M:
+        if self.opening_m(qpos[-1]).max() < spec.grip_opening_m - _LOST_M:
             return replace(result, fault=f"the fingers closed and do not hold the {spec.name}")
         return result
 
     def _refuse(self, data: mujoco.MjData, held: int | None, reason: str) -> MacroResult:
-        self.rest(data, held)
-        return self.executor.refused(reason)
+        self.rest_holding(data, held)
+        return self.refused(reason)
 
     def _tcp(self, data: mujoco.MjData) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of the tool centre point in the world, updated."""
-        mujoco.mj_kinematics(self.executor.model, data)
+        mujoco.mj_kinematics(self.model, data)
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp_site])
         return data.site_xpos[self._tcp_site].copy(), quat

@@ -17,6 +17,7 @@ from imagine_bench.interfaces import Floats
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from .arm_model import ArmModel
+from .sensing import Sensing
 from .trajectory import Trajectory, Waypoint, plan
 
 REST_OPENING_M = 0.0365
@@ -80,14 +81,16 @@ class MacroResult:
 
 
 class MacroExecutor:
-    """Executes trajectories on a compiled scene that holds the arm.
+    """Executes trajectories on a compiled scene that holds the arm: the base of what plans macro-actions.
 
     Before and after each macro-action the arm is set onto its observation pose; one that ended further off it than
     0.02 rad is a fault. What plans for it measures true poses of objects, unless :class:`.sensing.Sensing` says else.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
         self.model = model
+        self.arm = ArmModel()
+        self.sensing = sensing or Sensing()
         self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in ARM_JOINTS])
         self._finger_qpos = np.array([int(model.joint(name).qposadr[0]) for name in FINGER_JOINTS])
         self._arm_ctrl = np.array([model.actuator(f"{name}_servo").id for name in ARM_JOINTS])
@@ -121,7 +124,6 @@ class MacroExecutor:
     def perform(
         self,
         data: mujoco.MjData,
-        arm: ArmModel,
         waypoints: Sequence[Waypoint],
         *,
         ik_error_m: float,
@@ -139,7 +141,7 @@ class MacroExecutor:
         start_rad = np.array(OBSERVATION_QPOS_RAD)
         start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
-            arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
+            self.arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
         qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
         time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)

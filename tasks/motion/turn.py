@@ -13,7 +13,6 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
-from .arm_model import ArmModel
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
@@ -43,7 +42,7 @@ _MISSED_M = 0.0001
 """Fingers that come so near to their command, on the average, have nothing between them; smooth ones sink in deep."""
 
 
-class TurnExecutor:
+class TurnExecutor(MacroExecutor):
     """Turns the cubes of a compiled scene: mink plans, the servos move the arm, and contact alone moves the cube.
 
     The jaws are flat, so a cube turns with them by its shape and hardly needs friction. The planner knows the cubes'
@@ -53,10 +52,8 @@ class TurnExecutor:
     def __init__(
         self, model: mujoco.MjModel, slots_xy_m: Sequence[tuple[float, float]], sensing: Sensing | None = None
     ) -> None:
-        self._sensing = sensing or Sensing()
-        self.executor = MacroExecutor(model)
-        self._arm = ArmModel()
-        self._ik = ArmIK(self._arm)
+        super().__init__(model, sensing)
+        self._ik = ArmIK(self.arm)
         self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(slots_xy_m))]
         self._slots_xy_m = slots_xy_m
         self._slots = [self._reach(np.array(slot), None) for slot in slots_xy_m]
@@ -83,13 +80,13 @@ class TurnExecutor:
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
         poses = [
-            self._sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
+            self.sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
             for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
         true = poses[cube]
         slot = self._slots[cube]
         right_m, up_m, turned_rad = off
-        pose = self._sensing.erring(true)
+        pose = self.sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         place_m = np.add(self._slots_xy_m[cube], (right_m, up_m))
@@ -113,11 +110,11 @@ class TurnExecutor:
         openings_m = (opening_m, leaves_m)
         waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
-        result, qpos, trajectory = self.executor.perform(
-            data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
+        result, qpos, trajectory = self.perform(
+            data, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]
-        if self.executor.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
+        if self.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")
         return result
 
@@ -127,8 +124,8 @@ class TurnExecutor:
         return self._ik.reach(place_m, yaw_rad=_MIDDLE_YAW_RAD, lift_m=_LIFT_M, start=start)
 
     def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
-        self.executor.rest(data)
-        return self.executor.refused(reason)
+        self.rest(data)
+        return self.refused(reason)
 
 
 def _skew_rad(pose: ObjectPose) -> float:

@@ -129,7 +129,7 @@ class PickWorld(World):
         stays = before == intended[:N_OBJECTS]
         result = self._act(action, before, stays, capture_motion_hz)
         self.update()
-        self.executor.rest(self.data, held_object(self._objects()[0]))
+        self.executor.rest_holding(self.data, held_object(self._objects()[0]))
         self.update()
         after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it

@@ -66,7 +66,7 @@ def wrap(angle_rad):
 
 
 def test_planning_and_scene_have_the_same_servos(arm, turner):
-    model = turner.executor.model
+    model = turner.model
     servos = [model.actuator(f"right_j{index}_servo").id for index in range(7)]
     np.testing.assert_array_equal(model.actuator_gainprm[servos, 0], arm.stiffness_nm_rad)
     dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
@@ -76,12 +76,12 @@ def test_planning_and_scene_have_the_same_servos(arm, turner):
 
 @pytest.mark.parametrize(("cube", "clockwise"), [(0, True), (1, False), (2, True)])
 def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0.05, -0.05, QUARTER_RAD))
     result = turner.turn(data, cube=cube, clockwise=clockwise, capture_motion_hz=1 / TIMESTEP_S)
     assert result.fault is None
     np.testing.assert_allclose(result.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
-    arm_qpos = turner.executor.arm_qpos_rad(result.qpos)
+    arm_qpos = turner.arm_qpos_rad(result.qpos)
     speed_rad_s = np.abs(np.diff(arm_qpos, axis=0)) / TIMESTEP_S
     assert (speed_rad_s.max(axis=0) <= arm.speed_limit_rad_s).all()
     assert (speed_rad_s.max(axis=0) / arm.speed_limit_rad_s).max() > 0.9
@@ -93,25 +93,25 @@ def test_servo_forces_stay_below_their_limits(turner):
 
     Gravity is compensated beside the servos, so that a motor would give the sum: the shoulder's goes beyond its limit.
     """
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0, 0, 0))
     peak, motor_peak_nm = np.zeros(model.nu), np.zeros(7)
     arm_dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
     planned = {}
-    original = turner.executor.run
+    original = turner.run
 
     def keep(data, trajectory, **options):
         planned["trajectory"] = trajectory
         return original(data, trajectory, **options)
 
-    turner.executor.run = keep
+    turner.run = keep
     try:
         turner.turn(data, cube=0, clockwise=True)
     finally:
-        del turner.executor.run
+        del turner.run
     stepped = mujoco.MjData(model)
     place(model, stepped, (0, 0, 0))
-    turner.executor.rest(stepped)
+    turner.rest(stepped)
     trajectory = planned["trajectory"]
     for command, opening in zip(trajectory.arm_command_rad, trajectory.opening_m, strict=True):
         for index in range(7):
@@ -132,7 +132,7 @@ def test_servo_forces_stay_below_their_limits(turner):
 def run_turns(turner, number, per_start, seed):
     """Random turns in unreset sequences; returns yaw errors (deg), slot errors (m), others' motion (m), faults."""
     rng = np.random.default_rng(seed)
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     yaw_deg, slot_m, others_m, faults = [], [], [], []
     for index in range(number):
         if index % per_start == 0:
@@ -169,7 +169,7 @@ def test_two_thousand_turns_do_what_the_rules_say(turner):
 
 
 def test_a_finger_does_not_push_a_cube_that_stands_close(turner):
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0, 0, 0), [(0, -0.01), (0, 0.01), (0, 0.01)])
     before = poses(model, data)
     assert turner.turn(data, cube=0, clockwise=False).fault is None
@@ -181,7 +181,7 @@ def test_a_finger_does_not_push_a_cube_that_stands_close(turner):
 @pytest.mark.parametrize("clockwise", [True, False])
 def test_very_skew_cubes_are_squared(turner, clockwise):
     """Even 25 degrees off, where the wrist would leave its range if it took the usual faces."""
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     for skew_rad in (-math.radians(25), math.radians(25)):
         place(model, data, (skew_rad, 0, 0))
         assert turner.turn(data, cube=0, clockwise=clockwise).fault is None
@@ -191,7 +191,7 @@ def test_very_skew_cubes_are_squared(turner, clockwise):
 
 def test_a_turn_is_a_pure_function_of_positions_and_action(turner):
     """Twice, in two MjData, before and after other actions, in two executors: the same bits."""
-    model = turner.executor.model
+    model = turner.model
     data, used = mujoco.MjData(model), mujoco.MjData(model)
     place(model, data, (0.1, QUARTER_RAD, -0.1), ((0.003, -0.002), (0, 0.004), (0.001, 0)))
     turner.turn(data, cube=0, clockwise=True)
@@ -207,7 +207,7 @@ def test_a_turn_is_a_pure_function_of_positions_and_action(turner):
         turner.turn(used, cube=1, clockwise=False)
         np.testing.assert_array_equal(used.qpos, first)
     other = pickle.loads(pickle.dumps(turner))
-    fresh = mujoco.MjData(other.executor.model)
+    fresh = mujoco.MjData(other.model)
     fresh.qpos[:] = start
     other.turn(fresh, cube=1, clockwise=False)
     np.testing.assert_array_equal(fresh.qpos, first)
@@ -261,7 +261,7 @@ def test_an_arm_that_does_not_come_back_is_a_fault(turner):
     ids=["tipped", "leaning", "far"],
 )
 def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0, 0, 0))
     data.qpos[cube_slice(model, 1)] = [*position, *quat]
     before = poses(model, data)
@@ -274,13 +274,13 @@ def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
 
 def test_unknown_cube_is_named(turner):
     with pytest.raises(InvalidValueError, match="No cube 3; there are 0 to 2"):
-        turner.turn(mujoco.MjData(turner.executor.model), cube=3, clockwise=True)
+        turner.turn(mujoco.MjData(turner.model), cube=3, clockwise=True)
 
 
 def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0, 0, 0))
     data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
     with pytest.raises(DivergedError, match="its start state and controls were saved in"):
@@ -293,7 +293,7 @@ def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypat
 
 @pytest.mark.parametrize(("motion_hz", "rows"), [(0.0, 0), (20.0, None), (200.0, None)])
 def test_captured_motion_is_even_and_complete(turner, motion_hz, rows):
-    model, data = turner.executor.model, mujoco.MjData(turner.executor.model)
+    model, data = turner.model, mujoco.MjData(turner.model)
     place(model, data, (0, 0, 0))
     result = turner.turn(data, cube=0, clockwise=True, capture_motion_hz=motion_hz)
     expected = rows if rows is not None else 1 + math.ceil(result.sim_time_s * motion_hz - 1e-6)
@@ -304,4 +304,4 @@ def test_captured_motion_is_even_and_complete(turner, motion_hz, rows):
         np.testing.assert_allclose(result.time_s[-1], result.sim_time_s)
         assert (np.diff(result.time_s) > 0).all()
         np.testing.assert_array_equal(result.qpos[-1], data.qpos)
-        np.testing.assert_array_equal(turner.executor.opening_m(result.qpos[0]), [REST_OPENING_M] * 2)
+        np.testing.assert_array_equal(turner.opening_m(result.qpos[0]), [REST_OPENING_M] * 2)

@@ -244,7 +244,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     mujoco.mj_kinematics(world.model, world.data)
     world.data.qpos[row[:3]] += world.data.site_xpos[tcp] - carried
     tilted = in_gripper()
-    world.executor.rest(world.data, 1)
+    world.executor.rest_holding(world.data, 1)
     after = in_gripper()
     np.testing.assert_allclose(after[0], tilted[0], atol=1e-12)
     np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
