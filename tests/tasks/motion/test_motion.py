@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import REST_OPENING_M
 from imagine_bench.tasks.motion.turn import TurnExecutor
 from imagine_bench.tasks.scenes.constants import (
     CUBE_EDGE_M,
@@ -289,19 +288,3 @@ def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypat
     with np.load(saved) as contents:
         assert contents["start_state"].max() == 1e11
         assert contents["control"].shape[1] == model.nu
-
-
-@pytest.mark.parametrize(("motion_hz", "rows"), [(0.0, 0), (20.0, None), (200.0, None)])
-def test_captured_motion_is_even_and_complete(turner, motion_hz, rows):
-    model, data = turner.model, mujoco.MjData(turner.model)
-    place(model, data, (0, 0, 0))
-    result = turner.turn(data, cube=0, clockwise=True, capture_motion_hz=motion_hz)
-    expected = rows if rows is not None else 1 + math.ceil(result.sim_time_s * motion_hz - 1e-6)
-    assert result.qpos.shape == (expected, model.nq)
-    assert result.time_s.shape == (expected,)
-    if expected:
-        assert result.time_s[0] == 0.0
-        np.testing.assert_allclose(result.time_s[-1], result.sim_time_s)
-        assert (np.diff(result.time_s) > 0).all()
-        np.testing.assert_array_equal(result.qpos[-1], data.qpos)
-        np.testing.assert_array_equal(turner.opening_m(result.qpos[0]), [REST_OPENING_M] * 2)

@@ -91,8 +91,8 @@ def walk(name, execution, steps):
 @pytest.mark.parametrize(
     ("name", "execution", "steps"),
     [
-        ("arrows:slip=0.2,fickle=0.3", "kinematic", 1000),
-        ("pick_place:slip=0.2,fickle=0.3", "kinematic", 1000),
+        ("arrows:slip=0.2,goal_change=0.3", "kinematic", 600),
+        ("pick_place:slip=0.2,goal_change=0.3", "kinematic", 600),
         ("arrows:cubes=2,coupling=neighbour,forbid=none,shuffle=1,slip=0.4,fickle=0.3", "physics", 30),
         ("pick_place:slip=0.4,fickle=0.3", "physics", 30),
     ],
