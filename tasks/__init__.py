@@ -1,5 +1,5 @@
 """Simulated tasks: MuJoCo scenes, macro-actions executed by an arm, exact rules."""
 
-from .rendering.graphics import choose_platform
+from .graphics import choose_platform
 
 choose_platform()  # before MuJoCo is first imported

@@ -21,8 +21,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError
 
 try:
-    # Before dm_control, which chooses another platform while it loads.
-    registry.load("imagine_bench.tasks.rendering.graphics:choose_platform")()
+    registry.load("imagine_bench.tasks.graphics:choose_platform")()  # dm_control chooses another one while it loads
     import dm_env
     from dm_control.mujoco import Physics, wrapper
     from dm_env import specs

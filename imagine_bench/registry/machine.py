@@ -22,7 +22,7 @@ from imagine_bench.version import PACKAGE_FOLDER, __version__
 PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
 OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3", "torch-world")
 """Of adapters and of the extra ``peers``; named where they are installed."""
-GL_RENDERER = "imagine_bench.tasks.rendering.renderer:gl_renderer"
+GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 """What decides results, in a checkout."""
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

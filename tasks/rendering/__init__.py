@@ -1,1 +1,5 @@
-"""Drawing: OpenGL's platform, images of a scene from its cameras, and windows that show images."""
+"""Drawing: images of a scene from its cameras, and windows that show images."""
+
+from .renderer import Renderer, View, gl_renderer
+
+__all__ = ["Renderer", "View", "gl_renderer"]

@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.graphics import choose_platform
+from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering import renderer as rendering
 from imagine_bench.tasks.rendering.cameras import agent_camera, human_camera_view
-from imagine_bench.tasks.rendering.graphics import choose_platform
-from imagine_bench.tasks.rendering.renderer import Renderer, View
 from imagine_bench.tasks.scenes.appearance import appearance
 
 from imagine_bench.errors import SetupError, UnknownNameError

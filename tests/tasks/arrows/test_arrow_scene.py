@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering.cameras import agent_camera
-from imagine_bench.tasks.rendering.renderer import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
 from imagine_bench.tasks.scenes.layout import layout

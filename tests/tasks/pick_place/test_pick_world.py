@@ -13,7 +13,7 @@ from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, W
 from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
-from imagine_bench.tasks.rendering.renderer import Renderer, View
+from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
