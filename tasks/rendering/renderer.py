@@ -5,6 +5,8 @@
 - Any thread may draw, one at a time. A context stays current in the thread that made it. Another thread makes a
   context of its own; where the work changes threads again, contexts are released after each frame.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
+- Renderers of the main thread share the context of one scene and one view, which costs as much as 700 frames to make.
+  The last of a few contexts that nobody uses any more are kept for the next renderer.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import contextlib
 import copy
 import ctypes
 import functools
+import hashlib
 import os
 import sys
 import threading
@@ -120,6 +123,7 @@ class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
+        self.users = 0  # renderers that share it
         self.pid = os.getpid()
         self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
         self.gl: Any = _new_gl_context(view.width, view.height)
@@ -165,6 +169,56 @@ class _Canvas:
         gl.free()
 
 
+def _drawn_as(model: mujoco.MjModel) -> bytes:
+    """A digest of all that a context keeps of a model: equal for models that one context may draw."""
+    vis = model.vis
+    settings = [getattr(vis.map, name) for name in ("shadowclip", "shadowscale", "fogstart", "fogend")]
+    numbers = [*settings, *vis.rgba.fog, vis.global_.linewidth, model.stat.extent]
+    arrays = [model.mesh_vert, model.mesh_normal, model.mesh_texcoord, model.mesh_face, model.mesh_graph]
+    arrays += [model.tex_data, model.tex_height, model.tex_width, model.tex_type, model.hfield_data, model.skin_vert]
+    digest = hashlib.sha256(np.array(numbers).tobytes())
+    for array in arrays:
+        digest.update(f"{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.digest()
+
+
+class _Canvases:
+    """The shared contexts of the main thread of one process, by what they draw."""
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+        self._canvases: dict[tuple[bytes, View], _Canvas] = {}  # in the order of their last use
+
+    def borrow(self, scene: bytes, model: mujoco.MjModel, view: View) -> _Canvas:
+        """The context of a scene and a view, made if there is none."""
+        if self._pid != os.getpid():
+            self.close()
+            self._pid = os.getpid()
+        canvas = self._canvases.pop((scene, view), None) or _Canvas(model, view)
+        self._canvases[scene, view] = canvas
+        canvas.users += 1
+        return canvas
+
+    def give_back(self, canvas: _Canvas) -> None:
+        """One renderer less uses it; of those without a user the few that were used last are kept."""
+        canvas.users -= 1
+        self.free_idle(_KEPT)
+
+    def free_idle(self, keep: int = 0) -> None:
+        """Free the contexts that nobody uses, but for the last ones."""
+        idle = [key for key, each in list(self._canvases.items()) if not each.users]
+        for key in idle[: max(0, len(idle) - keep)]:
+            self._canvases.pop(key).close()
+
+    def close(self) -> None:
+        """Free every context."""
+        canvases = list(self._canvases.values())
+        self._canvases.clear()
+        for canvas in canvases:
+            canvas.close()
+
+
 @contextlib.contextmanager
 def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
     """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
@@ -185,15 +239,24 @@ def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
         model.vis.global_ = size_before
 
 
+_KEPT = 4
+"""Contexts that are kept although nobody uses them."""
+_shared = _Canvases()
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
 _inherited: list[Any] = []
 """Contexts of a parent process or another thread: never used here and never freed, since they belong there."""
 _exit_hook_pid: int | None = None
 
 
+def close_idle_contexts() -> None:
+    """Free the OpenGL contexts that are kept for the next renderer."""
+    _shared.free_idle()
+
+
 def _close_all() -> None:
     for renderer in list(_open):
         renderer.close()
+    _shared.close()
 
 
 def _close_all_at_exit() -> None:
@@ -233,6 +296,10 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = model.camera(view.camera).id
+
+    @functools.cached_property
+    def _drawn_as(self) -> bytes:
+        return _drawn_as(self._model)
 
     def frame(self, data: mujoco.MjData, model: mujoco.MjModel | None = None) -> NDArray[np.uint8]:
         """Draw ``data``, whose derived positions are up to date: a new upright RGB array. Shape (height, width, 3).
@@ -276,9 +343,15 @@ class Renderer:
             return canvas
         self._takeovers += canvas is not None and canvas.pid == os.getpid()
         self.close()
-        self._canvas = canvas = _Canvas(self._model, self.view)
+        if threading.current_thread() is threading.main_thread() and not self._takeovers:
+            canvas = _shared.borrow(self._drawn_as, self._model, self.view)
+            give_back = functools.partial(_shared.give_back, canvas)
+        else:
+            canvas = _Canvas(self._model, self.view)
+            give_back = canvas.close
+        self._canvas = canvas
         # A renderer that is merely forgotten must free its context with it current, too.
-        self._finalizer = weakref.finalize(self, canvas.close)
+        self._finalizer = weakref.finalize(self, give_back)
         self._finalizer.atexit = False
         _open.add(self)
         _close_all_at_exit()
@@ -291,8 +364,7 @@ class Renderer:
             self._canvas = None
             _open.discard(self)
             if canvas is not None:
-                self._finalizer.detach()
-                canvas.close()
+                self._finalizer()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._model, self.view)

@@ -25,6 +25,11 @@ from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.errors import SetupError, UnknownNameError
 
 
+@pytest.fixture(autouse=True)
+def no_idle_context():
+    rendering.close_idle_contexts()
+
+
 @pytest.fixture
 def world():
     world = ArrowWorld(appearance("clean"))
