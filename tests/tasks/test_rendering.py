@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.graphics import choose_platform
+from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering import renderer as rendering
 from imagine_bench.tasks.rendering.cameras import agent_camera, human_camera_view
@@ -70,6 +71,30 @@ def test_closing_one_renderer_leaves_the_others_frames_alone(world):
     assert np.array_equal(first.frame(world.data), before)  # and a later frame makes a new context
     for renderer in (first, second, image):
         renderer.close()
+
+
+def test_renderers_of_one_scene_and_view_share_a_context(world, monkeypatch):
+    made = []
+    make = rendering._new_gl_context
+    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make(*size))
+    twin = ArrowWorld(appearance("clean"))
+    twin.place((3, 3, 0, 2), np.random.default_rng(0))
+    worlds = world, twin, PickWorld(appearance("clean"))
+    cameras = [agent_camera(each.model) for each in worlds]
+    frames = [camera.frame(each.data) for camera, each in zip(cameras, worlds, strict=True)]
+    assert len(made) == 2, "pick-and-place has other meshes"
+    cameras[0].close()
+    assert np.array_equal(cameras[1].frame(twin.data), frames[1])
+    for camera in cameras:
+        camera.close()
+    assert np.array_equal(cameras[0].frame(world.data), frames[0]) and len(made) == 2, "one was kept"
+    cameras[0].close()
+    rendering.close_idle_contexts()
+    for camera, each, frame in zip(cameras, worlds, frames, strict=True):
+        assert np.array_equal(camera.frame(each.data), frame), "a new context draws the same"
+        camera.close()
+        rendering.close_idle_contexts()
+    assert len(made) == 5
 
 
 def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatch):
