@@ -84,7 +84,8 @@ def test_a_simulation_that_blows_up_ends_the_run(
     acted = itertools.count()
 
     def failing(env: MacroEnv, action: int) -> tuple[float, bool, dict[str, Any]]:
-        if in_lanes and next(acted) > 25:
+        number = next(acted)
+        if in_lanes and number > 25:
             raise DivergedError("The simulation diverged.")
         return act(env, action)
 
