@@ -80,49 +80,39 @@ def test_tips_hand_table_objects_and_palm_touch(world):
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("index", "yaw_deg", "problem"),
-    [
-        (0, 25, None),
-        (1, 25, "the car is turned by 25 degrees"),
-        (1, -15, None),
-        (2, -25, "the cup is turned by 25 deg"),
-    ],
-)
-def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw_deg, problem):
-    world.place((0, 0, 0, 0), rng())
-    half_rad = math.radians(yaw_deg) / 2
-    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
-    found = world.read().problem
-    assert found is None if problem is None else found.startswith(problem)
+def turn(world, index, axis, angle_deg):
+    """Turn an object about an axis, 0 for x to 2 for z, from how it stands upright."""
+    quat = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], math.radians(angle_deg))
+    world.data.qpos[world.object_qpos[index][3:]] = quat
 
 
 @pytest.mark.parametrize(
-    ("index", "moved_m", "tilt_deg", "problem"),
+    ("index", "moved_m", "axis", "angle_deg", "problem"),
     [
-        (0, (0.021, 0, 0), 0, "the ball stands 21 mm off its place"),
-        (0, (0.018, 0, 0), 90, None),  # a ball has no right way up
-        (1, (0, 0, 0), 12, "the car is tipped by 12 degrees"),
-        (2, (0, 0, 0), 8, None),
-        (2, (0, 0, 0.05), 0, "the cup is neither on the table nor held nor in the palm"),
+        (0, (0.0, 0, 0), 2, 25, None),  # a ball has neither a heading nor a right way up
+        (0, (0.018, 0, 0), 0, 90, None),
+        (0, (0.021, 0, 0), 0, 0, "the ball stands 21 mm off its place"),
+        (1, (0, 0, 0), 2, 25, "the car is turned by 25 degrees"),
+        (1, (0, 0, 0), 2, -15, None),
+        (1, (0, 0, 0), 0, 12, "the car is tipped by 12 degrees"),
+        (2, (0, 0, 0), 2, -25, "the cup is turned by 25 degrees"),
+        (2, (0, 0, 0), 0, 8, None),
+        (2, (0, 0, 0.05), 0, 0, "the cup is neither on the table nor held nor in the palm"),
     ],
 )
-def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, problem):
+def test_an_object_off_its_place_is_a_problem(world, index, moved_m, axis, angle_deg, problem):
     world.place((0, 0, 0, 0), rng())
-    row = world.object_qpos[index]
-    half_rad = math.radians(tilt_deg) / 2
-    world.data.qpos[row[:3]] += moved_m
-    world.data.qpos[row[3:]] = [math.cos(half_rad), math.sin(half_rad), 0, 0]
+    world.data.qpos[world.object_qpos[index][:3]] += moved_m
+    turn(world, index, axis, angle_deg)
     reading = world.read()
-    assert reading.problem == problem
-    assert reading.macrostate == (0, 0, 0, 0)
+    assert (reading.macrostate, reading.problem) == ((0, 0, 0, 0), problem)
 
 
 @pytest.mark.parametrize("index", [1, 2])
 def test_what_leans_too_far_is_not_picked(world, index):
     world.place((0, 0, 0, 0), rng())
-    half_rad = math.radians(14) / 2
-    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, math.sin(half_rad), 0]
+    turn(world, index, 1, 14)
     result = world.executor.pick(world.data, index=index)
     assert result.fault == f"the {OBJECTS[index].name} is tipped by 14 degrees" and result.sim_time_s == 0.0
 
@@ -146,23 +136,6 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
-@pytest.mark.parametrize("index", range(3))
-def test_gripper_and_object_pass_the_pointing_hand(world, index):
-    state = (0, 0, 0, index)
-    world.place(state, rng())
-    people = world.data.mocap_pos.copy()
-    motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
-    model, hand = world.model, world.model.geom("hand_skin").id
-    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", OBJECTS[index].name))]
-    closest_m, data = 1.0, mujoco.MjData(model)
-    data.mocap_pos[:] = people
-    for qpos in motion:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
-    assert 0.005 < closest_m < 0.05  # near, so the check is not vacuous, and free
-
-
 def ghost_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
@@ -174,8 +147,9 @@ def slippery_tips(model):
     model.geom_friction[tips] = (0.02, 0.001, 0.0001)
 
 
-@pytest.mark.parametrize("spoil", [ghost_tips, slippery_tips])
-@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize(
+    ("spoil", "index"), [(ghost_tips, 1), (slippery_tips, 0), (slippery_tips, 1), (slippery_tips, 2)]
+)
 def test_only_friction_lifts(spoil, index):
     """No weld, no teleport: fingers that pass through or slip leave the object there, and the human withdraws."""
     world = PickWorld(FIXED)
