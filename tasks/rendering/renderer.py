@@ -345,7 +345,7 @@ class Renderer:
         self.close()
         if threading.current_thread() is threading.main_thread() and not self._takeovers:
             canvas = _shared.borrow(self._drawn_as, self._model, self.view)
-            give_back = functools.partial(_shared.give_back, canvas)
+            give_back: Callable[[], None] = functools.partial(_shared.give_back, canvas)
         else:
             canvas = _Canvas(self._model, self.view)
             give_back = canvas.close
