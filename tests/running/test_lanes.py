@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import Rememberer
-from imagine_bench.tasks.macro_env import MacroEnv
+from imagine_bench.tasks.motion.executor import MacroExecutor
 from small_runs import same_but_for_time, small
 
 from imagine_bench.cli.observers import run_observed
@@ -80,16 +80,17 @@ def test_a_test_that_was_interrupted_goes_on(
 def test_a_simulation_that_blows_up_ends_the_run(
     tmp_path: Path, in_lanes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    act = MacroEnv.act
-    acted = itertools.count()
+    run = MacroExecutor.run
+    runs = itertools.count()
 
-    def failing(env: MacroEnv, action: int) -> tuple[float, bool, dict[str, Any]]:
-        number = next(acted)
+    def failing(executor: MacroExecutor, data: Any, trajectory: Any, **options: Any) -> Any:
+        qpos = run(executor, data, trajectory, **options)
+        number = next(runs)
         if in_lanes and number > 25:
             raise DivergedError("The simulation diverged.")
-        return act(env, action)
+        return qpos
 
-    monkeypatch.setattr(MacroEnv, "act", failing)
+    monkeypatch.setattr(MacroExecutor, "run", failing)
     with pytest.raises(DivergedError, match=r"The simulation diverged\. The agent's state lies in"):
         do(tmp_path / "run")
 
