@@ -31,6 +31,7 @@ from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import HUMAN_CAMERA
 from .world import World, WorldState
 
+_BUILT = PhysicsSettings()
 _WINDOW_HZ = 25.0  # images a second of a window
 Info = dict[str, Any]
 """What Gymnasium calls info: numpy scalars and arrays, and sentences."""
@@ -120,7 +121,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
-        physics: PhysicsSettings | Mapping[str, float | str] = PhysicsSettings(),  # noqa: B008 - frozen
+        physics: PhysicsSettings | Mapping[str, float | str] = _BUILT,
         motion_hz: float = 0.0,
         observation: str = "frame",
         size: int = FRAME_PX,

@@ -6,7 +6,7 @@ A world is a goal, what is forbidden, what a turn turns, the order of the macro-
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, pairwise, product
 
@@ -71,7 +71,7 @@ class ArrowRules:
         world: The world.
     """
 
-    world: Arrows = Arrows()  # noqa: RUF009 - frozen
+    world: Arrows = field(default_factory=Arrows)
 
     @cached_property
     def goal(self) -> Goal:

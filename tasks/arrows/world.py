@@ -21,13 +21,15 @@ if TYPE_CHECKING:
     from ..motion.turn import TurnExecutor
 
 _QUARTER_RAD = math.pi / 2
+_THESIS = Arrows()
+"""The puzzle of three cubes."""
 MAX_OFF_SLOT_M = 0.015
 
 
 class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
+    def __init__(self, level: Appearance, arrows: Arrows = _THESIS) -> None:
         self._turns = arrows.turns
         self._layout = layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}

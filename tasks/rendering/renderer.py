@@ -245,7 +245,6 @@ _shared = _Canvases()
 _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
 _inherited: list[Any] = []
 """Contexts of a parent process or another thread: never used here and never freed, since they belong there."""
-_exit_hook_pid: int | None = None
 
 
 def close_idle_contexts() -> None:
@@ -259,12 +258,11 @@ def _close_all() -> None:
     _shared.close()
 
 
-def _close_all_at_exit() -> None:
-    """Register after MuJoCo registered its own clean-up, so that ours runs first."""
-    global _exit_hook_pid  # noqa: PLW0603
-    if _exit_hook_pid != os.getpid():
-        _exit_hook_pid = os.getpid()
-        atexit.register(_close_all)
+@functools.cache
+def _close_all_at_exit(pid: int) -> None:
+    """Register, once in each process, after MuJoCo registered its own clean-up, so that ours runs first."""
+    del pid
+    atexit.register(_close_all)
 
 
 class Renderer:
@@ -354,7 +352,7 @@ class Renderer:
         self._finalizer = weakref.finalize(self, give_back)
         self._finalizer.atexit = False
         _open.add(self)
-        _close_all_at_exit()
+        _close_all_at_exit(os.getpid())
         return canvas
 
     def close(self) -> None:

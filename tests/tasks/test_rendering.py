@@ -38,6 +38,11 @@ def world():
     return world
 
 
+def own_camera(model):
+    """Of a size that nothing else in this process draws, so that it shares no context."""
+    return agent_camera(model, 62)
+
+
 def run_script(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
     import os
 
@@ -80,7 +85,7 @@ def test_renderers_of_one_scene_and_view_share_a_context(world, monkeypatch):
     twin = ArrowWorld(appearance("clean"))
     twin.place((3, 3, 0, 2), np.random.default_rng(0))
     worlds = world, twin, PickWorld(appearance("clean"))
-    cameras = [agent_camera(each.model) for each in worlds]
+    cameras = [own_camera(each.model) for each in worlds]
     frames = [camera.frame(each.data) for camera, each in zip(cameras, worlds, strict=True)]
     assert len(made) == 2, "pick-and-place has other meshes"
     cameras[0].close()
@@ -116,7 +121,7 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatc
 
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
-    camera = agent_camera(world.model)
+    camera = own_camera(world.model)
     twin = pickle.loads(pickle.dumps(camera))  # as a pickled environment's
     with pytest.raises(pytest.fail.Exception, match="made a context"):
         twin.frame(world.data)
@@ -187,7 +192,7 @@ def test_missing_gl_says_what_to_install(world, monkeypatch, failure):
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr(module, "GLContext", broken)
     with pytest.raises(SetupError, match="apt-get install libegl1 libgl1-mesa-dri") as caught:
-        agent_camera(world.model).frame(world.data)
+        own_camera(world.model).frame(world.data)
     assert (str(failure) or "AttributeError") in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -198,7 +203,7 @@ def test_a_display_that_is_missing_is_named_like_missing_gl(world, monkeypatch):
 
     monkeypatch.setattr(mujoco, "MjrContext", no_display)
     with pytest.raises(SetupError, match=r"has not been loaded .* 'apt-get install libegl1 libgl1-mesa-dri'"):
-        agent_camera(world.model).frame(world.data)
+        own_camera(world.model).frame(world.data)
 
 
 _FRAME = """
@@ -290,7 +295,7 @@ def test_any_thread_draws_one_at_a_time(world, monkeypatch):
     made = []
     make = rendering._new_gl_context
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make(*size))
-    camera = agent_camera(world.model)
+    camera = own_camera(world.model)
     before = camera.frame(world.data)
     with ThreadPoolExecutor(1) as first, ThreadPoolExecutor(1) as second:
         for _ in range(3):  # a collector's thread keeps its own
