@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.pick_place.world import PickWorld
-from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from imagine_bench.tasks.scenes.objects import OBJECTS
 
 from imagine_bench import registry
 
+FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 NAMES = ["pick_place", *(f"arrows:cubes={cubes}" for cubes in range(1, 7))]
 
 
-def world_of(name, level):
-    look = appearance(level)
+def world_of(name, look):
     return PickWorld(look) if name == "pick_place" else ArrowWorld(look, registry.task(name).rules.world)
 
 
@@ -25,7 +25,7 @@ def world_of(name, level):
 @pytest.mark.parametrize("name", NAMES)
 def test_macrostates_are_read_back_at_every_level(name, level):
     rules = registry.task(name).rules
-    world = world_of(name, level)
+    world = world_of(name, LEVELS[level])
     rng = np.random.default_rng(0)
     for index in rng.integers(len(rules.states), size=100):
         state = rules.states[index]
@@ -44,7 +44,7 @@ def test_macrostates_are_read_back_at_every_level(name, level):
 )
 def test_the_gripper_passes_the_pointing_hand(name, state, action):
     """With what it holds."""
-    world = world_of(name, "clean")
+    world = world_of(name, FIXED)
     world.place(state, np.random.default_rng(0))
     people = world.data.mocap_pos.copy()
     result = world.execute(action, registry.task(name).rules.outcomes(state, action)[0].macrostate, 20.0)
