@@ -18,7 +18,7 @@ from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
-from imagine_bench.tools.fidelity import measure_fidelity
+from imagine_bench.testing.fidelity import measure_fidelity
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 RULES = SPEC.rules
@@ -275,7 +275,7 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
 
 
 def check_fidelity(actions):
-    found = measure_fidelity(SPEC, SPEC.targets, actions)
+    found = measure_fidelity(SPEC, actions)
     assert found.actions == actions
     assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
     assert found.other_objects_mm < SPEC.targets.other_objects_mm

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import APPEARANCES, PerformanceTargets, State, TaskSpec
+from imagine_bench.interfaces import APPEARANCES, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree, episode_seed
 
@@ -39,15 +40,18 @@ class Fidelity:
     slipped_mm: float = 0.0  #: the furthest that an object moved whose macro-action slipped
 
 
-def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int, appearance: str = _CLEAN) -> Fidelity:
+def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> Fidelity:
     """Walk at random in contact physics, judged by the objects' poses in the simulation and not by ``info`` alone.
+
+    Of a task without ``targets`` no object is known, and ``info`` alone judges.
 
     Args:
         spec: The task.
-        targets: Which bodies to look at, and whether walks go on through ends.
         actions: Macro-actions of the measurement.
         appearance: Says how far from their places a reset puts objects.
     """
+    objects = () if spec.targets is None else spec.targets.objects
+    goes_on = spec.targets is not None and spec.targets.goes_on
     real, perfect = (
         gymnasium.make(spec.env_id, execution=execution, appearance=appearance, disable_env_checker=True).unwrapped
         for execution in ("physics", "kinematic")
@@ -56,14 +60,14 @@ def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int, 
     walk = _ACTIONS_A_WALK if appearance == _CLEAN else _ACTIONS_A_VARIED_WALK
     play = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
     real.reset(seed=episode_seed("tuning", 0, actions))
-    standing_m = _poses(real, targets)[:, 2]  # every start has all objects on the table
+    standing_m = _poses(real, objects)[:, 2]  # every start has all objects on the table
     fresh = True
     for step in range(actions):
         if fresh or step % walk == 0:
             options = {"macrostate": play[int(rng.integers(len(play)))]}
             for env in (perfect, real):
                 _, info = env.reset(seed=episode_seed("tuning", 0, step), options=options)
-        before, state = _poses(real, targets), tuple(int(value) for value in info["macrostate"])
+        before, state = _poses(real, objects), tuple(int(value) for value in info["macrostate"])
         action = int(rng.integers(spec.n_actions))
         *_, wanted = perfect.step(action)
         start = time.process_time()
@@ -72,7 +76,7 @@ def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int, 
         right = not info["fault"] and np.array_equal(info["macrostate"], wanted["macrostate"])
         found.actions, found.as_ruled = found.actions + 1, found.as_ruled + right
         if right:
-            after, reached = _poses(real, targets), info["macrostate"][: len(before)]
+            after, reached = _poses(real, objects), info["macrostate"][: len(before)]
             moves, slip = _may_move(spec, state, action, len(after))
             moved = np.not_equal(state[: len(after)], reached)
             if 0 < slip < 1:
@@ -80,19 +84,21 @@ def measure_fidelity(spec: TaskSpec, targets: PerformanceTargets, actions: int, 
             if not moved.any():
                 shifts_mm = 1e3 * np.linalg.norm(after[moves, :3] - before[moves, :3], axis=1)
                 found.slipped_mm = max(found.slipped_mm, float(shifts_mm.max(initial=0.0)))
-            _compare(found, moved, moves, standing_m, before, after, _poses(perfect, targets))
+            _compare(found, moved, moves, standing_m, before, after, _poses(perfect, objects))
         else:
             found.faults.append(info.get("fault_reason", f"{wanted['macrostate']} was to be reached"))
-        fresh = not right or (terminated and not targets.goes_on)
+        fresh = not right or (terminated and not goes_on)
     for env in (real, perfect):
         env.close()
     return found
 
 
-def _poses(env: Any, targets: PerformanceTargets) -> NDArray[np.float64]:
-    """Positions and quaternions of the objects, now. Shape (N, 7)."""
+def _poses(env: Any, objects: Sequence[str]) -> NDArray[np.float64]:
+    """Positions and quaternions of the named bodies, now. Shape (N, 7)."""
+    if not objects:
+        return np.empty((0, 7))
     motion = env.motion()
-    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in targets.objects]])
+    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in objects]])
 
 
 def _may_move(spec: TaskSpec, state: State, action: int, objects: int) -> tuple[NDArray[np.bool_], float]:

@@ -1,21 +1,18 @@
-"""``imagine-bench margins``: how far each thing that makes a grasp hold may go before macro-actions fail."""
+"""How far each physics setting that makes a grasp hold may go before macro-actions fail."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from imagine_bench import registry, statistics
-from imagine_bench.errors import DivergedError, InvalidValueError
+from imagine_bench import statistics
+from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import SENSES, PhysicsSettings, State, TaskSpec
-from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SeedTree, episode_seed
-from imagine_bench.store.files import require_writable, write_json
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001),
@@ -30,20 +27,17 @@ _STANDS_M = 0.02
 """An object so near to its first height stands."""
 
 
-def measure_margins(task: str, out: Path, trials: int = 200, show: Callable[[str], None] = print) -> None:
-    """Sweep each setting alone, walk with true and nominal poses, show a Markdown table and keep the figures.
+def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) -> dict[str, Any]:
+    """Sweep each setting alone, walk with true and nominal poses, show a Markdown table and return the figures.
 
-    A trial is one macro-action from a start that moves an object if it succeeds. The same starts, actions and seeds
-    serve every value.
-
-    Raises:
-        InvalidValueError: No trials.
-        SetupError: The file ``out`` cannot be written.
+    A task whose environment takes no ``physics`` has none. A trial is one macro-action from a start that moves an
+    object if it succeeds. The same starts, actions and seeds serve every value.
     """
-    spec = registry.task(task)
-    if trials < 1:
-        raise InvalidValueError(f"trials is {trials}; give at least 1 macro-action a value.")
-    require_writable(out.parent)
+    try:
+        _env(spec, PhysicsSettings()).close()
+    except TypeError:  # Gymnasium's, for a keyword that the environment does not take
+        show(f"No margins: the environment of {spec.id} takes no physics settings.")
+        return {}
     show("| setting | value | as ruled | 95 % (Wilson) |\n|---|---|---|---|")
     curves: dict[str, list[dict[str, float]]] = {name: [] for name in SWEEPS}
     for name, values in SWEEPS.items():
@@ -56,8 +50,7 @@ def measure_margins(task: str, out: Path, trials: int = 200, show: Callable[[str
     walks = [walk(spec, sense) for sense in SENSES]
     for each in walks:
         show(f"| sense | {each['sense']} | {each['as_ruled']} of {each['actions']} | {len(each['faults'])} faults |")
-    kept = {"task": task, "seed": 0, "built": asdict(PhysicsSettings()), "curves": curves, "walks": walks}
-    write_json(out, {**kept, "environment": describe_environment()})
+    return {"built": asdict(PhysicsSettings()), "curves": curves, "walks": walks}
 
 
 def as_ruled(spec: TaskSpec, settings: PhysicsSettings, trials: int) -> int:

@@ -1,4 +1,4 @@
-"""``imagine-bench coverage``: do intervals hold and tests claim as often as they say, on scores such as occur here?
+"""``python tests/measure/coverage.py [DRAWS]``: do intervals and tests keep their promises?
 
 Every agent and budget with five kept seeds or more gives a population: its scores, smoothed on the logit scale. Benches
 are drawn from these, with and without one seed in ten that is stuck at chance, and judged by
@@ -8,8 +8,9 @@ are drawn from these, with and without one seed in ten that is stuck at chance, 
 from __future__ import annotations
 
 import csv
+import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import reading, require_writable, write_json
 
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
 SEEDS = (3, 5, 10, 20)
 STUCK = (0.0, 0.1)  # shares of seeds that are stuck
 _CHANCE = 0.16  # where these are, as a greedy policy that always chooses the same
@@ -85,24 +87,17 @@ def measure(scores: list[Floats], draws: int, rng: np.random.Generator) -> Itera
             )  # fmt: skip
 
 
-def coverage_report(results: Path, out: Path, draws: int, show: Callable[[str], None] = print) -> None:
-    """Measure, show a Markdown table line by line, and keep it as JSON with seed, commit and machine.
-
-    Raises:
-        InvalidValueError: Nothing to draw, or nothing to draw from.
-        SetupError: The file cannot be written.
-    """
-    if draws < 1:
-        raise InvalidValueError(f"draws is {draws}; give at least 1.")
+def main(draws: int = 2_000, results: Path = RESULTS, out: Path = Path("runs/coverage.json")) -> None:
+    """Measure, print a Markdown table line by line, and keep it as JSON with seed, commit and machine."""
     scores = populations(results)
     require_writable(out.parent)
-    show("| seeds | stuck, % | intervals that hold, % | false claims a cell, % | a table of six, % |")
-    show("|---|---|---|---|---|")
+    print("| seeds | stuck, % | intervals that hold, % | false claims a cell, % | a table of six, % |")
+    print("|---|---|---|---|---|")
     rows = []
     for kept in measure(scores, draws, SeedTree(0).child("coverage").generator()):
         rows.append(asdict(kept))
         values = (kept.stuck, kept.coverage, kept.false_cell, kept.false_table)
-        show(f"| {kept.seeds} | " + " | ".join(f"{100.0 * value:.1f}" for value in values) + " |")
+        print(f"| {kept.seeds} | " + " | ".join(f"{100.0 * value:.1f}" for value in values) + " |", flush=True)
     facts = {"populations": len(scores), "draws": draws, "seed": 0, "environment": describe_environment()}
     write_json(out, {**facts, "rows": rows})
 
@@ -115,3 +110,7 @@ def _members(shares: Floats, stuck: float, rng: np.random.Generator) -> Floats:
     moved = 1.0 / (1.0 + np.exp(-(rng.choice(logits, size=_SIZE) + width * rng.normal(size=_SIZE))))
     chances = np.where(rng.random(_SIZE) < stuck, _CHANCE, moved)
     return np.asarray(rng.binomial(_TESTS, chances) / _TESTS)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,30 +1,28 @@
-"""CPU time of what the agents compute, for ``make speed``, beside the plain torch that an expert would write."""
+"""CPU seconds of code of the agents (``"ours"``) beside the plain torch that an expert would write (``"plain"``)."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
+from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
+from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
+from imagine_bench.agents.networks.precision import settle
+from imagine_bench.agents.networks.weight_samples import sample_outputs
+from imagine_bench.agents.regressors.bayesian_mdn import BayesianMDN
+from imagine_bench.agents.regressors.settings import MDNSettings
+from imagine_bench.agents.replay import Batch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .encoders.perception import prepare_torch
-from .imagination import mixture as mdn
-from .imagination.settings import HYPERPARAMETERS, WorldModelSettings
-from .imagination.world_model import WorldModel, log_cosh
-from .networks.mlp import MemberMLP, dropout_mask
-from .networks.precision import settle
-from .networks.weight_samples import sample_outputs
-from .regressors.bayesian_mdn import BayesianMDN
-from .regressors.settings import MDNSettings
-from .replay import Batch
-
-LATENTS = 24
-ACTIONS = 6
+LATENTS, ACTIONS = 24, 6
 """Those of the arrow puzzle's bundled encoders."""
 _SIZES = (2, 256, 256, 256, mdn.output_size(10, 3))
 """Those of a regressor of chapter 4."""
@@ -47,10 +45,8 @@ class _PlainMLP(nn.Module):
 
     def __init__(self, sizes: tuple[int, ...], members: int, dropout: float, draws: torch.Generator) -> None:
         super().__init__()
-        self.dropout = dropout
-        self.draws = draws
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
+        self.dropout, self.draws = dropout, draws
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
             self.weights.append(torch.randn(members, n_in, n_out, generator=draws) * math.sqrt(2.0 / (n_in + n_out)))
             self.biases.append(torch.zeros(members, 1, n_out))
@@ -73,9 +69,7 @@ class PlainWorldModel:
     """
 
     def __init__(self, latents: int, actions: int, settings: WorldModelSettings, draws: torch.Generator) -> None:
-        self.latents = latents
-        self.actions = actions
-        self.settings = settings
+        self.latents, self.actions, self.settings = latents, actions, settings
         outputs = mdn.output_size(settings.components, latents)
         shapes = [
             ((latents + actions, *settings.dynamics_hidden, outputs), settings.members),
@@ -115,18 +109,9 @@ class PlainWorldModel:
                     weight.mul_((self.settings.max_norm / norm).clamp_max(1.0))
 
 
-@dataclass(frozen=True)
-class ModelSpeed:
-    """CPU ms of one update of :class:`PlainWorldModel` and of the suite's model, and the precision of the latter."""
-
-    plain_ms: float
-    own_ms: float
-    precision: str
-
-
-def model_update(hyperparameters: str, rounds: int = 25) -> ModelSpeed:
-    """Measure with a set of hyperparameters of chapter 5, on one thread; the least of ``rounds`` readings counts."""
-    device = prepare_torch("cpu")
+def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
+    """One update of the world model with a set of hyperparameters of chapter 5, on one thread."""
+    prepare_torch("cpu")
     settings = HYPERPARAMETERS.resolve(hyperparameters, {}, "chapter_5").model
     draws = torch.Generator().manual_seed(0)
     rows = settings.batch_size
@@ -139,15 +124,11 @@ def model_update(hyperparameters: str, rounds: int = 25) -> ModelSpeed:
     )
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
     own = WorldModel(LATENTS, ACTIONS, settings, draws)
-    best = least_cpu_s({"plain": lambda: plain.update(batch), "own": lambda: own.update(batch, draws)}, rounds)
-    return ModelSpeed(1e3 * best["plain"], 1e3 * best["own"], settle(settings.precision, device.type))
+    return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
 
 
-def weight_samples(rows: int, samples: int, rounds: int) -> tuple[float, float]:
-    """CPU seconds of T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes.
-
-    The two are taken in turn ``rounds`` times; the least reading counts.
-    """
+def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
+    """T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes."""
     prepare_torch("cpu")
     draws = torch.Generator().manual_seed(0)
     network = MemberMLP(_SIZES, members=1, dropout=_DROPOUT, generator=draws)
@@ -160,17 +141,15 @@ def weight_samples(rows: int, samples: int, rounds: int) -> tuple[float, float]:
         for t in range(samples):
             outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
 
-    least = least_cpu_s({"pass": lambda: sample_outputs(network, x, masks), "loop": loop}, rounds)
-    return least["pass"], least["loop"]
+    return least_cpu_s({"ours": lambda: sample_outputs(network, x, masks), "plain": loop}, rounds)
 
 
-def training(networks: int, rows: int, updates: int, rounds: int) -> tuple[float, float]:
-    """CPU seconds of a number of updates of E regressors: as one batch, and one network after another."""
+def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:
+    """A number of updates of E regressors: as one batch, and one network after another."""
     prepare_torch("cpu")
     settings = MDNSettings(precision=settle("auto", "cpu"))
     draws = [torch.Generator().manual_seed(index) for index in range(networks)]
-    together = BayesianMDN(2, 3, settings, draws)
-    alone = [BayesianMDN(2, 3, settings, [one]) for one in draws]
+    together, alone = BayesianMDN(2, 3, settings, draws), [BayesianMDN(2, 3, settings, [one]) for one in draws]
     x, y = (torch.randn(networks, rows, size, generator=draws[0]) for size in (2, 3))
 
     def as_one() -> None:
@@ -182,5 +161,4 @@ def training(networks: int, rows: int, updates: int, rounds: int) -> tuple[float
             for _ in range(updates):
                 model.update(x[index : index + 1], y[index : index + 1])
 
-    least = least_cpu_s({"together": as_one, "alone": one_by_one}, rounds)
-    return least["together"], least["alone"]
+    return least_cpu_s({"ours": as_one, "plain": one_by_one}, rounds)

@@ -17,7 +17,6 @@ import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
-from small_runs import do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -25,14 +24,15 @@ from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import true_model
+from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.study import study_table, write_study
 from imagine_bench.rules import states_of
-from imagine_bench.running import run_state
 from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.store.results import Beliefs
-from imagine_bench.studies.catalogue import STUDIES
-from imagine_bench.studies.study import BASE, Line, Study, Variant, _imagined_right, load_study, run_study
+from imagine_bench.sweep.catalogue import STUDIES
+from imagine_bench.sweep.grid import BASE, Study, Variant, read_grid
+from imagine_bench.sweep.run import Line, imagined_right, run_study
 
 STUDY = Study(
     name="fakes",
@@ -95,29 +95,6 @@ def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
     assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
 
 
-def test_tuning_runs_never_meet_starts_of_reported_runs(tmp_path: Path) -> None:
-    seeds: dict[int, list[int]] = {}
-    real_reset = run_state.gymnasium.make
-
-    def make(*arguments: object, **options: object) -> object:
-        env = real_reset(*arguments, **options)
-        reset = env.reset
-
-        def noting(**how: object) -> object:
-            seeds.setdefault(current, []).append(int(str(how["seed"])))
-            return reset(**how)
-
-        env.reset = noting  # type: ignore[method-assign]
-        return env
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_state.gymnasium, "make", make)
-        for current in (0, 1000):
-            do(tmp_path / str(current), seed=current, seeds=(current,))
-    assert len(seeds[0]) == len(seeds[1000]) == 9 + 2 * 5
-    assert not set(seeds[0]) & set(seeds[1000])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -163,7 +140,7 @@ world.physics = { pad_friction = 0.1 }
 def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     path, launcher = tmp_path / "mine.toml", Here()
     path.write_text(_FILE)
-    study = load_study(path)
+    study = read_grid(path)
     assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
     lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
     worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.done]
@@ -174,14 +151,14 @@ def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     assert [line.difference is None for line in lines] == [True, False, False]
     text = json.dumps(tomllib.loads(_FILE))
     (tmp_path / "mine.json").write_text(text)
-    assert load_study(tmp_path / "mine.json") == study
+    assert read_grid(tmp_path / "mine.json") == study
 
 
 def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(_FILE + '[[variants]]\nname = "slow"\nagent = "dqn"\n'
                     'settings = { controller.discount = 0.9, "controller.hidden" = [8, 8] }\n')  # fmt: skip
-    assert load_study(path).variants[-1].settings == {"controller.discount": 0.9, "controller.hidden": [8, 8]}
+    assert read_grid(path).variants[-1].settings == {"controller.discount": 0.9, "controller.hidden": (8, 8)}
 
 
 @pytest.mark.parametrize(
@@ -190,7 +167,7 @@ def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
         ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
         ("budgets = [2]", "", "missing 1 required keyword-only argument: 'budgets'. Give name, question, budgets, "),
         ("question", "questions", "unexpected keyword argument 'questions'"),
-        ("budgets = [2]", "budgets = [", "is not a study: TOMLDecodeError"),
+        ("budgets = [2]", "budgets = [", "is no study: TOMLDecodeError"),
         ("test_appearance", "looks", "No field that a variant may change 'looks'"),
         ("[1000]", "[0]", "chooses settings on seeds"),
         ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),
@@ -203,10 +180,9 @@ def test_a_file_that_is_no_study_says_why(
 ) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(_FILE.replace(old, new))
-    assert main(["study", "--task", "arrow_puzzle", "--file", str(path)]) == 2
-    assert sentence in (said := " ".join(capsys.readouterr().err.split())) and str(path) in said
-    assert main(["study", "--task", "arrow_puzzle", "--file", str(path), "--name", "smoke"]) == 2
-    assert "leave one of them out" in capsys.readouterr().err
+    assert main(["sweep", "arrow_puzzle", "--name", str(path)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert sentence in said and str(path) in said
 
 
 def test_chosen_variants_bring_what_they_are_compared_with() -> None:
@@ -217,12 +193,28 @@ def test_chosen_variants_bring_what_they_are_compared_with() -> None:
         STUDY.only(("milld",))
 
 
+DIGESTS = {
+    "factors": "783723911a58", "deviations": "9448576e1c0c", "ladder": "16c2e21e0136", "controller": "a461c222ed4c",
+    "curiosity": "f24530419bb3", "uncertainty": "286a80f9b84c", "remarks": "234d3c347058", "smoke": "4d5a5ddbd8cc",
+}  # fmt: skip
+"""Of every study that kept results may name: what it compared when they were made."""
+
+
 @pytest.mark.parametrize("name", STUDIES)
-def test_the_settings_of_every_study_exist(name: str) -> None:
+def test_a_study_is_that_of_kept_results_and_its_settings_exist(name: str) -> None:
+    assert digest(dataclasses.asdict(STUDIES[name])) == DIGESTS[name]
     for variant in STUDIES[name].variants:
         settings = registry.load(registry.agent_entry(variant.agent).settings)
         changed = settings.resolve("fast", variant.settings, "chapter_5")
         assert (changed == settings.resolve("fast", {}, "chapter_5")) == (not variant.settings)
+
+
+def test_the_last_rung_of_the_ladder_is_quick_but_for_the_filter() -> None:
+    chapter_5 = HYPERPARAMETERS.groups["chapter_5"]
+    rung = STUDIES["ladder"].variants[-1].settings
+    for name, change in chapter_5.sets["fast"].items():
+        if name.startswith(("model.", "controller.")):
+            assert rung[name] == change.value
 
 
 def test_the_table_says_what_helps(tmp_path: Path) -> None:
@@ -249,7 +241,7 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
     assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 
-def test_what_is_imagined_right_is_what_the_rules_have_too() -> None:
+def test_what_isimagined_right_is_what_the_rules_have_too() -> None:
     task = registry.task("arrow_puzzle")
     states, actions = states_of(task.rules), task.n_actions
     truth = true_model(task.rules)
@@ -267,7 +259,7 @@ def test_what_is_imagined_right_is_what_the_rules_have_too() -> None:
         return SimpleNamespace(checkpoints=[SimpleNamespace(beliefs=each) for each in held])
 
     runs = [run(None, beliefs(truth.p_continues)), run(beliefs(half), beliefs(np.zeros_like(half)))]
-    found = _imagined_right(task.rules, runs)
+    found = imagined_right(task.rules, runs)
     right = ends[alive].copy()
     assert 0.0 < right.mean() < 1.0
     right[len(alive) // 2 :] = True
@@ -290,18 +282,3 @@ def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
         for name, value in variant.settings.items():
             if name != "model.precision":  # the thesis' is that of the machine
                 assert value == flatten(chapter_5.published)[name] != chapter_5.sets["fast"][name].value
-
-
-def test_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, sentence in (
-        (["study", "--task", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'?"),
-        (["study", "--task", "arrow_puzzle", "--name", "factor"], "No study 'factor'. Did you mean 'factors'?"),
-        (["plan", "--task", "arrow_puzle"], "No task 'arrow_puzle'"),
-        (["plan", "--count", "0"], "Asked for 0 plans"),
-        (["plan"], "There is no such bench below"),
-        (["why"], "There is no such bench below"),
-    ):
-        assert main([*words, "--out", str(tmp_path / "runs")]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("imagine-bench: ") and sentence in line
-    assert not (tmp_path / "runs").exists()

@@ -13,7 +13,7 @@ import pytest
 from imagine_bench import statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.store.results import OpenLoop
-from imagine_bench.suite.score import Scale, auroc, score
+from imagine_bench.sweep.score import Scale, auroc, score
 
 SCALES = (Scale(chance=0.1, optimum=0.9), Scale(chance=0.5, optimum=1.0))
 
